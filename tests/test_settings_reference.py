@@ -13,7 +13,7 @@ from warp_resphys.dynamics.simulator import COUPLINGS
 from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
-from warp_resphys.learning.networks import ACTIVATIONS, FORCE_BASES, NETWORK_KINDS
+from warp_resphys.learning.networks import ACTIVATIONS
 from warp_resphys.learning.training import SCHEDULES, SELECTIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
 from warp_resphys.settings.control import Model
@@ -49,9 +49,7 @@ def test_words_of_the_settings_are_those_that_the_code_knows():
         (PhysicsSettings, "volume_integration", VOLUME_INTEGRATIONS),
         (MarkerSettings, "bind", KINDS),
         (MarkerSettings, "frame", FRAMES),
-        (NetworkSettings, "kind", NETWORK_KINDS),
         (NetworkSettings, "activation", ACTIVATIONS),
-        (NetworkSettings, "force_basis", FORCE_BASES),
         (TrainerSettings, "schedule", SCHEDULES),
         (TrainerSettings, "selection", SELECTIONS),
     ]

@@ -28,6 +28,7 @@ from warp_resphys.data.markers import MarkerMap
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.reconstruction import make_reconstructor
 from warp_resphys.learning.rollout import Rollout, closed_loop
+from warp_resphys.settings.learning import NetworkSettings
 
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
@@ -102,9 +103,8 @@ print(f"sums of the forces over the body: up to {force.sum(2).norm(dim=-1).max()
 
 # %%
 samples = [each[:STEPS, train].flatten(0, 1) for each in (motion.q, motion.v, force)]
-layout = {"kind": "reduced", "position_modes": 4, "velocity_modes": 4, "force_modes": 8}
-network = {"blocks": 1, "layers": 2, "width": 64, "activation": "silu"}
-model = build_model({**layout, **network}, simulator.rest_positions, *samples)
+network = NetworkSettings(position_modes=4, velocity_modes=4, force_modes=8, layers=2, width=64, activation="silu")
+model = build_model(network, simulator.rest_positions, *samples)
 
 q, v, f = samples
 with torch.no_grad():

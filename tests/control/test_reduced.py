@@ -11,6 +11,7 @@ from warp_resphys.control.reduced import ReducedModel
 from warp_resphys.control.reduced_force import ReducedForce
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.predictors import Range
+from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
 
 MODES, PARTS, POINTS, FILTERS = 3, 2, 2, (0.1, 0.5)
@@ -30,7 +31,11 @@ def model(request):
 
     told = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
-    network = build_model(NETWORK, samples[0], samples, samples, samples, told).double().requires_grad_(False)
+    network = (
+        build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, told)
+        .double()
+        .requires_grad_(False)
+    )
     seen = np.zeros((6, 2 * MODES))
     seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
     force = ReducedForce(

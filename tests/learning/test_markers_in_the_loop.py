@@ -14,6 +14,7 @@ from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLo
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
@@ -33,7 +34,7 @@ NETWORK = {
     "layers": 0,
     "width": 8,
 }
-CONFIG = {"epochs": 4, "penalty": 1e-3, "hold_out": True, "memory": 5, "rollout_every": 1, "patience": 3}
+CONFIG = InTheLoopSettings(epochs=4, penalty=1e-3, memory=5)
 
 
 def simulator():
@@ -150,7 +151,9 @@ def network(seed=0, **changes):
     torch.manual_seed(seed)
     rest = simulator().rest_positions
     q, v, force = (1e-2 * torch.randn(12, *rest.shape, dtype=torch.float64) for _ in range(3))
-    return build_model({**NETWORK, **changes}, rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)).double()
+    return build_model(
+        NetworkSettings(**{**NETWORK, **changes}), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
+    ).double()
 
 
 def finish(trainer):
@@ -164,7 +167,7 @@ class TestMarkersInTheLoop:
     def test_it_starts_at_the_simulator_as_it_is(self, loss, changes):
         model = network(**changes)
         assert float(loss(model).detach()) != pytest.approx(float(loss(None)), rel=1e-6)
-        trainer = MarkersInTheLoop(model, loss, None, {**CONFIG, "epochs": 1})
+        trainer = MarkersInTheLoop(model, loss, None, CONFIG.changed(epochs=1))
         rest = simulator().rest_state(2)
         assert not model(rest.q, rest.v + 1.0, LOADS).any()
         trainer.run_epoch()
@@ -195,7 +198,7 @@ class TestMarkersInTheLoop:
         assert checked >= 4
 
     def test_it_descends_and_keeps_the_best_weights(self, loss):
-        trainer = finish(MarkersInTheLoop(network(), loss, loss, {**CONFIG, "epochs": 12}))
+        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG.changed(epochs=12)))
         losses = [record["train_loss"] for record in trainer.state.history]
         assert losses == sorted(losses, reverse=True)
         assert losses[-1] < 0.5 * losses[0]  # the way there hangs on rounding, from four epochs (0.53) to eight (0.42)
@@ -226,7 +229,7 @@ class TestMarkersInTheLoop:
             return call(self, model)
 
         monkeypatch.setattr(MotionLoss, "__call__", fragile)
-        trainer = finish(MarkersInTheLoop(network(), loss, loss, {**CONFIG, "epochs": 2}))
+        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG.changed(epochs=2)))
         losses = [record["train_loss"] for record in trainer.state.history]
         assert losses[2] < losses[0]
         assert all(torch.isfinite(w).all() for w in trainer.model.network.parameters())
@@ -239,7 +242,7 @@ class TestMarkersInTheLoop:
         assert loss.error_mm(None) == float("inf")
 
     def test_no_constant_force_is_learned(self, loss):
-        model = finish(MarkersInTheLoop(network(), loss, None, {**CONFIG, "epochs": 2})).model
+        model = finish(MarkersInTheLoop(network(), loss, None, CONFIG.changed(epochs=2))).model
         rest = simulator().rest_state(2)
         assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
         assert not model(rest.q, rest.v, 0.0 * LOADS).any()
@@ -251,13 +254,13 @@ class TestMarkersInTheLoop:
         with torch.no_grad():
             exact = Replay(sim, MARKERS, motions)(release)[0]
         other = MotionLoss([Watched(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
-        config, seen = {**CONFIG, "epochs": 3}, []
+        config, seen = CONFIG.changed(epochs=3), []
         assert cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
         for patience, spent in ((2, 2), (9, 3)):
             seen.clear()
             chosen = cross_validated_epochs(
-                network, [(loss, other)], {**config, "patience": patience}, lambda: seen.append(1)
+                network, [(loss, other)], config.changed(patience=patience), lambda: seen.append(1)
             )
             assert (chosen, len(seen)) == (0, spent)
         histories = []

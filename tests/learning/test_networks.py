@@ -23,11 +23,15 @@ from warp_resphys.learning.networks import (
     restore,
 )
 from warp_resphys.learning.predictors import LearnedPredictor, Range
+from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.stepping.inputs import Inputs
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
-KINDS = {"reduced": {**REDUCED, **ARCHITECTURE}, "nodal": {"kind": "nodal", **ARCHITECTURE}}
+KINDS = {
+    "reduced": NetworkSettings(**REDUCED, **ARCHITECTURE),
+    "nodal": NetworkSettings(kind="nodal", **ARCHITECTURE),
+}
 
 
 def field(samples, vertices=6, rank=None, seed=0):
@@ -206,7 +210,7 @@ class TestActuation:
         torch.manual_seed(0)
         rest, q, v = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2)
         fields = (rest, rest + q, v, *([field(40, seed=3)] if build is build_model else []))
-        return build({**KINDS["reduced"], **changes}, *fields, self.LOADS), rest + q, v
+        return build(KINDS["reduced"].changed(**changes), *fields, self.LOADS), rest + q, v
 
     def test_it_is_in_units_of_its_size_and_none_stays_zero(self):
         coded = actuation_coder(self.LOADS).encode(self.LOADS)
@@ -307,8 +311,8 @@ def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_mod
     rest, n = simulator.rest_positions, simulator.body.n_vertices
     random = torch.Generator().manual_seed(0)
     q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
-    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 0, "force_modes": 2}
-    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu"}
+    sizes = {"position_modes": 3, "velocity_modes": 0, "force_modes": 2}
+    config = NetworkSettings(**sizes, blocks=1, layers=1, width=8, activation="silu")
     model = build_model(config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
     torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
     assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
@@ -322,8 +326,8 @@ def test_networks_from_samples_in_single_precision_take_states_in_double_precisi
     rest, n = simulator.rest_positions, simulator.body.n_vertices
     random = torch.Generator().manual_seed(0)
     u, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
-    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 2}
-    config |= {"blocks": 1, "layers": 1, "width": 8, "activation": "silu", **changes}
+    sizes = {"position_modes": 3, "velocity_modes": 2, "force_modes": 2, **changes}
+    config = NetworkSettings(**sizes, blocks=1, layers=1, width=8, activation="silu")
     models = []
     for dtype in (torch.float32, torch.float64):
         torch.manual_seed(0)

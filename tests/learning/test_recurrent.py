@@ -7,6 +7,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import ResidualForce, build_model, restore
 from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.learning.training import Samples, SequenceTrainer
+from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 from warp_resphys.stepping.state import State
 
 NETWORK = {
@@ -58,8 +59,8 @@ def series(seed):
 def trained(recurrent):
     torch.manual_seed(0)
     train, held_out = series(1), series(2)
-    model = build_model({**NETWORK, "recurrent": recurrent}, REST, train.q, train.v, train.outputs[0])
-    trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TRAINER, 0)
+    model = build_model(NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0])
+    trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
     while not trainer.finished:
         trainer.run_epoch()
     return trainer.use_best(), held_out
@@ -117,8 +118,10 @@ def test_an_interrupted_training_goes_on_with_the_same_losses():
 
     def trainer():
         torch.manual_seed(0)
-        model = build_model(NETWORK, REST, train.q, train.v, train.outputs[0])
-        return SequenceTrainer(model, train, held_out, lambda _: 0.0, {**TRAINER, "epochs": 6, "noise": 1e-3}, 0)
+        model = build_model(NetworkSettings(**NETWORK), REST, train.q, train.v, train.outputs[0])
+        return SequenceTrainer(
+            model, train, held_out, lambda _: 0.0, TrainerSettings(**{**TRAINER, "epochs": 6, "noise": 1e-3}), 0
+        )
 
     whole = trainer()
     losses = [whole.run_epoch()["train_loss"] for _ in range(6)]

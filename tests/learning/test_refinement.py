@@ -14,13 +14,14 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.refinement import RefinementBatch, SolverInTheLoop, WindowLoss, Windows
+from warp_resphys.settings.learning import NetworkSettings, RefinementSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
 REALITY, WRONG = Corotated(264e3, 0.45), Corotated(215e3, 0.45)
-CONFIG = {"kind": "solver_in_the_loop", "window": 3, "epochs": 4, "batch_size": 4, "memory": 5, "rollout_every": 1}
+CONFIG = RefinementSettings(window=3, epochs=4, batch_size=4, memory=5)
 FRAMES = 11
 
 
@@ -63,7 +64,7 @@ def network(seed=0):
     torch.manual_seed(seed)
     rest = simulator().rest_positions
     force = 1e-3 * torch.randn(FRAMES * 2, *rest.shape, dtype=torch.float64)
-    sizes = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 8, "activation": "normalised_elu"}
+    sizes = NetworkSettings(kind="nodal", blocks=2, layers=1, width=8, activation="normalised_elu")
     return build_model(sizes, rest, TRAIN.q.flatten(0, 1), TRAIN.v.flatten(0, 1), force)
 
 
@@ -86,8 +87,8 @@ def window_loss(model, window=3, batch_size=4, integrator="implicit_euler"):
 
 def trainer(model=None, error=None, **changes):
     model = network() if model is None else model
-    config = {**CONFIG, **changes}
-    loss = window_loss(model, config["window"], config["batch_size"])
+    config = CONFIG.changed(**changes)
+    loss = window_loss(model, config.window, config.batch_size)
 
     def drift(model):
         return loss.measure(loss.side_by_side([VALIDATION]), [VALIDATION])[0] ** 0.5

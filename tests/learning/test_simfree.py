@@ -9,6 +9,7 @@ from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import NextState, build_next_state, restore
 from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.learning.rollout import FURTHEST, Rollout, closed_loop
+from warp_resphys.settings.learning import NetworkSettings
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 SIMULATOR = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), Corotated(215e3, 0.45))
@@ -16,7 +17,7 @@ REST = SIMULATOR.rest_positions
 MODES, SAMPLES = 3, 60
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 8, "activation": "silu"}
 SIZES = {"position_modes": MODES, "velocity_modes": MODES, "force_modes": MODES, **ARCHITECTURE}
-NETWORKS = {kind: {"kind": kind, **SIZES} for kind in ("reduced", "nodal")}
+NETWORKS = {kind: NetworkSettings(kind=kind, **SIZES) for kind in ("reduced", "nodal")}
 
 
 class LinearSystem:

@@ -9,8 +9,9 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.training import Samples, Trainer
+from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
-NETWORK = {"kind": "nodal", "blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
+NETWORK = NetworkSettings(kind="nodal", blocks=2, layers=1, width=16, activation="normalised_elu")
 CONFIG = {
     "epochs": 6,
     "batch_size": 16,
@@ -47,7 +48,7 @@ def rollout_error(model):
 def trainer(seed=0, error=rollout_error, **settings):
     torch.manual_seed(seed)
     model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.outputs[0])
-    return Trainer(model, TRAIN, VALIDATION, error, {**CONFIG, **settings}, seed)
+    return Trainer(model, TRAIN, VALIDATION, error, TrainerSettings(**{**CONFIG, **settings}), seed)
 
 
 def finish(trainer):
@@ -200,7 +201,7 @@ def test_empty_split(name):
     splits = {"training": TRAIN, "validation": VALIDATION, name: replace(empty)}
     model = trainer().model
     with pytest.raises(InputError, match=f"the {name} split is empty"):
-        Trainer(model, splits["training"], splits["validation"], rollout_error, CONFIG, 0)
+        Trainer(model, splits["training"], splits["validation"], rollout_error, TrainerSettings(**CONFIG), 0)
 
 
 @pytest.mark.parametrize(("exponent", "smallest"), [(0.0, 1.0), (1.0, 0.1)])
@@ -210,7 +211,7 @@ def test_outputs_weigh_by_their_deviation(exponent, smallest):
     torch.manual_seed(0)
     model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
     data = [replace(each, outputs=(forces[: len(each.q)],)) for each in (TRAIN, VALIDATION)]
-    run = Trainer(model, *data, rollout_error, {**CONFIG, "scale_weight": exponent}, 0)
+    run = Trainer(model, *data, rollout_error, TrainerSettings(**{**CONFIG, "scale_weight": exponent}), 0)
     loss = run.run_epoch()["validation_loss"]
     (coder,) = model.coders
     with torch.no_grad():

@@ -158,12 +158,11 @@ def _new_network(experiment: Experiment, model: str, train: Samples, settings: T
     if not experiment.moving(experiment.settings.split.train):
         network = _limited(network, len(train.q), model)
     torch.manual_seed(settings.seed)
-    config = dict(network)
     if model == SIMFREE:
-        return build_next_state(config, rest, train.q, train.v, train.actuation)
+        return build_next_state(network, rest, train.q, train.v, train.actuation)
     by_displacement = network.kind == "reduced" and network.force_basis == "displacement"
     stiffness = RestStiffness(experiment.model_simulator(model)) if by_displacement else None
-    return build_model(config, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
+    return build_model(network, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
 
 
 def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSettings:
@@ -193,7 +192,7 @@ def _supervised(
     def judge(weights: StateMap) -> float:
         return error(dataclasses.replace(learned, network=weights))
 
-    return Prepared(kind(network, train, validation, judge, dict(settings.trainer), settings.seed), learned)
+    return Prepared(kind(network, train, validation, judge, settings.trainer, settings.seed), learned)
 
 
 def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Range | None:
@@ -213,12 +212,10 @@ def _in_the_loop(
     The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
     held out once to find how long training serves others; no epoch at all is one of the choices.
     """
-    config, split = dict(loop), experiment.settings.split
+    split = experiment.settings.split
     parameters, simulator = experiment.parameters(model), experiment.model_simulator(model)
-    everyone, frames = (
-        experiment.replays(simulator, split.train + split.validation, model),
-        experiment.frames(simulator),
-    )
+    everyone = experiment.replays(simulator, split.train + split.validation, model)
+    frames = experiment.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
@@ -241,10 +238,10 @@ def _in_the_loop(
     if loop.hold_out and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
-            epochs = cross_validated_epochs(make_network, parts, config, progress.advance)
+            epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
         log.info("%s: %d epochs serve trials that are held out best", model, epochs)
     judged = loss(validation) if validation else None
-    trainer = MarkersInTheLoop(make_network(), loss(train), judged, config, epochs)
+    trainer = MarkersInTheLoop(make_network(), loss(train), judged, loop, epochs)
     trainer.begin()
     learned = Learned(trainer.model, _range_of(experiment, trainer.model, samples), experiment.settings.force_frame)
     return Prepared(trainer, learned)
@@ -278,7 +275,7 @@ def refine(context: StageContext) -> None:
         frames=experiment.frames(simulator, learned.force_frame),
         range_=learned.range_,
     )
-    trainer = SolverInTheLoop(network, loss, train_on, validate_on, lambda _: error(learned), dict(refinement))
+    trainer = SolverInTheLoop(network, loss, train_on, validate_on, lambda _: error(learned), refinement)
     fit(context, model, Prepared(trainer, learned), refined=True)
     left_out = trainer.state.history[0]["left_out"]
     if left_out:
@@ -351,7 +348,7 @@ def run_epochs(
     """
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
-    with Progress(name, trainer.config["epochs"], "epochs", trainer.state.epoch) as progress:
+    with Progress(name, trainer.settings.epochs, "epochs", trainer.state.epoch) as progress:
         try:
             while not trainer.finished:
                 record = trainer.run_epoch()

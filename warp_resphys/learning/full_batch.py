@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from ..settings.learning import FullBatchSettings
 from .networks import ResidualForce
 from .training import EpochTrainer
 
@@ -20,26 +21,28 @@ _EVALUATIONS = 12  # of the loss, the most that an epoch takes
 class FullBatchTrainer(EpochTrainer[ResidualForce]):
     """Minimises a loss of the network's weights, of those that require a gradient, by L-BFGS.
 
-    The ``config`` has ``memory`` beside the keys of `EpochTrainer`: the pairs that L-BFGS keeps.
+    `FullBatchSettings.memory` is the number of pairs that L-BFGS keeps.
     """
+
+    settings: FullBatchSettings
 
     def __init__(
         self,
         model: ResidualForce,
         rollout_error: Callable[[ResidualForce], float],
-        config: Mapping[str, Any],
+        settings: FullBatchSettings,
     ) -> None:
         self._weights = [w for w in model.network.parameters() if w.requires_grad]
         optimiser = torch.optim.LBFGS(
             self._weights,
             max_iter=1,
             max_eval=_EVALUATIONS,
-            history_size=config["memory"],
+            history_size=settings.memory,
             line_search_fn="strong_wolfe",
             tolerance_grad=0.0,
             tolerance_change=0.0,
         )
-        super().__init__(model, optimiser, rollout_error, config)
+        super().__init__(model, optimiser, rollout_error, settings)
         self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     @abstractmethod

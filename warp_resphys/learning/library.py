@@ -194,11 +194,11 @@ def fit_force(
         InputError: sizes that do not fit the samples, or a recurrent network.
     """
     network = network or NetworkSettings()
-    config = dict(trainer or TrainerSettings())
+    trainer = trainer or TrainerSettings()
     if network.recurrent is not None:
         raise InputError("fit_force trains no recurrent network: leave network.recurrent out.")
     if validation is None:
-        config["selection"] = "validation_loss"
+        trainer = trainer.changed(selection="validation_loss")
 
     def rollout_error(model: ResidualForce) -> float:
         if validation is None:
@@ -208,8 +208,8 @@ def fit_force(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         fields = samples.q, samples.v, samples.outputs[0], samples.actuation
-        model = build_model(dict(network), simulator.rest_positions, *fields)
-    trained = Trainer(model, samples, samples, rollout_error, config, seed)
+        model = build_model(network, simulator.rest_positions, *fields)
+    trained = Trainer(model, samples, samples, rollout_error, trainer, seed)
     while not trained.finished:
         trained.run_epoch()
     return trained.use_best()

@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
+from ..settings.learning import InTheLoopSettings
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .predictors import LearnedPredictor
@@ -98,22 +99,26 @@ class MarkersInTheLoop(FullBatchTrainer):
         model: whose network's weights are trained; those of its last layers are set to zero, as is the mean force.
         train: loss on the training motions.
         validation: loss on the validation motions, by which the weights are chosen; None: the training motions are.
-        config: the group ``in_the_loop``.
+        settings: epochs, and the penalty on the weights.
         epochs: in place of the configured ones; 0 keeps the simulator as it is.
     """
+
+    settings: InTheLoopSettings
 
     def __init__(
         self,
         model: ResidualForce,
         train: MotionLoss,
         validation: MotionLoss | None,
-        config: Mapping[str, Any],
+        settings: InTheLoopSettings,
         epochs: int | None = None,
     ) -> None:
         judge = train if validation is None else validation
         with torch.no_grad():
             _remove_force(model)
-        super().__init__(model, judge.error_mm, config if epochs is None else {**config, "epochs": epochs})
+        super().__init__(
+            model, judge.error_mm, settings if epochs is None else settings.model_copy(update={"epochs": epochs})
+        )
         self._train = train
 
     def begin(self) -> None:
@@ -133,7 +138,7 @@ class MarkersInTheLoop(FullBatchTrainer):
 
     def _penalty(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]
-        return self.config["penalty"] * torch.stack(squares).sum()
+        return self.settings.penalty * torch.stack(squares).sum()
 
     @override
     def _backward(self) -> float:
@@ -149,7 +154,7 @@ class MarkersInTheLoop(FullBatchTrainer):
 def cross_validated_epochs(
     make_model: Callable[[], ResidualForce],
     parts: Sequence[tuple[MotionLoss, MotionLoss]],
-    config: Mapping[str, Any],
+    settings: InTheLoopSettings,
     advance: Callable[[], None],
 ) -> int:
     """How many epochs serve motions that training did not see: those with the smallest mean error over the parts.
@@ -157,21 +162,21 @@ def cross_validated_epochs(
     Args:
         make_model: an untrained model, the same every time.
         parts: losses of the motions to train on, and of those that are held out.
-        config: the group ``in_the_loop``; its epochs are the most that are tried, and its patience is after how many
+        settings: of every search; its epochs are the most that are tried, and its patience is after how many
             without any gain the search ends.
         advance: called after every epoch of every part.
 
     Returns:
         0 where no training is better than the simulator as it is.
     """
-    config = {**config, "rollout_every": 1}
-    trainers = [MarkersInTheLoop(make_model(), train, held_out, config) for train, held_out in parts]
+    settings = settings.changed(rollout_every=1)
+    trainers = [MarkersInTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
     for trainer in trainers:
         trainer.begin()
     while True:
         means = np.mean([[record["rollout_error_mm"] for record in t.state.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
-        if trainers[0].finished or len(means) - 1 - best >= config["patience"]:
+        if trainers[0].finished or len(means) - 1 - best >= settings.patience:
             return best
         for trainer in trainers:
             trainer.run_epoch()

@@ -13,10 +13,10 @@ from typing_extensions import override
 
 from ..dynamics.modes import RestStiffness
 from ..io.errors import InputError
+from ..settings.learning import NetworkSettings
 
-NETWORK_KINDS = ("reduced", "nodal")
+_ARCHITECTURE = ("blocks", "layers", "width", "activation")
 ACTIVATIONS = ("normalised_elu", "silu")
-FORCE_BASES = ("force", "displacement")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
 # Samples that modes are taken from, evenly picked: neighbours in time tell the same, and more take minutes.
@@ -212,8 +212,7 @@ class StateMap(nn.Module):
         position: coder of positions less the rest shape.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: ``blocks``, ``layers``, ``width`` and ``activation``, and ``recurrent``, the size of a hidden
-            state that goes with the roll-out, or None.
+        architecture: number and width of the layers, their activation, and the size of a hidden state if any.
         actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
     """
 
@@ -228,17 +227,16 @@ class StateMap(nn.Module):
         position: Coder,
         velocity: Coder,
         outputs: Mapping[str, Coder],
-        architecture: Mapping[str, Any],
+        architecture: NetworkSettings,
         actuation: Coder | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("rest", rest)
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
-        self.architecture = {key: architecture[key] for key in ("blocks", "layers", "width", "activation")}
-        self.recurrent: int | None = architecture.get("recurrent")
-        if self.recurrent is not None:
-            self.architecture["recurrent"] = self.recurrent
+        self.recurrent = architecture.recurrent
+        keys = (*_ARCHITECTURE, "recurrent") if self.recurrent is not None else _ARCHITECTURE
+        self.architecture = {key: getattr(architecture, key) for key in keys}
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
@@ -350,7 +348,7 @@ class NextState(StateMap):
 
 
 def build_model(
-    config: Mapping[str, Any],
+    settings: NetworkSettings,
     rest: torch.Tensor,
     q: torch.Tensor,
     v: torch.Tensor,
@@ -361,7 +359,7 @@ def build_model(
     """A residual force with coders from training samples.
 
     Args:
-        config: the group ``network``.
+        settings: kind and size of the network.
         rest: (N, 3) rest positions [m].
         q: (S, N, 3) positions [m].
         v: (S, N, 3) velocities [m/s].
@@ -371,38 +369,36 @@ def build_model(
             would cause; of the forces themselves if None.
 
     Raises:
-        InputError: an unknown kind, or sizes that do not fit the samples.
+        InputError: sizes that do not fit the samples.
     """
-    position, velocity = _state_coders(config, q - rest, v)
-    if config["kind"] == "reduced":
-        modes = config["force_modes"]
+    position, velocity = _state_coders(settings, q - rest, v)
+    if settings.kind == "reduced":
+        modes = settings.force_modes
         coder = pod_coder(force, modes) if stiffness is None else displacement_coder(force, stiffness, modes)
     else:
         coder = nodal_coder(force)
     actuated = None if actuation is None else actuation_coder(actuation)
-    return ResidualForce(rest, position, velocity, {"force": coder}, config, actuated)
+    return ResidualForce(rest, position, velocity, {"force": coder}, settings, actuated)
 
 
 def build_next_state(
-    config: Mapping[str, Any],
+    settings: NetworkSettings,
     rest: torch.Tensor,
     q: torch.Tensor,
     v: torch.Tensor,
     actuation: torch.Tensor | None = None,
 ) -> NextState:
     """A data-driven baseline of the same family, whose in- and outputs share their coders; see `build_model`."""
-    position, velocity = _state_coders(config, q - rest, v)
-    outputs = dict(zip(NextState.fields, _state_coders(config, q - rest, v), strict=True))
+    position, velocity = _state_coders(settings, q - rest, v)
+    outputs = dict(zip(NextState.fields, _state_coders(settings, q - rest, v), strict=True))
     actuated = None if actuation is None else actuation_coder(actuation)
-    return NextState(rest, position, velocity, outputs, config, actuated)
+    return NextState(rest, position, velocity, outputs, settings, actuated)
 
 
-def _state_coders(config: Mapping[str, Any], u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
+def _state_coders(settings: NetworkSettings, u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
     """Coders of displacements and velocities."""
-    if config["kind"] not in NETWORK_KINDS:
-        raise InputError(f"network.kind is {config['kind']!r}: choose one of {', '.join(NETWORK_KINDS)}.")
-    if config["kind"] == "reduced":
-        pairs = ((u, config["position_modes"]), (v, config["velocity_modes"]))
+    if settings.kind == "reduced":
+        pairs = ((u, settings.position_modes), (v, settings.velocity_modes))
         found = [pod_coder(field, modes) if modes else _blind_coder(field) for field, modes in pairs]
         return found[0], found[1]
     return nodal_coder(u), nodal_coder(v)
@@ -427,7 +423,7 @@ def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description:
     outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
     actuation = coder("actuation") if description["actuated"] else None
     state = coder("position"), coder("velocity")
-    model = kind(tensors["rest"], *state, outputs, description["architecture"], actuation)
+    model = kind(tensors["rest"], *state, outputs, NetworkSettings(**description["architecture"]), actuation)
     if tensors["linear"].dtype == torch.float64:
         model.double()
     model.load_state_dict(tensors)

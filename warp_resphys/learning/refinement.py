@@ -18,6 +18,7 @@ from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, InputError
+from ..settings.learning import RefinementSettings
 from ..stepping.state import State
 from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
@@ -257,8 +258,10 @@ class SolverInTheLoop(FullBatchTrainer):
         train: training trials.
         validation: held-out trials.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
-        config: the group ``refinement``.
+        settings: epochs, and the memory of L-BFGS.
     """
+
+    settings: RefinementSettings
 
     def __init__(
         self,
@@ -267,9 +270,9 @@ class SolverInTheLoop(FullBatchTrainer):
         train: Sequence[RefinementBatch],
         validation: Sequence[RefinementBatch],
         rollout_error: Callable[[ResidualForce], float],
-        config: Mapping[str, Any],
+        settings: RefinementSettings,
     ) -> None:
-        super().__init__(model, rollout_error, config)
+        super().__init__(model, rollout_error, settings)
         self._loss, self._train, self._validation = loss, train, validation
         self._windows = loss.side_by_side(train)
 
@@ -285,7 +288,7 @@ class SolverInTheLoop(FullBatchTrainer):
         if bool(lost.all()):
             raise InputError(
                 "the simulator fails in every window of the training split with the trained network's forces: take a "
-                f"smaller refinement.window than {self.config['window']}, or refinement=none."
+                f"smaller refinement.window than {self.settings.window}, or refinement=none."
             )
         self._windows = self._windows.pick((~lost).nonzero()[:, 0])
         losses = {"train_loss": loss, **self._validate()}

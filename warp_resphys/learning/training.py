@@ -11,6 +11,7 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
+from ..settings.learning import EpochSettings, TrainerSettings
 from .networks import Model, StateMap
 
 SCHEDULES = ("cosine", "step")
@@ -49,19 +50,19 @@ class EpochTrainer(ABC, Generic[Model]):
         model: to train.
         optimiser: of its network's weights.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
-        config: with ``epochs`` and ``rollout_every``.
+        settings: number of epochs, and how often the roll-out error is measured.
     """
 
-    selection = "rollout"
+    selection: str = "rollout"
 
     def __init__(
         self,
         model: Model,
         optimiser: torch.optim.Optimizer,
         rollout_error: Callable[[Model], float],
-        config: Mapping[str, Any],
+        settings: EpochSettings,
     ) -> None:
-        self.model, self.config, self.rollout_error = model, config, rollout_error
+        self.model, self.settings, self.rollout_error = model, settings, rollout_error
         self._optimiser, self.state = optimiser, TrainingState()
 
     @abstractmethod
@@ -71,14 +72,14 @@ class EpochTrainer(ABC, Generic[Model]):
     @property
     def finished(self) -> bool:
         """Whether all epochs are done."""
-        return self.state.epoch >= self.config["epochs"]
+        return self.state.epoch >= self.settings.epochs
 
     def run_epoch(self) -> dict[str, float]:
         """One epoch; returns its record."""
         losses = self._run_epoch()
         self.state.epoch += 1
         record = {"epoch": float(self.state.epoch), **losses}
-        if self.state.epoch % self.config["rollout_every"] == 0 or self.finished:
+        if self.state.epoch % self.settings.rollout_every == 0 or self.finished:
             record["rollout_error_mm"] = self.rollout_error(self.model)
         self._keep(record)
         return record
@@ -159,12 +160,14 @@ class Trainer(EpochTrainer[Model]):
         train: training samples.
         validation: held-out samples.
         rollout_error: see `EpochTrainer`.
-        config: the group ``trainer``.
+        settings: rates, batches, noise and epochs.
         seed: of the batches and the noise.
 
     Raises:
         InputError: an empty split.
     """
+
+    settings: TrainerSettings
 
     def __init__(
         self,
@@ -172,16 +175,16 @@ class Trainer(EpochTrainer[Model]):
         train: Samples,
         validation: Samples,
         rollout_error: Callable[[Model], float],
-        config: Mapping[str, Any],
+        settings: TrainerSettings,
         seed: int,
     ) -> None:
         for name, samples in (("training", train), ("validation", validation)):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
-        rate, decay = config["learning_rate"], config["weight_decay"]
-        optimiser = torch.optim.Adam(model.network.parameters(), lr=rate, weight_decay=decay, fused=True)
-        super().__init__(model, optimiser, rollout_error, config)
-        self.selection = config["selection"]
+        weights, rate = model.network.parameters(), settings.learning_rate
+        optimiser = torch.optim.Adam(weights, lr=rate, weight_decay=settings.weight_decay, fused=True)
+        super().__init__(model, optimiser, rollout_error, settings)
+        self.selection = settings.selection
         self._random = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             self._train = (model.encode(train.q, train.v, train.actuation), model.encode_outputs(*train.outputs))
@@ -189,16 +192,16 @@ class Trainer(EpochTrainer[Model]):
                 model.encode(validation.q, validation.v, validation.actuation),
                 model.encode_outputs(*validation.outputs),
             )
-            if config["linear_noise"] is not None:
-                model.fit_linear(*self._train, config["linear_noise"])
-            self._weights = scale_weights(model, config["scale_weight"])
+            if settings.linear_noise is not None:
+                model.fit_linear(*self._train, settings.linear_noise)
+            self._weights = scale_weights(model, settings.scale_weight)
 
     def learning_rate(self, epoch: int) -> float:
         """Cosine from the first to the final rate, or a factor gamma every so many epochs."""
-        first, last = self.config["learning_rate"], self.config["final_learning_rate"]
-        if self.config["schedule"] == "step":
-            return float(first * self.config["gamma"] ** (epoch // self.config["step_epochs"]))
-        phase = epoch / max(self.config["epochs"] - 1, 1)
+        first, last = self.settings.learning_rate, self.settings.final_learning_rate
+        if self.settings.schedule == "step":
+            return float(first * self.settings.gamma ** (epoch // self.settings.step_epochs))
+        phase = epoch / max(self.settings.epochs - 1, 1)
         return float(last + 0.5 * (first - last) * (1.0 + math.cos(math.pi * phase)))
 
     @override
@@ -224,7 +227,7 @@ class Trainer(EpochTrainer[Model]):
         """Yields the mean loss of each batch of one pass over the samples, and the number of samples in it."""
         inputs, outputs = self._train
         order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
-        for batch in order.split(self.config["batch_size"]):
+        for batch in order.split(self.settings.batch_size):
             found, _ = self.model.standardised(self._noisy(inputs[batch]))
             yield self._squares(found, outputs[batch]).mean(), len(batch)
 
@@ -234,9 +237,9 @@ class Trainer(EpochTrainer[Model]):
         return self._squares(self.model.standardised(inputs)[0], outputs).mean()
 
     def _noisy(self, inputs: torch.Tensor) -> torch.Tensor:
-        if not self.config["noise"] > 0.0:
+        if not self.settings.noise > 0.0:
             return inputs
-        return inputs + self.config["noise"] * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
+        return inputs + self.settings.noise * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
 
     def _squares(self, found: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
         """Weighted squared errors of the standardised outputs, in units of what the linear part leaves."""
@@ -269,7 +272,8 @@ class SequenceTrainer(Trainer[Model]):
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
         inputs, outputs, inside = self._train_series
         hidden = None
-        for span in torch.arange(len(inputs)).split(self.config["sequence"]):
+        assert self.settings.sequence is not None
+        for span in torch.arange(len(inputs)).split(self.settings.sequence):
             count = float(inside[span].sum())
             loss, hidden = self._through(self._noisy(inputs[span]), outputs[span], inside[span], hidden, count)
             yield loss, count

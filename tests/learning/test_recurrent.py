@@ -59,7 +59,9 @@ def series(seed):
 def trained(recurrent):
     torch.manual_seed(0)
     train, held_out = series(1), series(2)
-    model = build_model(NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0])
+    model = build_model(
+        NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0]
+    )
     trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
     while not trainer.finished:
         trainer.run_epoch()

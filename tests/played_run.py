@@ -1,4 +1,4 @@
-"""Whether the robots of a run do in its test trials what the evaluation wrote, from the folder and from a file."""
+"""Checks that the robots of a run repeat its evaluation, loaded from the folder and from a file."""
 
 from pathlib import Path
 
@@ -10,10 +10,10 @@ from warp_resphys.io.files import read_array, read_hdf5
 
 
 def check_robots(folder, models=("simulation", "sysid", "simfree", "resphys"), tolerance=1e-8):
-    """Every model's trials as in rollouts.h5 [m], up to what solver tolerances leave."""
+    """Compares every model's trials with rollouts.h5 [m], up to solver tolerances."""
     folder = Path(folder)
     with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
-        names = [str(each) for each in file.attrs["names"]]
+        names = [str(name) for name in file.attrs["names"]]
         expected = {model: read_array(file, f"{model}_observed") for model in models}
     for model in models:
         robot = warp_resphys.load(folder, model)

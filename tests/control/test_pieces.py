@@ -1,14 +1,16 @@
 """Paths, polynomials, the response of inputs, quadratic programs, and what control has without a simulator."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from warp_resphys.control.baselines import fit_linear
 from warp_resphys.control.controllers import JacobianFeedback
-from warp_resphys.control.evaluator import Evaluator
-from warp_resphys.control.plan import Limits, Planner, Weights, solve_program, tracked_of
+from warp_resphys.control.plan import Horizon, Limits, Planner, Weights, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, powers
+from warp_resphys.control.reduced_force import Evaluator
 from warp_resphys.control.reference import Path
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import build_model
@@ -42,18 +44,17 @@ class TestPaths:
     @pytest.mark.parametrize(
         ("change", "said"),
         [
-            ({"name": "square"}, "the path is 'square': choose circle, eight, or a capital letter"),
-            ({"size": 0.0}, "the size of the path circle is 0: it must be positive"),
-            ({"up": (2.0, 0.0, 0.0)}, "the path circle lies in no plane"),
+            ({"name": "square"}, "square"),
+            ({"size": 0.0}, "size"),
+            ({"up": (2.0, 0.0, 0.0)}, "parallel"),
+            ({"name": "R", "seconds": 0.05}, "ten steps"),
         ],
     )
-    def test_what_is_no_path(self, change, said):
+    def test_invalid_paths_are_refused(self, change, said):
+        given = {"name": "circle", "size": 0.1, "centre": (0.0, 0.0, 0.0), "seconds": 1.0, **change}
+        seconds = given.pop("seconds")
         with pytest.raises(InputError, match=said):
-            _ = Path(**{"name": "circle", "size": 0.1, "centre": (0.0, 0.0, 0.0), **change}).points
-
-    def test_too_fast(self):
-        with pytest.raises(InputError, match=r"is to take 0.05 s: that is less than ten steps"):
-            Path("R", 0.1, (0.0, 0.0, 0.0)).timed(0.05, 0.01)
+            Path(**given).timed(seconds, 0.01)
 
 
 class TestPolynomials:
@@ -70,35 +71,33 @@ class TestPolynomials:
             np.testing.assert_allclose(wanted.slopes(at)[:, variable], slope, atol=1e-7)
 
 
+def program(target, rows, least, most, high):
+    """The point nearest to a target, between zero and upper bounds, with one linear constraint."""
+    target = np.array(target)
+    return solve_program(
+        np.eye(len(target)), -target, np.array([rows]), np.array([least]), np.array([most]), 0.0 * target, high
+    )
+
+
 class TestPrograms:
     def test_a_bound_and_a_rate_hold(self):
         """The nearest point to (3, 2) with x at most 1 and y - x at most -0.5."""
-        found = solve_program(
-            np.eye(2),
-            -np.array([3.0, 2.0]),
-            np.array([[-1.0, 1.0]]),
-            np.array([-9.0]),
-            np.array([-0.5]),
-            np.zeros(2),
-            np.array([1.0, 9.0]),
-        )
-        np.testing.assert_allclose(found, [1.0, 0.5], atol=1e-3)
+        nearest = program([3.0, 2.0], [-1.0, 1.0], -9.0, -0.5, np.array([1.0, 9.0]))
+        np.testing.assert_allclose(nearest, [1.0, 0.5], atol=1e-3)
 
-    def test_without_a_solution_it_says_so(self):
-        with pytest.raises(InputError, match="no inputs are within their bounds and rates"):
-            solve_program(
-                np.eye(1), np.zeros(1), np.ones((1, 1)), np.full(1, 2.0), np.full(1, 3.0), np.zeros(1), np.ones(1)
-            )
+    def test_contradicting_constraints_are_refused(self):
+        with pytest.raises(InputError, match="bounds and rate limits"):
+            program([0.0], [1.0], 2.0, 3.0, np.ones(1))
 
     def test_a_missing_package_is_named(self, monkeypatch):
-        monkeypatch.setitem(__import__("sys").modules, "piqp", None)
-        with pytest.raises(InputError, match=r"pip install 'warp-resphys\[control\]'"):
-            solve_program(*[np.eye(1), *[np.zeros(1)]], np.ones((1, 1)), *[np.zeros(1)] * 2, np.zeros(1), np.ones(1))
+        monkeypatch.setitem(sys.modules, "piqp", None)
+        with pytest.raises(InputError, match=r"warp-resphys\[control\]"):
+            program([0.0], [1.0], 0.0, 0.0, np.ones(1))
 
     def test_points_are_means_of_markers(self):
         markers = np.arange(9.0).reshape(3, 3)
         np.testing.assert_allclose(tracked_of("abc", ["a", "c"]) @ markers.ravel(), markers[[0, 2]].mean(0))
-        with pytest.raises(InputError, match=r"^tracked names 'd': choose from a, b, c"):
+        with pytest.raises(InputError, match="tracked names 'd'"):
             tracked_of("abc", ["d"])
 
 
@@ -131,36 +130,33 @@ def driven_line(steps, random, matrices):
 
 
 class TestBaselines:
-    def made(self):
+    @pytest.fixture(scope="class")
+    def fitted(self):
+        """A model of four trials, the last for validation; a path; and the error of a plan for any path."""
         random = np.random.default_rng(3)
         turn = 0.97 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
         matrices = turn, np.array([[0.0], [0.01]]), random.standard_normal((6, 2))
-        return random, matrices
-
-    def test_a_linear_system_is_identified_and_planned_with(self):
-        random, matrices = self.made()
         trials = [driven_line(100, random, matrices) for _ in range(4)]
         model = fit_linear(trials[:3], trials[3:], np.ones(1), 0.01)
-        assert model.validation_mm < 1e-3
-        path = driven_line(30, random, matrices)[0][1:]
-        planner = Planner(
-            model, np.eye(6), Limits(np.zeros(1), np.ones(1), np.full(1, 200.0)), 30, 30, Weights(1e-9, 1e-9), 2
-        )
-        plan = planner.plan(model.state([np.full(6, 0.1)] * 4), np.zeros(1), path)
-        played = model.respond(model.state([np.full(6, 0.1)] * 4), plan.inputs).y
-        assert np.abs(played - path).max() < 0.05 * np.abs(path - 0.1).max()
-
-    def test_where_a_path_does_not_matter_nothing_holds_the_points(self):
-        random, matrices = self.made()
-        model = fit_linear([driven_line(100, random, matrices) for _ in range(3)], [], np.ones(1), 0.01)
         start, path = model.state([np.full(6, 0.1)] * 4), driven_line(30, random, matrices)[0][1:]
-        limits, free = Limits(np.zeros(1), np.ones(1), np.full(1, 200.0)), np.arange(30) < 15
-        planner = Planner(model, np.eye(6), limits, 30, 30, Weights(1e-9, 1e-9), 2)
-        last = np.where(free[:, None], np.nan, path)
-        off = model.respond(start, planner.plan(start, np.zeros(1), last).inputs).y - path
-        held = np.where(free[:, None], 0.1, path)
-        worse = model.respond(start, planner.plan(start, np.zeros(1), held).inputs).y - path
-        assert np.abs(off[~free]).max() < 0.2 * np.abs(worse[~free]).max()
+        limits = Limits(np.zeros(1), np.ones(1), np.full(1, 200.0))
+        planner = Planner(model, np.eye(6), limits, Horizon(30, 30, Weights(1e-9, 1e-9), 2))
+
+        def error(wanted):
+            return np.abs(model.respond(start, planner.plan(start, np.zeros(1), wanted).inputs).y - path)
+
+        return model, path, error
+
+    def test_a_linear_system_is_identified_and_planned_with(self, fitted):
+        model, path, error = fitted
+        assert model.validation_mm < 1e-3
+        assert error(path).max() < 0.05 * np.abs(path - 0.1).max()
+
+    def test_points_are_free_where_the_path_is_nan(self, fitted):
+        _, path, error = fitted
+        free = np.arange(30) < 15
+        without, held = (error(np.where(free[:, None], value, path))[~free] for value in (np.nan, 0.1))
+        assert without.max() < 0.2 * held.max()
 
     def test_feedback_finds_a_place_that_its_jacobian_gets_wrong(self):
         true = np.array([[1e-3, 0.0, 5e-4], [0.0, 2e-3, 0.0]])

@@ -29,22 +29,19 @@ def model(request):
         coefficients[0] += middle
         return Polynomial(coefficients, order)
 
-    told = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
+    conditions = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
-    network = (
-        build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, told)
-        .double()
-        .requires_grad_(False)
-    )
+    network = build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
+    network = network.double().requires_grad_(False)
     seen = np.zeros((6, 2 * MODES))
     seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
     force = ReducedForce(
         network,
-        Range.of(torch.randn(30, 6 + told.shape[1], dtype=torch.float64)),
+        Range.of(torch.randn(30, 6 + conditions.shape[1], dtype=torch.float64)),
         polynomial(3, np.zeros(6), 0.1),
         polynomial(2, seen, 0.1),
-        0.1 * random.standard_normal(told.shape[1]),
-        0.3 * random.standard_normal((told.shape[1], told.shape[1])),
+        0.1 * random.standard_normal(conditions.shape[1]),
+        0.3 * random.standard_normal((conditions.shape[1], conditions.shape[1])),
         polynomial(1, np.zeros(3), 0.1),
         polynomial(2, random.standard_normal((MODES, 3)), 0.1),
     )

@@ -20,7 +20,7 @@ def test_a_trial_commands_its_inputs(robot):
     live = LiveRobot(robot)
     live.play_trial(warp_resphys.trial_names(robot)[-1])
     motion = live.trial.play(robot)
-    (name,) = (each for each in live.trial.inputs if each in robot.inputs)
+    (name,) = [name for name in live.trial.inputs if name in robot.inputs]
     given = np.asarray(live.trial.inputs[name]).reshape(-1, len(robot.inputs[name].parts))
     assert np.ptp(given, axis=0).max() > 0.0
     shown = live.trial.shown(motion)
@@ -28,13 +28,12 @@ def test_a_trial_commands_its_inputs(robot):
         assert live.step()
         np.testing.assert_allclose(live.inputs[name], given[number])
         np.testing.assert_allclose(live.positions, motion.q[number + 1, 0], rtol=0.0, atol=1e-9)
-        frame = np.flatnonzero(np.isclose(live.trial.times, live.time, atol=1e-9))
-        for known in frame:
-            np.testing.assert_allclose(live.markers, shown[known], rtol=0.0, atol=1e-9)
-            np.testing.assert_allclose(live.measured, live.trial.markers[known], rtol=0.0, atol=1e-9)
+        for frame in np.flatnonzero(np.isclose(live.trial.times, live.time, atol=1e-9)):
+            np.testing.assert_allclose(live.markers, shown[frame], rtol=0.0, atol=1e-9)
+            np.testing.assert_allclose(live.measured, live.trial.markers[frame], rtol=0.0, atol=1e-9)
 
 
-def test_between_frames_what_was_measured_is_linear_in_time(robot):
+def test_measured_markers_are_interpolated_linearly_between_frames(robot):
     live = LiveRobot(robot)
     live.play_trial(warp_resphys.trial_names(robot)[0])
     times, seen = live.trial.times, live.trial.markers
@@ -42,17 +41,18 @@ def test_between_frames_what_was_measured_is_linear_in_time(robot):
     np.testing.assert_allclose(live.measured, 0.75 * seen[3] + 0.25 * seen[4], rtol=0.0, atol=1e-12)
 
 
-def test_markers_that_are_seen_in_a_frame_of_their_own_are_shown_on_the_body(robot):
-    known = robot.description
-    own = Robot(replace(known, markers=known.markers.changed(frame="own")))
-    plain, turned = LiveRobot(Robot(known)), LiveRobot(own)
+def test_markers_observed_in_their_own_frame_are_shown_on_the_body(robot):
+    description = robot.description
+    own = Robot(replace(description, markers=description.markers.changed(frame="own")))
+    plain, turned = LiveRobot(Robot(description)), LiveRobot(own)
+    name, driven = next(iter(robot.inputs.items()))
     for live in (plain, turned):
         live.play_trial(None)
-        live.set_input(next(iter(robot.inputs)), 0, 0.5 * robot.inputs[next(iter(robot.inputs))].high[0])
+        live.set_input(name, 0, 0.5 * driven.high[0])
         for _ in range(10):
             live.step()
-    told = own.observe(turned.state)[0].numpy()
+    observed = own.observe(turned.state)[0].numpy()
     np.testing.assert_allclose(turned.positions, plain.positions, rtol=0.0, atol=1e-9)
-    assert np.abs(told - plain.markers).max() > 1e-4
+    assert np.abs(observed - plain.markers).max() > 1e-4
     np.testing.assert_allclose(turned.markers, plain.markers, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(kabsch(told, plain.markers).apply(told), plain.markers, atol=1e-8)
+    np.testing.assert_allclose(kabsch(observed, plain.markers).apply(observed), plain.markers, atol=1e-8)

@@ -4,6 +4,7 @@ import contextlib
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import warp_resphys
 from warp_resphys import pipeline
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.robot.program import export_network, told_names
+from warp_resphys.robot.program import condition_names, export_network
 
 # A short segment with two chambers of some 70 vertices; what is unknown of its pressures is identified.
 SEGMENT = """# @package _global_
@@ -86,6 +87,11 @@ def robot(arm):
     return warp_resphys.load(arm)
 
 
+def played(robot, steps):
+    with torch.no_grad():
+        return robot.rollout(robot.begin(), pressure=wave(steps))
+
+
 def wave(steps, batch=1):
     times = torch.arange(steps, dtype=torch.float64)[:, None, None]
     phase = torch.arange(2 * batch, dtype=torch.float64).reshape(1, batch, 2)
@@ -103,11 +109,11 @@ class TestRollouts:
         robot = warp_resphys.load(folder)
         program = torch.export.load(export_network(robot, tmp_path / "force.pt2")).module()
         state = robot.step(robot.begin(2), pressure=[HIGH, 0.0])
-        told = state.memory["pressure.behind"]
-        found, hidden = program(state.q, state.v, told, state.hidden)
-        predictor = robot._predictor(told, None)
+        conditions = state.memory["pressure.behind"]
+        force, hidden = program(state.q, state.v, conditions, state.hidden)
+        predictor = robot._predictor(conditions, None)
         predictor.hidden = state.hidden
-        torch.testing.assert_close(found, predictor(state.body, 0))
+        torch.testing.assert_close(force, predictor(state.body, 0))
         torch.testing.assert_close(hidden, predictor.hidden)
 
     def test_a_fold_is_a_robot_and_their_parent_says_so(self, tmp_path):
@@ -137,7 +143,7 @@ class TestRollouts:
         assert torch.equal(further.q[0], motion.q[-1])
         np.testing.assert_allclose(motion.times, robot.time_step * np.arange(6))
 
-    def test_at_rest_it_stays_where_its_force_brings_it(self, robot):
+    def test_a_settled_robot_stays_at_rest(self, robot):
         with torch.no_grad():
             rest = robot.settle(pressure={"chamber_1": HIGH})
             motion = robot.rollout(rest, 3, pressure=[HIGH, 0.0])
@@ -145,7 +151,7 @@ class TestRollouts:
         assert float((motion.q - rest.q).abs().max()) < 2e-6
         assert float((begun.q - rest.q).abs().max()) > 1e-5  # without the learned force it rests elsewhere
 
-    def test_what_leaves_the_training_is_said(self, robot):
+    def test_leaving_the_training_range_is_reported(self, robot):
         q = robot.begin(2).q.clone()
         q[1, :, 0] += 0.03 * (q[1, :, 2] / 0.1) ** 2  # m: it was never bent so far
         with torch.no_grad():
@@ -165,7 +171,7 @@ class TestGradients:
             return own.rollout(start, pressure=pressure).markers[-1, 0, 0, 0]
 
         values = [wave(3)[:, 0] + 100.0, torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)]
-        values = [each.requires_grad_(True) for each in values]
+        values = [value.requires_grad_(True) for value in values]
         tip(*values).backward()
         with torch.no_grad():
             for at, step in ((0, 30.0), (1, 1e-2), (2, 3e-5)):  # Less of a step, and float32 forces round it away.
@@ -205,8 +211,7 @@ class TestStates:
 
 class TestFiles:
     def test_a_table_is_read_as_a_recording(self, robot, tmp_path):
-        with torch.no_grad():
-            motion = robot.rollout(robot.begin(), pressure=wave(6))
+        motion = played(robot, 6)
         path = motion.write_csv(tmp_path / "motion.csv")
         header, *rows = path.read_text().splitlines()
         assert header.split(",")[:4] == ["time [s]", "T1.x [m]", "T1.y [m]", "T1.z [m]"]
@@ -219,8 +224,7 @@ class TestFiles:
     def test_a_series_for_paraview(self, robot, tmp_path):
         import pyvista
 
-        with torch.no_grad():
-            motion = robot.rollout(robot.begin(), pressure=wave(3))
+        motion = played(robot, 3)
         reader = pyvista.get_reader(motion.write_vtk(tmp_path / "arm.pvd"))
         np.testing.assert_allclose(reader.time_values, motion.times)
         reader.set_active_time_value(motion.times[-1])
@@ -237,8 +241,7 @@ class TestFiles:
         pytest.importorskip("pxr", reason="the extra usd is not installed")
         from pxr import Usd, UsdGeom
 
-        with torch.no_grad():
-            motion = robot.rollout(robot.begin(), pressure=wave(3))
+        motion = played(robot, 3)
         for name in ("arm.usda", "arm.usd"):
             stage = Usd.Stage.Open(str(motion.write_usd(tmp_path / name)))
             assert UsdGeom.GetStageUpAxis(stage) == "Z"
@@ -255,14 +258,14 @@ class TestFiles:
     def test_a_program_of_torch(self, robot, tmp_path):
         path = export_network(robot, tmp_path / "force.pt2")
         program = torch.export.load(path).module()
-        names = told_names(robot)
+        names = condition_names(robot)
         pressures = ["pressure chamber_1 [Pa]", "pressure chamber_2 [Pa]"]
-        assert names == [*pressures, *(f"mean of {each} over 0.1 s" for each in pressures)]
+        assert names == [*pressures, *(f"mean of {name} over 0.1 s" for name in pressures)]
         with torch.no_grad():
             state = robot.rollout(robot.begin(3), pressure=wave(4)).final
-            told = HIGH * torch.tensor([[0.1, 0.2, 0.3, 0.4], [9.0, 0.0, 9.0, 0.0], [0.0, 0.0, 0.0, 0.0]]).double()
-            (force,) = program(state.q, state.v, told, None)
-            expected = robot._predictor(told, None)(state.body, 0)
+            given = HIGH * torch.tensor([[0.1, 0.2, 0.3, 0.4], [9.0, 0.0, 9.0, 0.0], [0.0, 0.0, 0.0, 0.0]]).double()
+            (force,) = program(state.q, state.v, given, None)
+            expected = robot._predictor(given, None)(state.body, 0)
         torch.testing.assert_close(force, expected)
         assert float(force.abs().max()) > 0.0
 
@@ -271,21 +274,21 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("call", "sentence"),
         [
-            (lambda r, s: r.step(s, presure=[0.0]), "no input 'presure': the robot has 'pressure', 'base', 'ext"),
-            (lambda r, s: r.step(s, pressure="high"), "pressure is 'high': it must be numbers"),
-            (lambda r, s: r.step(s, pressure={"3": 1.0}), r"pressure has no part '3': it has 'chamber_1', 'chamber_2'"),
-            (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\): give \(2,\) values in P"),
-            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), r"pressure is n"),
-            (lambda r, s: r.step(s, external_force=[0.0, 0.0, 1.0]), r"external_force has shape \(3,\): give \(\d+, "),
-            (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "no number of steps: give `steps`"),
-            (lambda r, s: r.with_parameters(youngs=1.0), "no parameter 'youngs'.*youngs_modulus"),
-            (lambda r, s: r.with_parameters(youngs_modulus=-1.0), "youngs_modulus is -1: it must be positive"),
-            (lambda r, s: r.save("robot.pt"), "robot.pt does not end in .safetensors"),
-            (lambda r, s: r.rollout(s, 1).write_vtk("a.vtk"), "a.vtk does not end in .pvd"),
-            (lambda r, s: r.rollout(s, 1).write_usd("a.obj"), "a.obj does not end in .usd"),
-            (lambda r, s: r.rollout(s, 1).write_csv("a.csv", 1), "environment is 1: the motion has 1"),
-            (lambda r, s: export_network(r, "net.pt"), "net.pt does not end in .pt2"),
-            (lambda r, s: warp_resphys.recorded_trial(r, "t9"), "the trial is 't9': .* has 't000'"),
+            (lambda r, s: r.step(s, presure=[0.0]), "'presure': the robot has 'pressure', 'base', 'external_force'"),
+            (lambda r, s: r.step(s, pressure="high"), "pressure is 'high'"),
+            (lambda r, s: r.step(s, pressure={"3": 1.0}), "'3': it has 'chamber_1', 'chamber_2'"),
+            (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\): give \(2,\)"),
+            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure is nan"),
+            (lambda r, s: r.step(s, external_force=[0.0, 0.0, 1.0]), r"external_force has shape \(3,\)"),
+            (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "steps"),
+            (lambda r, s: r.with_parameters(youngs=1.0), "'youngs'.*youngs_modulus"),
+            (lambda r, s: r.with_parameters(youngs_modulus=-1.0), "youngs_modulus is -1"),
+            (lambda r, s: r.save("robot.pt"), ".safetensors"),
+            (lambda r, s: r.rollout(s, 1).write_vtk("a.vtk"), ".pvd"),
+            (lambda r, s: r.rollout(s, 1).write_usd("a.obj"), ".usd"),
+            (lambda r, s: r.rollout(s, 1).write_csv("a.csv", 1), "environment is 1"),
+            (lambda r, s: export_network(r, "net.pt"), ".pt2"),
+            (lambda r, s: warp_resphys.recorded_trial(r, "t9"), "'t9': .* has 't000'"),
         ],
     )  # fmt: skip
     def test_calls(self, robot, call, sentence):
@@ -293,65 +296,60 @@ class TestBadInput:
             call(robot, robot.begin())
 
     def test_models_and_files(self, arm, robot, tmp_path):
-        with pytest.raises(InputError, match=r"the model is 'resfys': .* has 'simulation', .*'sysid'"):
+        with pytest.raises(InputError, match=r"'resfys': .* has 'simulation', .*'sysid'"):
             warp_resphys.load(arm, "resfys")
         kept = robot.save(tmp_path / "robot.safetensors")
-        with pytest.raises(InputError, match=r"the model is 'sysid', but .* holds 'resphys'"):
+        with pytest.raises(InputError, match=r"'sysid', but .* 'resphys'"):
             warp_resphys.load(kept, "sysid")
-        with pytest.raises(InputError, match="loaded from a file, which has no trials"):
+        with pytest.raises(InputError, match="no trials"):
             warp_resphys.trial_names(warp_resphys.load(kept))
         sysid = warp_resphys.load(arm, "sysid")
-        with pytest.raises(InputError, match="is a simulator alone: it has learned nothing"):
+        with pytest.raises(InputError, match="no network"):
             export_network(sysid, tmp_path / "net.pt2")
         content = bytearray(kept.read_bytes())
         content[-9] ^= 1
         kept.write_bytes(content)
-        with pytest.raises(DataFileError, match="does not match its checksum"):
+        with pytest.raises(DataFileError, match="checksum"):
             warp_resphys.load(kept)
 
-    def test_runs_that_are_not_done_or_of_other_programs(self, arm, tmp_path):
-        with pytest.raises(DataFileError, match="does not exist: name a run folder"):
+    def test_a_folder_without_a_run(self, tmp_path):
+        with pytest.raises(DataFileError, match="does not exist"):
             warp_resphys.load(tmp_path / "nothing")
-        with pytest.raises(DataFileError, match="is no run folder"):
+        with pytest.raises(DataFileError, match="not a run folder"):
             warp_resphys.load(tmp_path)
+
+    def test_a_copy_of_a_run_is_a_run(self, arm, tmp_path):
+        assert warp_resphys.load(shutil.copytree(arm, tmp_path / "run")).description.model == "resphys"
+
+    @pytest.mark.parametrize(
+        ("file", "change", "sentence"),
+        [
+            ("stages/evaluate.json", {"versions": {"warp-resphys": "9.4.0"}}, r"9\.4\.0.*0\.1\.0"),
+            ("stages/evaluate.json", None, "'evaluate' was not completed"),
+            ("stages/train_resphys.json", {"fingerprint": "other"}, "'train_resphys' was run again after 'evaluate'"),
+            ("stages/train_resphys.json", None, "'train_resphys' was not completed"),
+            ("resphys.safetensors", None, "resphys.safetensors is missing or has changed"),
+        ],
+    )
+    def test_an_unfinished_or_changed_run_is_refused(self, arm, tmp_path, file, change, sentence):
         folder = Path(shutil.copytree(arm, tmp_path / "run"))
-        assert warp_resphys.load(folder).description.model == "resphys"  # a copy is as good
-        record = read_json(folder / "stages/evaluate.json")
-        write_json(folder / "stages/evaluate.json", {**record, "versions": {"warp-resphys": "9.4.0"}})
-        with pytest.raises(DataFileError, match=r"was made by warp-resphys 9\.4\.0, and this is 0\.1\.0: run"):
-            warp_resphys.load(folder)
-        write_json(folder / "stages/evaluate.json", record)
-        trained = read_json(folder / "stages/train_resphys.json")
-        write_json(folder / "stages/train_resphys.json", {**trained, "fingerprint": "other"})
-        with pytest.raises(DataFileError, match="unfinished, as its stage 'train_resphys' was run since 'evaluate'"):
-            warp_resphys.load(folder)
-        (folder / "stages/train_resphys.json").unlink()
-        with pytest.raises(DataFileError, match="unfinished, as its stage 'train_resphys' was not run to the end"):
-            warp_resphys.load(folder)
-        write_json(folder / "stages/train_resphys.json", trained)
-        (folder / "resphys.safetensors").write_bytes(b"-")
-        with pytest.raises(DataFileError, match="is missing or has changed since it was written"):
-            warp_resphys.load(folder)
-        (folder / "stages/evaluate.json").unlink()
-        with pytest.raises(DataFileError, match="unfinished, as its stage 'evaluate' was not run to the end"):
+        if change is None:
+            (folder / file).unlink()
+        else:
+            write_json(folder / file, {**read_json(folder / file), **change})
+        with pytest.raises(DataFileError, match=sentence):
             warp_resphys.load(folder)
 
     def test_a_package_that_is_not_there(self, robot, monkeypatch, tmp_path):
-        monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-        with pytest.raises(InputError, match=r"not installed: pip install 'warp-resphys\[usd\]'"):
+        monkeypatch.setitem(sys.modules, "pxr", None)
+        with pytest.raises(InputError, match=r"warp-resphys\[usd\]"):
             robot.rollout(robot.begin(), 1).write_usd(tmp_path / "a.usd")
 
 
-def test_it_says_what_it_is(robot, arm):
+def test_its_description(robot, arm):
     text = repr(robot)
-    for said in (
-        "run, resphys: ",
-        "3 markers",
-        "input pressure [Pa]: chamber_1, chamber_2",
-        "identified pressure_delay: ",
-        "mean error",
-    ):
-        assert said in text
+    for part in ("run, resphys: ", "3 markers", "pressure [Pa]: chamber_1, chamber_2", "pressure_delay: ", "error"):
+        assert part in text
     low, high = robot.inputs["pressure"].low, robot.inputs["pressure"].high
     assert low[0] >= 0.0
     assert 1e3 < high[0] <= 2.1e4

@@ -24,9 +24,9 @@ def test_environments_are_chosen_from_two_states():
     )
     mixed = first.where(torch.tensor([True, False]), second)
     for name in ("q", "v", "hidden", "left"):
-        found, wanted = getattr(mixed, name), getattr(first, name)
-        assert torch.equal(found[0], wanted[0])
-        assert not found[1].any()
+        joined, wanted = getattr(mixed, name), getattr(first, name)
+        assert torch.equal(joined[0], wanted[0])
+        assert not joined[1].any()
     assert torch.equal(mixed.base[:, 0], first.base[:, 0])
     assert not mixed.base[:, 1].any()
     assert torch.equal(mixed.memory["pressure.queue"][:, 0], first.memory["pressure.queue"][:, 0])

@@ -1,1 +1,1 @@
-"""Inputs that make points of a robot follow a path: references, a reduced model, plans, estimates, and baselines."""
+"""Control: inputs that make a point of a robot follow a path. Paths, reduced models, plans, estimators, baselines."""

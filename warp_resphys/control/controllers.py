@@ -1,12 +1,11 @@
-"""Controllers: they play a plan, plan anew at every step, or feed back the error by a Jacobian.
+"""Controllers: open loop (a plan is played), receding horizon (a new plan at every step), and Jacobian feedback.
 
-A controller has a memory of arrays, from which a run that was interrupted goes on.
+The memory of a controller is a set of arrays, so that an interrupted run can resume.
 """
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -15,38 +14,38 @@ from typing_extensions import override
 
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
-from .plan import Limits, Planner, PredictionModel, Weights
+from .plan import Horizon, Limits, Plan, Planner, PredictionModel
 from .reduced import ReducedModel
 
 FloatArray = NDArray[np.float64]
 Memory = dict[str, FloatArray]
 
-_SETTLES = 0.1  # share by which a linear model's constant error is corrected in a step
-_AVERAGED = 0.25  # s, over which the means of points and inputs are compared, without what vibrates
-_LEARNING = 0.05  # share of Broyden's correction that is taken in a step
-_LITTLE = 1e-3  # of the squared changes of the inputs, as shares of their ranges, that tell little
-_DAMPING = 0.05  # of the largest singular value
+_SETTLES = 0.1  # gain per step of the disturbance observer of the linear model
+_AVERAGED = 0.25  # window of the means of points and inputs, which averages vibrations out [s]
+_LEARNING = 0.05  # share of Broyden's correction taken per step
+_LITTLE = 1e-3  # regularises Broyden's correction: squared change of the inputs, as shares of their ranges
+_DAMPING = 0.05  # of the inverse of the Jacobian, relative to its largest singular value
 
 
 class Controller(ABC):
-    """Commands inputs (n,) at each step, from what cameras saw after the last one.
+    """Commands inputs (n,) at each step, from the markers observed after the previous step.
 
     Attributes:
-        memory_keys: attributes that the next step depends on; None is not kept.
+        memory_keys: names of the attributes that the next step depends on; those that are None are not saved.
     """
 
     memory_keys: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def command(self, number: int, markers: FloatArray) -> FloatArray:
-        """(n,) inputs for a step, from markers (M, 3) before it [m], NaN where one is not seen."""
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
 
     def remembered(self) -> Memory:
-        """The arrays that the next step depends on."""
+        """Returns the arrays that the next step depends on."""
         return {key: value for key in self.memory_keys if (value := getattr(self, key)) is not None}
 
     def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        """Continues from what another controller of the same settings `remembered`."""
+        """Continues from the memory of another controller with the same settings, see `remembered`."""
         for key in self.memory_keys:
             setattr(self, key, memory.get(key))
 
@@ -62,49 +61,30 @@ class OpenLoop(Controller):
         return np.asarray(self._inputs[number])
 
 
-@dataclass(frozen=True)
-class Horizon:
-    """How far receding plans look.
-
-    Attributes:
-        steps: T.
-        pieces: of the broken line of the inputs.
-        weights: see `plan.Weights`.
-        iterations: of Gauss-Newton, at each step.
-    """
-
-    steps: int
-    pieces: int
-    weights: Weights
-    iterations: int = 1
-
-
 class _Receding(Controller):
-    """Plans anew at every step, from where the last plan would go on."""
+    """Makes a new plan at every step; the previous plan, moved on by one step, is its initial guess."""
 
     memory_keys: ClassVar[tuple[str, ...]] = ("last_command", "knots")
 
     def __init__(
         self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
     ) -> None:
-        self._planner = Planner(
-            model, tracked, limits, horizon.steps, horizon.pieces, horizon.weights, horizon.iterations
-        )
+        self._planner = Planner(model, tracked, limits, horizon)
         self._path, self.last_command = path, np.array(limits.low)
         self.knots: FloatArray | None = None
 
     def _ahead(self, number: int) -> FloatArray:
-        """(H, d) of the path from a step on; at its end it stays."""
-        return np.asarray(self._path[np.minimum(np.arange(number, number + self._planner.steps), len(self._path) - 1)])
+        """Path (T, d) over the horizon from a step on; past its end, its last point is repeated."""
+        steps = np.arange(number, number + self._planner.steps)
+        return np.asarray(self._path[np.minimum(steps, len(self._path) - 1)])
 
-    def _keep(self, inputs: FloatArray, knots: FloatArray) -> FloatArray:
-        """Takes the first of the inputs, and moves the knots on by a step."""
-        planner = self._planner
-        steps, pieces = planner.steps, planner.knots - 1
-        line = np.concatenate([knots[:1], inputs])
+    def _keep(self, plan: Plan) -> FloatArray:
+        """Returns the first inputs of a plan, and moves its knots on by a step for the next guess."""
+        steps, pieces = len(plan.inputs), len(plan.knots) - 1
+        line = np.concatenate([plan.knots[:1], plan.inputs])
         at = np.minimum(np.arange(pieces + 1) * steps / pieces + 1.0, steps)
         self.knots = np.stack([np.interp(at, np.arange(steps + 1), column) for column in line.T], axis=1)
-        self.last_command = inputs[0]
+        self.last_command = plan.inputs[0]
         return self.last_command
 
 
@@ -113,12 +93,12 @@ class RecedingHorizon(_Receding):
 
     Args:
         model: of the robot.
-        tracked: see `Planner`.
+        tracked: (d, 3 M) from the markers to the coordinates that follow the path.
         limits: of the inputs.
         horizon: of the plans.
-        noise: see `Estimator`.
-        path: (T, d) where the points are to be after each step [m].
-        rest: (M, 3) markers of the robot as it hangs without inputs [m].
+        noise: of the estimator.
+        path: (T, d) reference after each step [m].
+        rest: (M, 3) markers of the robot at rest without inputs [m].
     """
 
     def __init__(
@@ -138,15 +118,14 @@ class RecedingHorizon(_Receding):
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
-        known = self._estimator
+        estimate = self._estimator
         if number:
-            known.correct(markers)
+            estimate.correct(markers)
         plan = self._planner.plan(
-            known.state, self.last_command, self._ahead(number), self.knots, known.bias, self._offset
+            estimate.state, self.last_command, self._ahead(number), self.knots, estimate.bias, self._offset
         )
-        found = self._keep(plan.inputs, plan.knots)
-        known.predict(found)
-        return found
+        estimate.predict(plan.inputs[0])
+        return self._keep(plan)
 
     @override
     def remembered(self) -> Memory:
@@ -159,11 +138,11 @@ class RecedingHorizon(_Receding):
 
 
 class LinearRecedingHorizon(_Receding):
-    """Plans with a linear model, from the last markers; what it misses at rest is observed and taken away.
+    """Plans with a linear model, from the last markers; a disturbance observer removes its constant error.
 
     Args:
-        model: of the same recordings as the simulator.
-        tracked, limits, horizon, path, rest: see `RecedingHorizon`.
+        model: fitted to the recordings.
+        tracked, limits, horizon, path, rest: as for `RecedingHorizon`.
     """
 
     memory_keys: ClassVar[tuple[str, ...]] = (*_Receding.memory_keys, "seen", "expected", "missed")
@@ -193,23 +172,22 @@ class LinearRecedingHorizon(_Receding):
         plan = self._planner.plan(
             state, self.last_command, self._ahead(number), self.knots, offset=self._tracked @ self.missed
         )
-        found = self._keep(plan.inputs, plan.knots)
-        self.expected = self._model.respond(state, found[None]).y[0]
-        return found
+        self.expected = self._model.respond(state, plan.inputs[:1]).y[0]
+        return self._keep(plan)
 
 
 class JacobianFeedback(Controller):
-    """Follows a path by how the points moved when the inputs were pressed, corrected on the way by Broyden's rule.
+    """Feeds the error back through a measured Jacobian, which Broyden's rule updates while the robot moves.
 
-    The rule is applied to means over a while, as the body vibrates.
+    The rule is applied to means over a time window, because the body vibrates.
 
     Args:
-        jacobian: (d, n) of the points by the inputs, measured [m per unit].
+        jacobian: (d, n) of the points with respect to the inputs, measured [m per unit].
         limits: of the inputs.
         gain: of the error [1/s].
         time_step: h [s].
-        tracked: see `Planner`.
-        path: (T, d) where the points are to be after each step [m].
+        tracked: (d, 3 M) from the markers to the coordinates that follow the path.
+        path: (T, d) reference after each step [m].
         rest: (M, 3) markers at the beginning [m].
     """
 
@@ -230,7 +208,7 @@ class JacobianFeedback(Controller):
         self.shares = np.zeros(len(limits.range))
         self._damping = _DAMPING * float(np.linalg.norm(self.jacobian, 2))
         self._window = max(round(_AVERAGED / time_step), 1)
-        self.past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and shares of the inputs, the last last
+        self.past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and inputs as shares, latest last
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
@@ -239,7 +217,7 @@ class JacobianFeedback(Controller):
         u, h, d = self.shares, self._step, len(point)
         self.past = np.concatenate([self.past, [np.concatenate([point, u])]])[-2 * self._window :]
         if len(self.past) == 2 * self._window:
-            before, now = (each.mean(0) for each in np.split(self.past, 2))
+            before, now = (window.mean(0) for window in np.split(self.past, 2))
             moved, changed = (now - before)[:d], (now - before)[d:]
             missed = moved - self.jacobian @ changed
             self.jacobian = self.jacobian + _LEARNING / (changed @ changed + _LITTLE) * np.outer(missed, changed)
@@ -247,7 +225,7 @@ class JacobianFeedback(Controller):
         j = self.jacobian
         inverse = j.T @ np.linalg.inv(j @ j.T + self._damping**2 * np.eye(d))
         change = inverse @ wanted
-        # What moves no point brings the inputs together, away from their bounds.
+        # In the null space of the Jacobian, the inputs move towards their mean, away from their bounds.
         change = change - 0.5 * h * (np.eye(len(u)) - inverse @ j) @ (u - u.mean())
         most = self._limits.rate * h / self._limits.range
         self.shares = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)
@@ -255,7 +233,7 @@ class JacobianFeedback(Controller):
 
 
 def timed_command(controller: Controller, number: int, markers: FloatArray) -> tuple[FloatArray, float]:
-    """A command, and the seconds that it took."""
+    """Returns a command (n,) and the seconds that computing it took."""
     begun = time.perf_counter()
-    found = controller.command(number, markers)
-    return found, time.perf_counter() - begun
+    inputs = controller.command(number, markers)
+    return inputs, time.perf_counter() - begun

@@ -1,8 +1,8 @@
-"""The state of a reduced model from what cameras see: an extended Kalman filter with a bias of the equilibria.
+"""State estimation from markers: an extended Kalman filter on a reduced model, with a bias of the equilibria.
 
-The state is (z, z', b): coordinates, their rates, and b, by how much the real robot's equilibria are elsewhere than the
-model's, which wanders. With b in the state, what a receding plan aims at is where the real robot goes, whatever
-constant error the model has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
+The state is (z, z', b): coordinates, their rates, and the offset b of the real robot's equilibria from the model's,
+a random walk. Estimating b removes the steady-state error of a receding horizon, whatever constant error the model
+has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 """
 
 from collections.abc import Mapping
@@ -19,12 +19,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what a filter does not know.
+    """Standard deviations of the measurement and process noise.
 
     Attributes:
         observed: of a coordinate of a marker [m].
-        rate: of what rates change by in a step beside the model, over their spread in a swing of one millimetre.
-        bias: of what the bias wanders by in a second, as a displacement of the markers [m].
+        rate: of the unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre.
+        bias: of the drift of the bias in a second, as a displacement of the markers [m].
     """
 
     observed: float = 1e-4
@@ -33,13 +33,13 @@ class Noise:
 
 
 class Estimator:
-    """Follows a robot by its markers.
+    """Estimates the state of a robot from its markers.
 
     Args:
         model: of the robot.
-        noise: see the class.
-        inputs: (n,) under which it rests at first.
-        offset: (3 M,) where its markers are beside where the model has them, at rest [m]; none, if left out.
+        noise: of the measurements and of the model.
+        inputs: (n,) under which the robot rests at first.
+        offset: (3 M,) of its markers from those of the model, at rest [m]; zero if omitted.
     """
 
     def __init__(self, model: ReducedModel, noise: Noise, inputs: FloatArray, offset: FloatArray | None = None) -> None:
@@ -50,7 +50,7 @@ class Estimator:
         self.offset = np.zeros(model.curved.shape[2]) if offset is None else offset
         u = Monomials(self.state.acting)
         seen = model.point_slopes(self.state.z, u)[0][0]
-        # How far a coordinate moves the markers, on average [m].
+        # Mean displacement of the markers per unit of each coordinate [m].
         size = np.linalg.norm(seen, axis=0) / np.sqrt(len(self.offset) / 3.0)
         one = 1e-3 / size
         stiffness = np.abs(np.diag(model.stiffness(u)[0]))
@@ -60,7 +60,7 @@ class Estimator:
         self._covariance = np.diag(np.concatenate([one**2, (one * np.sqrt(stiffness)) ** 2, (2.0 * one) ** 2]))
 
     def predict(self, inputs: FloatArray) -> None:
-        """One step under inputs (n,)."""
+        """Advances the estimate by one step under inputs (n,)."""
         r = self.model.modes
         transition = np.eye(3 * r)
         self.state, transition[: 2 * r] = self.model.transition(self.state, inputs, self.bias)
@@ -68,7 +68,7 @@ class Estimator:
 
     @property
     def memory(self) -> dict[str, FloatArray]:
-        """What the next step depends on."""
+        """Arrays that the next step depends on."""
         return {**self.state.arrays(), "bias": self.bias, "covariance": self._covariance}
 
     @memory.setter
@@ -77,7 +77,7 @@ class Estimator:
         self.bias, self._covariance = values["bias"], values["covariance"]
 
     def correct(self, markers: FloatArray) -> None:
-        """Takes in markers (M, 3) after the step [m]; NaN where one is not seen."""
+        """Updates the estimate with markers (M, 3) observed after the step [m]; NaN where one is not seen."""
         model, r = self.model, self.model.modes
         seen = np.isfinite(markers).ravel()
         if not seen.any():

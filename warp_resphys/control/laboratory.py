@@ -1,4 +1,4 @@
-"""The simulated laboratory, driven by hand: commands go in, and what its cameras see comes out."""
+"""The simulated laboratory: takes commands step by step and returns noisy markers, as cameras would."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,20 +19,20 @@ from ..settings.stages import PlayedSettings
 from ..stepping.inputs import Inputs
 from .world import BoolArray, FloatArray, IntArray, World
 
-_STREAM: Final = 7  # of the random numbers
-_BEFORE: Final = 1_000_000  # number of the first frame before the first step
+_STREAM: Final = 7  # of the random number generator
+_BEFORE: Final = 1_000_000  # number of the first of the frames taken before the first step
 
 
 class Laboratory(World):
-    """B bodies that play the real one, from rest.
+    """B simulated bodies that stand in for the real robot; they start at rest.
 
     Args:
         settings: of the laboratory.
-        run_dir: of its run, whose registration says where cameras have the body.
+        run_dir: of its run; the registration there gives the pose of the body in the cameras' frame.
         name: of the input.
         count: B.
         seed: of the noise.
-        on_failure: of a step, ``raise``; or ``count``: a body whose simulation fails rests until it begins again.
+        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until `begin`.
 
     Attributes:
         state: of the bodies.
@@ -55,8 +55,8 @@ class Laboratory(World):
         self._constants, self.input, self.count = self._simulator.prepare(), name, count
         self.time_step, self.parts = settings.time_step, self._simulator.counts[name]
         binding = settings.binding
-        found = bound_markers(binding, self._simulator.body.mesh, setup.tracked, tuple(binding.tracked))
-        self._read = found.to(self._simulator.rest_positions)
+        markers = bound_markers(binding, self._simulator.body.mesh, setup.tracked, tuple(binding.tracked))
+        self._read = markers.to(self._simulator.rest_positions)
         self._substeps, self.noise = substeps_of(settings), settings.laboratory.noise
         self._seeds = (settings.seed, _STREAM, seed)
         self._frame = _registered(run_dir, setup.reference, tuple(binding.reference))
@@ -100,18 +100,18 @@ class Laboratory(World):
         return triangles, np.asarray(self._frame.apply(self.state.q.double().cpu().numpy()))
 
     def seen(self, number: int) -> FloatArray:
-        """(B, M, 3) where cameras have them after a number of steps [m]; the same noise for the same number."""
-        found = self.markers()
+        """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""
+        markers = self.markers()
         random = np.random.default_rng([*self._seeds, number])
-        return found + self.noise * random.standard_normal(found.shape)
+        return markers + self.noise * random.standard_normal(markers.shape)
 
     def rest(self, frames: int = 20) -> FloatArray:
-        """(B, M, 3) the mean of some frames of cameras, before anything moves [m]."""
+        """Returns noisy markers (B, M, 3) averaged over frames taken before anything moves [m]."""
         return np.asarray(np.mean([self.seen(_BEFORE + number) for number in range(frames)], axis=0))
 
 
 def _registered(run_dir: Path, reference: FloatArray, labels: tuple[str, ...]) -> RigidTransform:
-    """From the frame of the laboratory's body to that in which the experiment has it."""
-    known = read_json(run_dir / REGISTRATION)
-    every = [each["positions"] for each in known.values() if "positions" in each]
-    return kabsch(reference, np.mean([[places[label] for label in labels] for places in every], axis=0))
+    """Transform from the frame of the laboratory's body to the frame of the experiment."""
+    trials = read_json(run_dir / REGISTRATION).values()
+    positions = [trial["positions"] for trial in trials if "positions" in trial]
+    return kabsch(reference, np.mean([[places[label] for label in labels] for places in positions], axis=0))

@@ -1,8 +1,8 @@
-"""Inputs for whole motions, planned on a reduced model and corrected by the robot itself.
+"""Inputs for whole motions, planned on a reduced model and corrected with the full simulator.
 
-The reduced model plans; the robot plays the plan; and what it leaves is planned away, by a step of Gauss-Newton whose
-slopes are the reduced model's (iterative learning control on the simulated robot), or with the gradient of the robot's
-own adjoint, which holds where the reduced model is wrong.
+The reduced model plans, the robot's simulator plays the plan, and a Gauss-Newton step reduces the remaining error. Its
+slopes are those of the reduced model (iterative learning control on the simulated robot); its gradient can come from
+the adjoint of the full simulator, which is right where the reduced model is wrong.
 """
 
 from collections.abc import Callable
@@ -20,17 +20,17 @@ from .reduced import ReducedModel
 FloatArray = NDArray[np.float64]
 OnProgress = Callable[[int], None]
 
-_SHORTER: Final = 0.25  # share of a step that is tried where all of it was worse
+_SHORTER: Final = 0.25  # factor on a correction that made the motion worse
 
 
 class Follower:
-    """Plans for a robot.
+    """Plans whole motions of a robot.
 
     Args:
-        robot: that is to follow.
+        robot: whose point follows the paths.
         model: its reduced model.
-        planner: of motions of these steps.
-        corrections: by the robot.
+        planner: for the number of steps of the motions.
+        corrections: number of corrections by the robot.
         gradient: ``reduced`` or ``adjoint``.
     """
 
@@ -42,15 +42,19 @@ class Follower:
 
     @property
     def rollouts(self) -> int:
-        """How often the robot plays."""
+        """Number of roll-outs of the robot in `follow`."""
         return self._corrections + 1
 
     def follow(self, paths: FloatArray, on_progress: OnProgress = lambda steps: None) -> list[PlannedMotion]:
-        """The best plans that were found for paths (B, T, d) [m]; reports the steps of the robot that are done.
+        """Returns the best plans for paths (B, T, d) [m].
+
+        Args:
+            paths: references of the point after each step.
+            on_progress: called with the number of further simulation steps that are done.
 
         Raises:
-            InputError: no inputs are within their bounds.
-            ConvergenceError: see `Robot.step`.
+            InputError: no inputs satisfy their bounds.
+            ConvergenceError: the robot's simulation fails.
         """
         planner, model = self._planner, self._model
         before = np.array(planner.limits.low)
@@ -74,29 +78,30 @@ class Follower:
                 knots[row] = kept[row] + shares[row] * steps[row]
         rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
         return [
-            PlannedMotion(path, planner.inputs(knots), markers[1:] @ planner.tracked.T, markers, mm)
+            PlannedMotion(path, planner.lines @ knots, markers[1:] @ planner.tracked.T, markers, mm)
             for path, knots, markers, mm in rows
         ]
 
     def _play(
         self, knots: FloatArray, paths: FloatArray, adjoint: bool, on_progress: OnProgress
     ) -> tuple[FloatArray, FloatArray | None]:
-        """(B, T + 1, 3 M) where the robot has the markers [m], and (B, K, n) half the points' squares by the knots."""
-        robot, planner = self._robot, self._planner
-        like = robot.simulator.rest_positions
-        tracked = torch.as_tensor(planner.tracked).to(like)
-        chosen = torch.as_tensor(knots).to(like).requires_grad_(adjoint)
-        lines = torch.as_tensor(planner.lines).to(like)
-        series = torch.einsum("tk,bkn->tbn", lines, chosen)
-        name = self._model.name
-        given: dict[str, Any] = {name: series}
+        """Plays plans on the robot.
+
+        Returns:
+            (B, T + 1, 3 M) markers [m]; and with ``adjoint``, (B, K, n) the gradient of half the sum of squared
+            distances from the paths with respect to the knots.
+        """
+        robot, planner, name = self._robot, self._planner, self._model.name
+        tensor = robot.simulator.tensor
+        chosen = tensor(knots).requires_grad_(adjoint)
+        inputs: dict[str, Any] = {name: torch.einsum("tk,bkn->tbn", tensor(planner.lines), chosen)}
         with torch.set_grad_enabled(adjoint):
-            start = robot.begin(len(knots), **{name: torch.as_tensor(planner.limits.low).to(like)})
-            motion = robot.rollout(start, on_step=lambda number: on_progress(1), **given)
+            start = robot.begin(len(knots), **{name: planner.limits.low})
+            motion = robot.rollout(start, on_step=lambda number: on_progress(1), **inputs)
             markers = motion.markers.flatten(2).swapaxes(0, 1)
             if not adjoint:
                 return markers.double().cpu().numpy(), None
-            points = markers[:, 1:] @ tracked.mT
+            points = markers[:, 1:] @ tensor(planner.tracked).mT
             half = 0.5 * (points - torch.as_tensor(paths).to(points)).square().sum()
             (slope,) = torch.autograd.grad(half, chosen)
         return markers.detach().double().cpu().numpy(), slope.cpu().double().numpy()

@@ -1,9 +1,7 @@
-"""Inputs that make points follow a path: Gauss-Newton on a reduced model, within bounds and rates, and what is left.
+"""Plans: inputs that make points follow a path, by Gauss-Newton on a prediction model, within bounds and rate limits.
 
-A plan is a broken line over knots, which a quadratic program chooses about the last one: the least distance of the
-points from the path, and a little of the inputs and of how they change. The horizon of a receding plan is short and
-begins where an estimate says; a plan of a whole motion is then played by the full robot, whose difference from the
-reduced model moves the path of the next plan (iterative learning control on the simulated robot).
+The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program for the change of
+the knots: it minimises the distance of the points from the path, plus small penalties on the inputs and their changes.
 """
 
 from collections.abc import Sequence
@@ -18,7 +16,7 @@ from ..io.errors import InputError
 FloatArray = NDArray[np.float64]
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
-_ENOUGH: Final = 1e-3  # of the range of an input, that a plan must change by to be improved further
+_ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Response:
 
     Attributes:
         y: (T, 3 M) observed points after each step [m].
-        slopes: (T, 3 M, P) their derivatives by P parameters of the inputs; None if not asked for.
+        slopes: (T, 3 M, P) their derivatives by P parameters of the inputs; None if not requested.
     """
 
     y: FloatArray
@@ -35,7 +33,7 @@ class Response:
 
 
 class PredictionModel(Protocol):
-    """A model that predicts observed points under inputs, with derivatives: a `ReducedModel` or a `LinearModel`."""
+    """Predicts observed points under inputs, with derivatives: a `ReducedModel` or a `LinearModel`."""
 
     @property
     def time_step(self) -> float:
@@ -50,25 +48,25 @@ class PredictionModel(Protocol):
     def respond(
         self, start: Any, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
     ) -> Response:
-        """The motion of the observed points over T steps.
+        """Predicts the observed points over T steps.
 
         Args:
             start: the state.
             inputs: (T, n) commanded during each step, in their unit.
             basis: (T, n, P) derivatives of the inputs by parameters, for `Response.slopes`.
-            bias: (r,) added to the coordinates of the equilibria, where the model has some.
+            bias: (r,) added to the reduced coordinates of the equilibria; a linear model ignores it.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the inputs may be.
+    """Bounds of the inputs.
 
     Attributes:
-        low: (n,) the least of each.
-        high: (n,) the greatest.
-        rate: (n,) by which each may change in a second.
+        low: (n,) lower bounds.
+        high: (n,) upper bounds.
+        rate: (n,) largest change per second.
     """
 
     low: FloatArray
@@ -77,21 +75,38 @@ class Limits:
 
     @property
     def range(self) -> FloatArray:
-        """(n,) from the least to the greatest."""
+        """(n,) upper less lower bounds."""
         return np.asarray(self.high - self.low)
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What a plan is to be good at, beside distances in millimetres.
+    """Weights of the penalties in a plan's objective, beside squared distances in millimetres.
 
     Attributes:
         effort: of the mean square of the inputs, as shares of their ranges.
-        change: of the mean square of how they change between knots, over what they may.
+        change: of the mean square of their changes between knots, as shares of the rate limits.
     """
 
     effort: float = 1e-2
     change: float = 1e-2
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """Length and discretisation of plans.
+
+    Attributes:
+        steps: T.
+        pieces: of the piecewise linear inputs.
+        weights: of the penalties.
+        iterations: of Gauss-Newton, at most.
+    """
+
+    steps: int
+    pieces: int
+    weights: Weights = Weights()
+    iterations: int = 1
 
 
 @dataclass(frozen=True)
@@ -100,57 +115,43 @@ class Plan:
 
     Attributes:
         inputs: (T, n) during each step.
-        knots: (K, n) at the ends of the pieces of the broken line.
-        iterations: of Gauss-Newton.
+        knots: (K, n) at the ends of the linear pieces.
     """
 
     inputs: FloatArray
     knots: FloatArray
-    iterations: int
 
 
 class Planner:
-    """Plans over a number of steps.
+    """Plans over a fixed number of steps.
 
     Args:
-        model: of the robot.
-        tracked: (d, 3 M) from what is observed to the coordinates that are to follow.
+        model: that predicts the points.
+        tracked: (d, 3 M) from the observed points to the coordinates that follow the path.
         limits: of the inputs.
-        steps: T.
-        pieces: of the broken line.
-        weights: see the class.
-        iterations: of Gauss-Newton, at most.
+        horizon: of the plans.
+
+    Attributes:
+        lines: (T, K) from the knots to the inputs of each step.
+
+    Raises:
+        InputError: more pieces than steps, or none.
     """
 
-    def __init__(
-        self,
-        model: PredictionModel,
-        tracked: FloatArray,
-        limits: Limits,
-        steps: int,
-        pieces: int,
-        weights: Weights = Weights(),
-        iterations: int = 8,
-    ) -> None:
+    def __init__(self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon) -> None:
+        steps, pieces, n = horizon.steps, horizon.pieces, model.parts
         if not 1 <= pieces <= steps:
             raise InputError(f"a plan of {steps} steps cannot have {pieces} pieces: give from 1 to {steps}.")
-        self.model, self.tracked, self.limits, self.steps = model, tracked, limits, steps
-        self._weights, self._iterations = weights, iterations
-        self.knots = pieces + 1
-        n = model.parts
-        at = np.arange(1, steps + 1) / steps * pieces
-        left = np.minimum(at.astype(np.int64), pieces - 1)
-        lines = np.zeros((steps, self.knots))
-        lines[np.arange(steps), left] = 1.0 - (at - left)
-        lines[np.arange(steps), left + 1] += at - left
-        self.lines = lines
+        self.model, self.tracked, self.limits, self._horizon = model, tracked, limits, horizon
+        self.steps = steps
+        knots, at = np.arange(pieces + 1.0), np.arange(1, steps + 1) / steps * pieces
+        self.lines = np.maximum(1.0 - np.abs(at[:, None] - knots), 0.0)
         # The first knot is the input before the plan, and stays.
-        free = lines[:, 1:]
+        free = self.lines[:, 1:]
         self._basis = np.einsum("tk,ij->tikj", free, np.eye(n)).reshape(steps, n, -1) * np.tile(limits.range, pieces)
         seconds = steps * model.time_step / pieces
         self._most = np.tile(limits.rate * seconds / limits.range, pieces)
-        difference = np.eye(pieces) - np.eye(pieces, k=-1)
-        self._difference = np.kron(difference, np.eye(n))
+        self._difference = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(n))
 
     def plan(
         self,
@@ -161,62 +162,59 @@ class Planner:
         bias: FloatArray | None = None,
         offset: FloatArray | None = None,
     ) -> Plan:
-        """The best inputs.
+        """Optimises the inputs.
 
         Args:
-            start: where the model is.
-            before: (n,) the inputs until now.
-            path: (T, d) where the points are to be after each step [m], NaN where that does not matter.
-            guess: (K, n) knots to begin with; the inputs until now, if left out.
-            bias: see `ReducedModel.respond`.
-            offset: (T, d) or (d,) added to where the model has the points [m].
+            start: state of the model.
+            before: (n,) inputs until now.
+            path: (T, d) reference of the points after each step [m], NaN where they are free.
+            guess: (K, n) initial knots; constant inputs if omitted.
+            bias: (r,) added to the reduced coordinates of the equilibria.
+            offset: (T, d) or (d,) added to the points that the model predicts [m].
 
         Raises:
             InputError: the quadratic program has no solution.
         """
-        limits, n = self.limits, self.model.parts
+        limits = self.limits
         goal = path - (0.0 if offset is None else offset)
-        knots = np.repeat(before[None], self.knots, axis=0) if guess is None else guess.copy()
+        knots = np.repeat(before[None], self.lines.shape[1], axis=0) if guess is None else guess.copy()
         knots[0] = before
         knots = np.clip(knots, limits.low, limits.high)
-        iterations = 0
-        for iterations in range(1, self._iterations + 1):  # noqa: B007
-            found = self.model.respond(start, self.lines @ knots, self._basis, bias)
-            assert found.slopes is not None
-            step = self._step(found.slopes, found.y @ self.tracked.T - goal, knots, None)
-            knots[1:] += limits.range * step.reshape(-1, n)
+        for _ in range(self._horizon.iterations):
+            response = self.model.respond(start, self.lines @ knots, self._basis, bias)
+            assert response.slopes is not None
+            step = self._step(response.slopes, response.y @ self.tracked.T - goal, knots, None)
+            knots[1:] += limits.range * step.reshape(-1, self.model.parts)
             if np.abs(step).max() < _ENOUGH:
                 break
-        return Plan(self.inputs(knots), knots, iterations)
-
-    def inputs(self, knots: FloatArray) -> FloatArray:
-        """(T, n) of knots (K, n)."""
-        return np.asarray(self.lines @ knots)
+        return Plan(self.lines @ knots, knots)
 
     def corrected(
-        self, start: Any, knots: FloatArray, left: FloatArray, gradient: FloatArray | None = None
+        self, start: Any, knots: FloatArray, errors: FloatArray, gradient: FloatArray | None = None
     ) -> FloatArray:
-        """(K, n) better knots, by one step of Gauss-Newton from others.
+        """Returns improved knots (K, n), by one Gauss-Newton step from measured errors.
 
         Args:
-            start: where the model is.
-            knots: (K, n).
-            left: (T, d) how far the robot's points were from the path with these [m].
-            gradient: (K, n) of half the sum of their squares by the knots, if it is known otherwise than by the model.
+            start: state of the model.
+            knots: (K, n) that were played.
+            errors: (T, d) of the robot's points from the path [m].
+            gradient: (K, n) of half the sum of squared errors with respect to the knots; the model's if omitted.
         """
-        slopes = self.model.respond(start, self.inputs(knots), self._basis).slopes
+        slopes = self.model.respond(start, self.lines @ knots, self._basis).slopes
         assert slopes is not None
-        step = self._step(slopes, left, knots, gradient)
+        step = self._step(slopes, errors, knots, gradient)
         return np.concatenate([knots[:1], knots[1:] + self.limits.range * step.reshape(-1, self.model.parts)])
 
-    def _step(self, slopes: FloatArray, left: FloatArray, knots: FloatArray, gradient: FloatArray | None) -> FloatArray:
-        """(P,) how the knots after the first are to change, as shares of the inputs' ranges."""
-        count, weights, limits = max(left.size, 1), self._weights, self.limits
+    def _step(
+        self, slopes: FloatArray, errors: FloatArray, knots: FloatArray, gradient: FloatArray | None
+    ) -> FloatArray:
+        """Change (P,) of the knots after the first, as shares of the inputs' ranges."""
+        count, weights, limits = max(errors.size, 1), self._horizon.weights, self.limits
         first, *others = (knots - limits.low) / limits.range
         x = np.concatenate(others)
-        known = np.isfinite(left).ravel()
-        j = 1e3 * (self.tracked @ slopes).reshape(left.size, -1) * known[:, None]
-        pull = j.T @ (1e3 * np.where(known, left.ravel(), 0.0))
+        finite = np.isfinite(errors).ravel()
+        j = 1e3 * (self.tracked @ slopes).reshape(errors.size, -1) * finite[:, None]
+        pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
         if gradient is not None:
             pull = 1e6 * (gradient[1:] * limits.range).ravel()
         d = self._difference / self._most[:, None]
@@ -238,10 +236,10 @@ def solve_program(
     low: FloatArray,
     high: FloatArray,
 ) -> FloatArray:
-    """(P,) the minimum of x^T H x / 2 + g^T x where rows x is between least and most, and x between low and high.
+    """Minimises x^T H x / 2 + g^T x over x (P,) with least <= rows x <= most and low <= x <= high.
 
     Raises:
-        InputError: the package that solves it is not installed, or there is none.
+        InputError: the solver's package is not installed, or the constraints cannot be satisfied.
     """
     try:
         import piqp
@@ -253,21 +251,21 @@ def solve_program(
     solver.settings.eps_abs, solver.settings.eps_rel = _TOLERANCE, _TOLERANCE
     solver.setup(hessian, gradient, None, None, rows, least, most, low, high)
     if solver.solve() != piqp.PIQP_SOLVED:
-        raise InputError("no inputs are within their bounds and rates: raise the rates, or begin within the bounds.")
+        raise InputError(
+            "no inputs satisfy their bounds and rate limits: raise the rate limits, or begin within the bounds."
+        )
     return np.asarray(solver.result.x)
 
 
 def tracked_of(labels: Sequence[str], chosen: Sequence[str]) -> FloatArray:
-    """(3, 3 M) the mean of some of M points.
+    """Returns the matrix (3, 3 M) from M markers to the mean of the chosen ones.
 
     Raises:
-        InputError: an unknown one, or none.
+        InputError: an unknown marker, or none.
     """
-    odd = [label for label in chosen if label not in labels]
-    if odd or not chosen:
-        what = f"names {odd[0]!r}" if odd else "names no marker"
+    unknown = [label for label in chosen if label not in labels]
+    if unknown or not chosen:
+        what = f"names {unknown[0]!r}" if unknown else "names no marker"
         raise InputError(f"tracked {what}: choose from {', '.join(labels)}.")
-    found = np.zeros((3, len(labels), 3))
-    for label in chosen:
-        found[:, labels.index(label)] += np.eye(3) / len(chosen)
-    return found.reshape(3, -1)
+    weights = [[chosen.count(label) / len(chosen) for label in labels]]
+    return np.asarray(np.kron(weights, np.eye(3)), dtype=np.float64)

@@ -1,30 +1,30 @@
-r"""A robot in a few coordinates: its equilibria, the slowest vibrations about them, and its network as it is.
+r"""A reduced model of a robot: its equilibria, the slowest vibrations about them, and the learned force's network.
 
 In coordinates z = Psi^T M x of r modes,
 
     z'' + D(u) z' + A(u) (z - z_0(u)) = G(u) (c - c_0(u)),
 
-with u the inputs and c the outputs of the network of the learned force, which sees of the body only what z and z' tell
-(hyper-reduction: no unknown of the full model is left). z_0(u) is the equilibrium under u and the force of fixed
-outputs c_0(u), affine in u, which the network has on average. With Phi(u) the vibrations about it,
+with u the inputs and c the outputs of the learned force's network, evaluated on the body that z and z' describe
+(hyper-reduction: no degree of freedom of the full model is left). z_0(u) is the equilibrium under u and a force of
+fixed outputs c_0(u), affine in u: a fit of the network's outputs. With Phi(u) the vibrations about it,
 K phi = omega^2 M phi, and T = Psi^T M Phi,
 
     A = T (omega^2 - Phi^T dF/dx Phi) T^-1,   D = T (alpha + beta omega^2) T^-1,   G = T Phi^T dF/dc,
 
-F being the learned force of fixed outputs, which turns with the body, and alpha and beta the Rayleigh damping. Observed
-points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u), C being exact for small dz. z_0 and y_0 are cubic
-polynomials of the inputs, A, D, G and C quadratic, fitted to equilibria and the vibrations about them (interpolation of
-reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803, in coordinates that are common from the beginning), and
-H is constant, fitted to motions. The network acts on the state before a step, as in the robot, so that a step is linear
-in z. With s = (z, z') and the integrator's g (1/3 where BDF2 has a state before the last, else 0) and step length h',
+where F is the learned force of fixed outputs, which turns with the body, and alpha and beta are the Rayleigh damping.
+Observed points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact for small dz. z_0 and y_0 are cubic
+polynomials of the inputs, and A, D, G and C are quadratic, fitted to equilibria and the vibrations about them
+(interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share one basis Psi). H is
+constant, fitted to motions. As in the robot, the network is evaluated at the state before a step, so a step is linear
+in z. With s = (z, z'), and the integrator's g (1/3 where BDF2 has a previous state, else 0) and step length h',
 
     s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + force(s_k)),   J = [N; N / h'],   N = (1 / h'^2 + D / h' + A)^-1,
 
-of which `ReducedMotion` has the derivatives. B models take a step at once. Inputs are in units of `ReducedModel.scale`.
+whose derivatives `ReducedMotion` has. B models are stepped together. Inputs are in units of `ReducedModel.scale`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -44,10 +44,11 @@ BoolArray = NDArray[np.bool_]
 STATIC_ORDER: Final = 3
 TANGENT_ORDER: Final = 2
 USUAL_ORDER: Final = 1
-_REST_TOLERANCE: Final = 1e-6  # of the coordinates' size, for an equilibrium; networks are in float32
+_REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50
 _HALVINGS: Final = 8
 _POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown")
+_FORCE_POLYNOMIALS: Final = ("places", "seen", "usual", "push")
 _PLAIN: Final = ("time_step", "integrator", "labels", "name", "delay", "rise", "filters", "quality")
 
 
@@ -58,10 +59,10 @@ class ReducedState:
     Attributes:
         z: (B, r) coordinates.
         v: (B, r) their rates [1/s].
-        acting: (B, n) inputs that act, in units of the model's scale.
+        acting: (B, n) inputs after delay and lag, in units of the model's scale.
         memory: of the inputs' response, entries (..., B, n).
         previous: (2, B, r) coordinates and rates one step earlier.
-        looks_back: (B,) whether the integrator may use these; a model that has just begun has none.
+        looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
     """
 
     z: FloatArray
@@ -72,31 +73,31 @@ class ReducedState:
     looks_back: BoolArray
 
     def where(self, chosen: BoolArray, other: "ReducedState") -> "ReducedState":
-        """The models of this state where chosen (B,), those of the other one elsewhere."""
+        """Joins two states: this one where chosen (B,), the other one elsewhere."""
         theirs = other.arrays()
         return self.from_arrays(
             {
-                key: np.where(chosen[:, None] if each.ndim > 1 else chosen, each, theirs[key])
-                for key, each in self.arrays().items()
+                key: np.where(chosen[:, None] if array.ndim > 1 else chosen, array, theirs[key])
+                for key, array in self.arrays().items()
             }
         )
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything by name, for a checkpoint."""
-        own = {key: each for key, each in vars(self).items() if key != "memory"}
-        return own | {f"memory.{key}": each for key, each in self.memory.items()}
+        """All arrays of the state by name, for a checkpoint."""
+        own = {key: array for key, array in vars(self).items() if key != "memory"}
+        return own | {f"memory.{key}": array for key, array in self.memory.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ReducedState":
-        """The state of `arrays`."""
-        own = {key: each for key, each in arrays.items() if not key.startswith("memory.")}
-        memory = {key.removeprefix("memory."): each for key, each in arrays.items() if key.startswith("memory.")}
+        """Restores the state from its `arrays`."""
+        own = {key: array for key, array in arrays.items() if not key.startswith("memory.")}
+        memory = {key.removeprefix("memory."): arrays[key] for key in arrays.keys() - own.keys()}
         return cls(memory=memory, **own)
 
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """The reduced model of a robot; see the module for the equations.
+    """The reduced model of a robot; the module's docstring has the equations.
 
     Attributes:
         time_step: h [s].
@@ -104,9 +105,9 @@ class ReducedModel:
         labels: of the M observed points.
         name: of the input.
         scale: (n,) of the inputs.
-        delay: of the inputs behind their commands [s].
-        rise: time constant with which they follow these [s].
-        filters: F time constants of the means of the inputs that the network takes [s].
+        delay: from commands to inputs [s].
+        rise: time constant of the inputs' first-order lag [s].
+        filters: F time constants of the filtered inputs that the network takes [s].
         static: z_0, (r,).
         observed: y_0, (3 M,) [m].
         stiffness: A, (r, r) [1/s^2].
@@ -114,10 +115,10 @@ class ReducedModel:
         shown: C, (3 M, r) [m].
         curved: H, (r, r, 3 M), symmetric [m].
         force: the learned force; None for a simulator alone.
-        quality: errors, and counts of the samples from which it was made.
+        quality: errors, and counts of the samples that the model was fitted to.
 
     Raises:
-        InputError: another integrator.
+        InputError: an integrator that cannot be reduced.
     """
 
     time_step: float
@@ -156,14 +157,14 @@ class ReducedModel:
 
     @cached_property
     def response(self) -> InputResponse:
-        """How inputs follow their commands, with the means that the network takes."""
+        """Delay and lag of the inputs, and the filters whose outputs the network takes."""
         return InputResponse(self.time_step, None, self.delay or None, self.rise or None, self.filters)
 
     def rest(self, inputs: FloatArray | None = None, count: int = 1) -> ReducedState:
-        """The equilibrium under inputs (n,), none if left out; of B models.
+        """Returns the state of B models in equilibrium under inputs (n,), zero if omitted.
 
         Raises:
-            ConvergenceError: no equilibrium is found, as the learned force is too large.
+            ConvergenceError: there is no equilibrium, because the learned force is too large.
         """
         u = np.zeros((1, self.parts)) if inputs is None else (inputs / self.scale)[None]
         z = self._equilibrium(Monomials(u))[0]
@@ -172,7 +173,7 @@ class ReducedModel:
         return ReducedState(still[0], still[1], u, self.response.still(u), still, np.zeros(count, dtype=np.bool_))
 
     def _equilibrium(self, u: Monomials) -> tuple[FloatArray, ForceAlong | None]:
-        """(1, r) where A (z - z_0) is the learned force, by Newton's method with halved steps; and that force."""
+        """Solves A (z - z_0) = learned force by Newton's method with step halving; returns z (1, r) and the force."""
         a, base = self.stiffness(u)[0], self.static(u)
         force = self._force(u, np.repeat(u.points[None], len(self.filters), axis=0))
         if force is None:
@@ -180,32 +181,32 @@ class ReducedModel:
         size = np.abs(self.static.coefficients).max()
 
         def imbalance(z: FloatArray) -> tuple[FloatArray, float]:
-            """(r,) by which the forces differ, and how far that would move the model."""
-            found = a @ (z - base)[0] - force(slice(1), np.stack([z, np.zeros_like(z)]))[0]
-            return found, float(np.abs(np.linalg.solve(a, found)).max())
+            """Residual (r,), and its largest entry as a displacement of the coordinates."""
+            residual = a @ (z - base)[0] - force(slice(1), np.stack([z, np.zeros_like(z)]))[0]
+            return residual, float(np.abs(np.linalg.solve(a, residual)).max())
 
         z = base
-        found, left = imbalance(z)
+        residual, error = imbalance(z)
         for _ in range(_ITERATIONS):
-            if left < _REST_TOLERANCE * size:
+            if error < _REST_TOLERANCE * size:
                 return z, force
-            step = np.linalg.solve(a - force.last_slope(), found)
+            step = np.linalg.solve(a - force.last_slope(), residual)
             for share in 0.5 ** np.arange(_HALVINGS):
-                tried = z - share * step
-                found, now = imbalance(tried)
-                if now < left:
+                trial = z - share * step
+                residual, now = imbalance(trial)
+                if now < error:
                     break
-            z, left = tried, now
+            z, error = trial, now
         raise ConvergenceError("the reduced model has no equilibrium: its learned force is too large.", z, None)
 
     def _force(self, u: Monomials, means: FloatArray) -> ForceAlong | None:
         return None if self.force is None else ForceAlong(self.force, u, self.static, means)
 
     def rest_observed(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(3 M,) observed points in equilibrium under inputs (n,) [m], and (3 M, n) their derivatives by the inputs.
+        """Returns observed points (3 M,) in equilibrium under inputs (n,) [m], and their derivatives (3 M, n).
 
         Raises:
-            ConvergenceError: see `rest`.
+            ConvergenceError: there is no equilibrium.
         """
         u = Monomials((inputs / self.scale)[None])
         z, force = self._equilibrium(u)
@@ -214,24 +215,24 @@ class ReducedModel:
         if force is not None:
             force.restart()
             force(slice(1), np.stack([z, np.zeros_like(z)]))
-            by_state, more, by_means = (each[0] for each in force.slopes())
+            by_state, more, by_means = (slopes[0] for slopes in force.slopes())
             a, by_u = a - by_state[:, : self.modes], by_u + more + by_means.sum(1)
-        seen, direct = (each[0] for each in self.point_slopes(z, u))
-        return self.points(z, u)[0], (direct + seen @ np.linalg.solve(a, by_u)) / self.scale
+        by_z, direct = (slopes[0] for slopes in self.point_slopes(z, u))
+        return self.points(z, u)[0], (direct + by_z @ np.linalg.solve(a, by_u)) / self.scale
 
     def observe(self, state: ReducedState) -> FloatArray:
-        """(B, 3 M) observed points [m]."""
+        """Observed points (B, 3 M) in a state [m]."""
         return self.points(state.z, Monomials(state.acting))
 
     def points(self, z: FloatArray, u: Monomials) -> FloatArray:
-        """(S, 3 M) observed points at coordinates (S, r) under S inputs [m]."""
+        """Observed points (S, 3 M) at coordinates (S, r) under S inputs [m]."""
         off = z - self.static(u)
         squares = (off[:, :, None] * off[:, None, :]).reshape(len(z), -1)
         linear = (self.shown(u) @ off[..., None])[..., 0]
         return self.observed(u) + linear + squares @ self.curved.reshape(squares.shape[1], -1)
 
     def point_slopes(self, z: FloatArray, u: Monomials) -> tuple[FloatArray, FloatArray]:
-        """(S, 3 M, r) derivatives of `points` by the coordinates, and (S, 3 M, n) by the inputs."""
+        """Derivatives of `points` with respect to the coordinates (S, 3 M, r) and the inputs (S, 3 M, n)."""
         off, r = z - self.static(u), self.modes
         bent = (off @ self.curved.reshape(r, -1)).reshape(len(z), r, -1)
         by_z = self.shown(u) + 2.0 * bent.swapaxes(1, 2)
@@ -240,7 +241,7 @@ class ReducedModel:
         return by_z, direct - by_z @ self.static.slopes(u).swapaxes(1, 2)
 
     def move(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> "ReducedMotion":
-        """T steps of B models.
+        """Advances B models by T steps.
 
         Args:
             start: their state.
@@ -281,74 +282,67 @@ class ReducedModel:
         basis: FloatArray | None = None,
         bias: FloatArray | None = None,
     ) -> Response:
-        """T steps of one model under commanded inputs (T, n), in their unit.
-
-        Args:
-            start: the state, of B = 1.
-            inputs: during each step.
-            basis: (T, n, P) derivatives of the inputs by parameters, for `Response.slopes`.
-            bias: see `move`.
-        """
+        """Predicts the observed points of one model (B = 1); `PredictionModel` documents the arguments."""
         motion = self.move(start, inputs[:, None], bias)
         slopes = None if basis is None else motion.slopes(basis / self.scale[:, None])
         return Response(motion.y, slopes)
 
     def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
-        """The state of one model after a step under inputs (n,), and (2 r, 3 r) its derivatives by z, v and bias."""
+        """Advances one model by a step under inputs (n,); returns the state and its derivatives by z, v and b."""
         motion = self.move(start, inputs[None, None], bias)
         by_bias = motion.impulse @ self.stiffness(motion.u)
         return motion.end, np.concatenate([motion.by_state, by_bias], axis=2)[0]
 
     def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-        """Arrays and plain data for `restored`; without the network."""
-        made = {name: getattr(self, name) for name in _POLYNOMIALS}
+        """Returns arrays and plain data for `restored`, without the network."""
+        polynomials = {name: getattr(self, name) for name in _POLYNOMIALS}
         arrays = {"scale": self.scale, "curved": self.curved}
         if self.force is not None:
-            made |= self.force.polynomials()
-            arrays |= {"told": self.force.told, "told_by": self.force.told_by}
+            polynomials |= {name: getattr(self.force, name) for name in _FORCE_POLYNOMIALS}
+            arrays |= {"told": self.force.conditions, "told_by": self.force.conditions_by}
         plain = {key: getattr(self, key) for key in _PLAIN}
-        plain["orders"] = {name: each.order for name, each in made.items()}
-        return arrays | {name: each.coefficients for name, each in made.items()}, plain
+        plain["orders"] = {name: polynomial.order for name, polynomial in polynomials.items()}
+        return arrays | {name: polynomial.coefficients for name, polynomial in polynomials.items()}, plain
 
     @classmethod
     def restored(
         cls, arrays: Mapping[str, FloatArray], plain: Mapping[str, Any], learned: Learned | None = None
     ) -> "ReducedModel":
-        """The model of a `checkpoint`.
+        """Restores a model from its `checkpoint`.
 
         Args:
             arrays: of the checkpoint.
-            plain: likewise.
-            learned: of its robot (`Description.learned`), if the model has a learned force.
+            plain: of the checkpoint.
+            learned: of its robot (`Description.learned`); needed if the model has a learned force.
 
         Raises:
-            InputError: it has one, and `learned` is None.
+            InputError: the model has a learned force, and ``learned`` is None.
         """
-        made = {name: Polynomial(arrays[name], order) for name, order in plain["orders"].items()}
-        own: dict[str, Any] = {key: plain[key] for key in _PLAIN} | {name: made.pop(name) for name in _POLYNOMIALS}
+        polynomials = {name: Polynomial(arrays[name], order) for name, order in plain["orders"].items()}
+        own = {key: plain[key] for key in _PLAIN} | {name: polynomials.pop(name) for name in _POLYNOMIALS}
         own |= {key: tuple(own[key]) for key in ("labels", "filters")}
-        model = cls(**own, scale=arrays["scale"], curved=arrays["curved"])
-        if not made:
-            return model
-        if learned is None:
-            raise InputError("the reduced model has a learned force: give what its robot has learned.")
-        force = ReducedForce(learned.network, learned.range_, told=arrays["told"], told_by=arrays["told_by"], **made)
-        return replace(model, force=force)
+        force = None
+        if polynomials and learned is None:
+            raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
+        if polynomials and learned is not None:
+            conditions: dict[str, Any] = {"conditions": arrays["told"], "conditions_by": arrays["told_by"]}
+            force = ReducedForce(learned.network, learned.range_, **conditions | polynomials)
+        return cls(**own, scale=arrays["scale"], curved=arrays["curved"], force=force)
 
 
 @dataclass(frozen=True)
 class ReducedMotion:
-    """T steps of B models, S = T B in all, the models running fastest; with what their derivatives need.
+    """T steps of B models with their derivatives; rows S = T B run over models first, then steps.
 
     Attributes:
-        model: that moved.
-        u: of the (S, n) inputs that acted.
-        bias: see `ReducedModel.move`.
-        share: (S, 1) g, of the state before the last.
+        model: the reduced model.
+        u: monomials of the (S, n) inputs.
+        bias: (r,) added to the equilibria z_0.
+        share: (S, 1) g, weight of the previous state.
         step: (S, 1) h' [s].
         inertia: (S, r, r) 1 / h'^2 + D / h'.
         inverse: (S, r, r) N.
-        force: the learned force along the motion; None where there is none.
+        force: the learned force along the motion, if the model has one.
         z: (S, r) after each step.
         v: (S, r) after each step [1/s].
         end: the last state.
@@ -368,17 +362,17 @@ class ReducedMotion:
 
     @property
     def y(self) -> FloatArray:
-        """(S, 3 M) observed points after each step [m]."""
+        """Observed points (S, 3 M) after each step [m]."""
         return self.model.points(self.z, self.u)
 
     @cached_property
     def impulse(self) -> FloatArray:
-        """(S, 2 r, r) J, derivatives of the state after a step by a force."""
+        """J, derivatives (S, 2 r, r) of the state after a step with respect to a force."""
         return np.concatenate([self.inverse, self.inverse / self.step[..., None]], axis=1)
 
     @cached_property
     def _carried(self) -> FloatArray:
-        """(S, 2 r, 2 r) L, derivatives of the state after a step by the state that the integrator starts it from."""
+        """L, derivatives (S, 2 r, 2 r) of the state after a step by the state that the integrator starts from."""
         step, identity = self.step[..., None], np.eye(self.model.modes)
         by_z, by_v = self.inverse @ self.inertia, self.inverse / step
         upper = np.concatenate([by_z, by_v], axis=2)
@@ -390,12 +384,12 @@ class ReducedMotion:
 
     @cached_property
     def by_state(self) -> FloatArray:
-        """(S, 2 r, 2 r) derivatives of the state after each step by the state before it."""
-        found = (1.0 + self.share[..., None]) * self._carried
-        return found if self._force_slopes is None else found + self.impulse @ self._force_slopes[0]
+        """Derivatives (S, 2 r, 2 r) of the state after each step with respect to the state before it."""
+        slopes = (1.0 + self.share[..., None]) * self._carried
+        return slopes if self._force_slopes is None else slopes + self.impulse @ self._force_slopes[0]
 
     def slopes(self, basis: FloatArray) -> FloatArray:
-        """(T, 3 M, P) derivatives of `y` of one model by parameters, of the commands' (T, n, P)."""
+        """Derivatives (T, 3 M, P) of `y` of one model by parameters, from those of the commands (T, n, P)."""
         model, u = self.model, self.u
         by_parameters, by_means = model.response.from_rest(basis)
         base = model.static(u)
@@ -409,9 +403,9 @@ class ReducedMotion:
             pushed = pushed + more @ by_parameters + np.einsum("trfn,ftnp->trp", means, by_means)
         direct, before = self.impulse @ pushed, self.share[..., None] * self._carried
         now = past = np.zeros(direct.shape[1:])
-        found = []
+        z_slopes = []
         for k in range(len(direct)):
             now, past = self.by_state[k] @ now - before[k] @ past + direct[k], now
-            found.append(now[: model.modes])
+            z_slopes.append(now[: model.modes])
         by_z, own = model.point_slopes(self.z, u)
-        return by_z @ np.array(found) + own @ by_parameters
+        return by_z @ np.array(z_slopes) + own @ by_parameters

@@ -1,35 +1,98 @@
-"""The learned force in a reduced model: the network itself, which sees and pushes a few modes alone."""
+"""The learned force in a reduced model: the robot's network, evaluated on a few modes.
 
+The network is evaluated in NumPy: for one state at a time, calling torch's layers takes longer than computing them.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from ..data.input_response import told_of
-from ..learning.networks import StateMap
+from ..learning.networks import SkipMLP, StateMap
 from ..learning.predictors import Range
-from .evaluator import Evaluator
 from .polynomials import Monomials, Polynomial
 
 FloatArray = NDArray[np.float64]
+Array = NDArray[Any]
+Layer = Callable[[Array], Array]
+
+
+class Evaluator:
+    """Evaluates a trained network that is not recurrent, in the type of its weights.
+
+    Args:
+        network: whose weights are final.
+        range_: to which its inputs are clipped; None for no clipping.
+    """
+
+    def __init__(self, network: StateMap, range_: Range | None) -> None:
+        assert isinstance(network.network, SkipMLP)
+        self._blocks = [[_layer(layer) for layer in cast(nn.Sequential, block)] for block in network.network.blocks]
+        self._linear, self._remainder = network.linear.numpy(force=True), network.remainder.numpy(force=True)
+        self._edges = None if range_ is None else [edge.numpy(force=True) for edge in range_.edges]
+
+    def __call__(self, inputs: FloatArray) -> FloatArray:
+        """Standardised outputs (S, c) for standardised inputs (S, i)."""
+        held: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
+        hidden = held = held.astype(self._linear.dtype)
+        for number, layers in enumerate(self._blocks):
+            after = hidden
+            for layer in layers:
+                after = layer(after)
+            hidden = hidden + after if number else after
+        return np.asarray(held @ self._linear + self._remainder * hidden, dtype=np.float64)
+
+
+def _layer(module: nn.Module) -> Layer:
+    if isinstance(module, nn.Linear):
+        return partial(_affine, module.weight.numpy(force=True).T.copy(), module.bias.numpy(force=True))
+    if isinstance(module, nn.SiLU):
+        return _silu
+    if isinstance(module, nn.ELU):
+        return partial(_elu, float(module.alpha))
+    assert isinstance(module, nn.LayerNorm)
+    return partial(_norm, module.weight.numpy(force=True), module.bias.numpy(force=True), float(module.eps))
+
+
+def _affine(weight: Array, bias: Array, x: Array) -> Array:
+    return x @ weight + bias
+
+
+def _silu(x: Array) -> Array:
+    with np.errstate(over="ignore"):  # exp overflows for very negative x, where the quotient is zero
+        return x / (1.0 + np.exp(-x))
+
+
+def _elu(alpha: float, x: Array) -> Array:
+    return np.where(x > 0.0, x, alpha * np.expm1(np.minimum(x, 0.0)))
+
+
+def _norm(weight: Array, bias: Array, eps: float, x: Array) -> Array:
+    off = x - x.mean(-1, keepdims=True)
+    return off / np.sqrt((off * off).mean(-1, keepdims=True) + eps) * weight + bias
 
 
 @dataclass(frozen=True)
 class ReducedForce:
     r"""G(u) (c - c_0(u)), with c the network's outputs for coordinates z, their rates, and inputs u.
 
-    Its inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and held in the range of the training,
-    with m the means of the inputs.
+    The network's inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and clipped to the training
+    range, with m the filtered inputs.
 
     Attributes:
-        network: a force in reduced modes.
-        range_: of its inputs; None for no guard.
+        network: predicts a force in reduced modes.
+        range_: of its inputs; None for no clipping.
         places: p, (m,), standardised position and velocity modes at rest where z = z_0(u).
         seen: E, (m, 2 r).
-        told: t, (k,), standardised inputs that no state tells, without inputs.
-        told_by: S, (k, n (1 + F)), of the inputs and their means; empty where the network takes no inputs.
+        conditions: t, (k,), the network's standardised inputs beside the state, at u = 0.
+        conditions_by: S, (k, n (1 + F)), their derivatives by the inputs and the filtered inputs; empty where the
+            network takes no inputs.
         usual: c_0, (c,).
         push: G, (r, c).
     """
@@ -38,38 +101,34 @@ class ReducedForce:
     range_: Range | None
     places: Polynomial
     seen: Polynomial
-    told: FloatArray
-    told_by: FloatArray
+    conditions: FloatArray
+    conditions_by: FloatArray
     usual: Polynomial
     push: Polynomial
 
     @cached_property
     def outputs(self) -> Evaluator:
-        """(S, c) of standardised inputs (S, i)."""
+        """Standardised outputs (S, c) for standardised inputs (S, i)."""
         return Evaluator(self.network, self.range_)
 
     def output_slopes(self, inputs: FloatArray, left: FloatArray) -> FloatArray:
-        """(S, r, i) derivatives of ``left @ outputs`` by the inputs (S, i), with left (S, r, c)."""
+        """Derivatives (S, r, i) of ``left @ outputs`` with respect to the inputs (S, i), with left (S, r, c)."""
         with torch.enable_grad():
             unheld = torch.as_tensor(inputs).to(self.network.linear).requires_grad_()
-            found = self.network.standardised(unheld if self.range_ is None else self.range_.hold(unheld))[0]
-            weights = torch.as_tensor(left).to(found).swapaxes(0, 1)  # (r, S, c)
-            (slopes,) = torch.autograd.grad(found, unheld, weights, is_grads_batched=True)
+            outputs = self.network.standardised(unheld if self.range_ is None else self.range_.hold(unheld))[0]
+            weights = torch.as_tensor(left).to(outputs).swapaxes(0, 1)  # (r, S, c)
+            (slopes,) = torch.autograd.grad(outputs, unheld, weights, is_grads_batched=True)
         return np.asarray(slopes.swapaxes(0, 1).double().cpu().numpy())
-
-    def polynomials(self) -> dict[str, Polynomial]:
-        """Its polynomials by name."""
-        return {"places": self.places, "seen": self.seen, "usual": self.usual, "push": self.push}
 
 
 class ForceAlong:
-    """A reduced force along S inputs.
+    """The learned force along a motion under S inputs; records its evaluations for the derivatives.
 
     Args:
         force: of the model.
-        u: the inputs.
+        u: monomials of the inputs.
         static: z_0.
-        means: (F, S, n) of the inputs.
+        means: (F, S, n) filtered inputs.
     """
 
     def __init__(self, force: ReducedForce, u: Monomials, static: Polynomial, means: FloatArray) -> None:
@@ -77,21 +136,21 @@ class ForceAlong:
         base = static(u)
         self._base = np.concatenate([base, np.zeros_like(base)], axis=1)
         self._seen, self._usual, self._push = force.seen(u), force.usual(u), force.push(u)
-        told = np.tile(force.told, (len(base), 1))
-        if len(force.told_by):
-            told = told + told_of(u.points, means) @ force.told_by.T
+        conditions = np.tile(force.conditions, (len(base), 1))
+        if len(force.conditions_by):
+            conditions = conditions + told_of(u.points, means) @ force.conditions_by.T
         places = force.places(u) - (self._seen @ self._base[..., None])[..., 0]
-        self._offset, self._modes = np.concatenate([places, told], axis=1), places.shape[1]
+        self._offset, self._modes = np.concatenate([places, conditions], axis=1), places.shape[1]
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the steps that were made."""
+        """Discards the recorded evaluations."""
         self._states: list[FloatArray] = []
         self._inputs: list[FloatArray] = []
         self._outputs: list[FloatArray] = []
 
     def __call__(self, rows: slice, state: FloatArray) -> FloatArray:
-        """(B, r) force at some of the S inputs, of coordinates and rates (2, B, r)."""
+        """Force (B, r) in some rows of the S inputs, for coordinates and rates (2, B, r)."""
         flat = np.concatenate([*state], axis=1)
         inputs = self._offset[rows].copy()
         inputs[:, : self._modes] += (self._seen[rows] @ flat[..., None])[..., 0]
@@ -102,23 +161,23 @@ class ForceAlong:
         return np.asarray((self._push[rows] @ (outputs - self._usual[rows])[..., None])[..., 0])
 
     def last_slope(self) -> FloatArray:
-        """(r, r) derivative of the last force by the coordinates, along S = 1 inputs."""
+        """Derivative (r, r) of the last force with respect to the coordinates, for S = 1."""
         slopes = self._force.output_slopes(self._inputs[-1], self._push)[0]
         return np.asarray(slopes[:, : self._modes] @ self._seen[0, :, : self._push.shape[1]])
 
     def slopes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives of the forces of all steps: (S, r, 2 r) by the states, (S, r, n) by u, (S, r, F, n) by means."""
+        """Derivatives of all forces: (S, r, 2 r) by the states, (S, r, n) by u, (S, r, F, n) by filtered inputs."""
         force, u = self._force, self._u
-        states, inputs, outputs = (np.concatenate(each) for each in (self._states, self._inputs, self._outputs))
+        states, inputs, outputs = map(np.concatenate, (self._states, self._inputs, self._outputs))
         by_inputs = force.output_slopes(inputs, self._push)  # (S, r, i)
-        by_modes, by_told = by_inputs[..., : self._modes], by_inputs[..., self._modes :]
+        by_modes, by_conditions = by_inputs[..., : self._modes], by_inputs[..., self._modes :]
         by_z = self._seen[..., : self._base.shape[1] // 2]
         moved = force.places.slopes(u) - self._static.slopes(u) @ by_z.swapaxes(1, 2)
         moved = moved + (force.seen.slopes(u) @ (states - self._base)[:, None, :, None])[..., 0]  # (S, n, m)
         by_u = by_modes @ moved.swapaxes(1, 2) - self._push @ force.usual.slopes(u).swapaxes(1, 2)
         by_u = by_u + (force.push.slopes(u) @ (outputs - self._usual)[:, None, :, None])[..., 0].swapaxes(1, 2)
         by_means = np.zeros((*by_u.shape[:2], self._filters, by_u.shape[2]))
-        if len(force.told_by):
-            own, more = np.split(by_told @ force.told_by, [by_u.shape[2]], axis=2)
+        if len(force.conditions_by):
+            own, more = np.split(by_conditions @ force.conditions_by, [by_u.shape[2]], axis=2)
             by_u, by_means = by_u + own, more.reshape(by_means.shape)
         return by_modes @ self._seen, by_u, by_means

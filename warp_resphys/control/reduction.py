@@ -1,4 +1,4 @@
-"""Makes a reduced model of a robot: equilibria, vibrations about them and motions, sampled within its inputs' range."""
+"""Fits a reduced model to a robot: to equilibria, vibrations about them, and motions, sampled in its input range."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,30 +22,30 @@ from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_redu
 
 FloatArray = NDArray[np.float64]
 
-_LEAST_SETTLED: Final = 0.9  # of the equilibria
-_WINDOW: Final = 0.3  # s, in which a motion is foretold to tell the error
+_LEAST_SETTLED: Final = 0.9  # share of the sampled inputs that must have an equilibrium
+_WINDOW: Final = 0.3  # length of the predictions that measure the error [s]
 
 
 class _Statics(NamedTuple):
     """S equilibria."""
 
     q: torch.Tensor  # (S, N, 3) [m]
-    y: FloatArray  # (S, 3 M) what is observed [m]
+    y: FloatArray  # (S, 3 M) observed points [m]
     u: FloatArray  # (S, n) inputs as shares
     outputs: FloatArray | None  # (S, c) of the network
 
 
 def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda steps: None) -> ReducedModel:
-    """The reduced model of a robot.
+    """Fits the reduced model of a robot.
 
     Args:
-        robot: a simulator, with or without a learned force, that one input drives.
-        sampling: how much is sampled.
-        on_progress: told how many more of ``sampling.total`` are done.
+        robot: a simulator, with or without a learned force, driven by one input.
+        sampling: amount of samples.
+        on_progress: called with the number of further samples done, of ``sampling.total``.
 
     Raises:
-        InputError: see `sampling.check_reducible` and `sampling.driven_input`.
-        ConvergenceError: no equilibrium is found for inputs within the range of the trials, by the robot or by a model.
+        InputError: the robot cannot be reduced, or is not driven by exactly one input.
+        ConvergenceError: the robot or the reduced model has no equilibrium for inputs in the range of the trials.
     """
     check_reducible(robot)
     source = Source(robot, driven_input(robot))
@@ -58,113 +58,113 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
         on_progress(1)
     on_progress(sampling.tangents - len(tangents))
     counts = {"asked": sampling.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
-    best, tried, failure = None, dict[str, float](), None
+    models, failures = [], []
     for modes in sampling.modes:
-        slowest = [each.slowest(modes) for each in tangents]
+        slowest = [tangent.slowest(modes) for tangent in tangents]
         try:
-            made = _fitted(source, slowest, statics, motions, sampling.motions)
+            models.append(_fitted(source, slowest, statics, motions, sampling.motions))
         except ConvergenceError as error:
-            failure = error
-            continue
-        tried[str(modes)] = made.quality["window_relative"]
-        if best is None or made.quality["window_error_mm"] < best.quality["window_error_mm"]:
-            best = made
-    if best is None:
-        assert failure is not None
-        raise failure
+            failures.append(error)
+    if not models:
+        raise failures[-1]
+    best = min(models, key=lambda model: model.quality["window_error_mm"])
+    tried = {str(model.modes): model.quality["window_relative"] for model in models}
     return replace(best, quality={**best.quality, **counts, "motions": sampling.motions, "tried": tried})
 
 
 def _fitted(
     source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions, first: int
 ) -> ReducedModel:
-    """A model in as many coordinates as there are vibrations, fitted to the first motions and tried on the others.
+    """Fits a model with a coordinate for each vibration to the first motions, and measures its error on the others.
 
     Raises:
-        ConvergenceError: it comes to rest nowhere, or diverges.
+        ConvergenceError: the model has no equilibrium, or diverges.
     """
-    made, z_statics, z, rates = _assembled(source, tangents, statics, motions)
-    made = _with_output(
-        made,
+    model, z_statics, z, rates = _assembled(source, tangents, statics, motions)
+    model = _with_output(
+        model,
         (z_statics, statics.u, statics.y),
         (
-            z[1:, :first].reshape(-1, made.modes),
+            z[1:, :first].reshape(-1, model.modes),
             motions.acting[:, :first].reshape(-1, source.parts),
             motions.y[1:, :first].reshape(-1, motions.y.shape[2]),
         ),
     )
-    frequency = np.sqrt(np.abs(np.linalg.eigvals(made.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
-    quality: dict[str, Any] = _errors(made, motions, z, rates, first)
+    frequency = np.sqrt(np.abs(np.linalg.eigvals(model.stiffness(statics.u[:1])[0]))) / (2.0 * np.pi)
+    quality: dict[str, Any] = _errors(model, motions, z, rates, first)
     if not np.isfinite(quality["window_error_mm"]):
-        raise ConvergenceError(f"the reduced model of {made.modes} modes diverges.", statics.q, None)
-    return replace(made, quality={**quality, "modes": made.modes, "frequencies_hz": np.sort(frequency).tolist()})
+        raise ConvergenceError(f"the reduced model of {model.modes} modes diverges.", statics.q, None)
+    return replace(model, quality={**quality, "modes": model.modes, "frequencies_hz": np.sort(frequency).tolist()})
 
 
 def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> _Statics:
-    """Those under a low-discrepancy sequence of inputs, none at first.
+    """Equilibria under a low-discrepancy sequence of inputs, the first of which is zero.
 
     Raises:
-        ConvergenceError: the robot rests under too few of them.
+        ConvergenceError: the robot has an equilibrium under too few of the inputs.
     """
     asked = sampling.equilibria
     unit = qmc.Sobol(source.parts, seed=sampling.seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
     unit[0] = 0.0
-    found = []
+    batches = []
     with torch.no_grad():
-        for some in np.array_split(unit, -(-asked // sampling.batch)):
-            found.append(source.equilibria(some))
-            on_progress(len(some))
-        q, u = torch.cat([each[0] for each in found]), np.concatenate([each[1] for each in found])
+        for shares in np.array_split(unit, -(-asked // sampling.batch)):
+            batches.append(source.equilibria(shares))
+            on_progress(len(shares))
+        q, u = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])
         y = source.robot.observe(RobotState(State(q, torch.zeros_like(q)))).flatten(1).double().cpu().numpy()
     if len(u) < _LEAST_SETTLED * asked:
         raise ConvergenceError(
-            f"the robot comes to rest under {len(u)} of {asked} inputs within its range: its learned force is too "
+            f"the robot has an equilibrium under {len(u)} of {asked} inputs in its range: its learned force is too "
             "large for a reduced model.",
             q,
             None,
         )
-    outputs = [each[2] for each in found if each[2] is not None]
+    outputs = [batch[2] for batch in batches if batch[2] is not None]
     return _Statics(q, y, u, np.concatenate(outputs) if outputs else None)
 
 
 def _assembled(
     source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions
 ) -> tuple[ReducedModel, FloatArray, FloatArray, FloatArray]:
-    """The model without what is observed; coordinates (S, r) of the equilibria and (T + 1, B, r) of motions; rates.
+    """Fits the dynamics of the model, without y_0 and H.
 
-    What the network's outputs at an equilibrium have beside the usual ones is taken from it by the model's own linear
-    response, so that z_0 and p are as smooth as the body, however rough the network is.
+    The deviation of the network's outputs from c_0 at an equilibrium is subtracted through the model's own linear
+    response, so that z_0 and p are smooth functions of the inputs even if the network is not.
+
+    Returns:
+        The model, coordinates (S, r) of the equilibria, and coordinates and rates (T + 1, B, r) of the motions.
     """
-    known, unit = statics.u[: len(tangents)], statics.u
-    shapes = torch.stack([each.shapes for each in tangents])  # (S', 3 N, r)
+    unit = statics.u
+    shapes = torch.stack([tangent.shapes for tangent in tangents])  # (S', 3 N, r)
     projector = source.mass[:, None] * _common(shapes, source.mass)
     turned = torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy()
     back = np.linalg.inv(turned)
     z_statics = ((statics.q - source.rest).flatten(1).double() @ projector).cpu().numpy()
     z, rates = (
-        torch.einsum("tbd,dr->tbr", each.flatten(2).double(), projector).cpu().numpy()
-        for each in (motions.q - source.rest.float(), motions.v)
+        torch.einsum("tbd,dr->tbr", field.flatten(2).double(), projector).cpu().numpy()
+        for field in (motions.q - source.rest.float(), motions.v)
     )
 
-    def tangent(values: FloatArray) -> Polynomial:
-        return Polynomial.fitted(known, values, TANGENT_ORDER)
+    def fitted(values: FloatArray) -> Polynomial:
+        return Polynomial.fitted(unit[: len(tangents)], values, TANGENT_ORDER)
 
-    stiffness = tangent(turned @ np.stack([each.stiffness for each in tangents]) @ back)
-    damping = tangent(turned @ np.stack([each.damping for each in tangents]) @ back)
+    stiffness = fitted(turned @ np.stack([tangent.stiffness for tangent in tangents]) @ back)
+    damping = fitted(turned @ np.stack([tangent.damping for tangent in tangents]) @ back)
     z_usual, force = z_statics, None
     if statics.outputs is not None and source.learned is not None:
         network = source.learned.network
-        push = tangent(turned @ np.stack([each.push for each in tangents if each.push is not None]))
+        push = fitted(turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None]))
         usual = Polynomial.fitted(unit, statics.outputs, USUAL_ORDER)
         moved = np.linalg.solve(stiffness(unit), push(unit) @ (statics.outputs - usual(unit))[..., None])[..., 0]
         z_usual = z_statics - moved
         both = [_modes_seen(coder, shapes, back) for coder in (network.position, network.velocity)]
-        seen = tangent(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
+        seen = fitted(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
         places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
         places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
         places = places - (seen(unit)[..., : shapes.shape[2]] @ moved[..., None])[..., 0]
         at_rest = Polynomial.fitted(unit, places, STATIC_ORDER)
-        force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.told(), usual, push)
+        force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push)
     modes, labels = shapes.shape[2], source.robot.labels
     model = ReducedModel(
         source.robot.time_step,
@@ -179,7 +179,7 @@ def _assembled(
         Polynomial(np.zeros((1, 3 * len(labels))), 0),
         stiffness,
         damping,
-        tangent(np.stack([each.shown for each in tangents]) @ back),
+        fitted(np.stack([tangent.shown for tangent in tangents]) @ back),
         np.zeros((modes, modes, 3 * len(labels))),
         force,
     )
@@ -187,7 +187,7 @@ def _assembled(
 
 
 def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatArray:
-    """(S, m, r) the standardised modes of a coder by the coordinates; m is 0 for a network that sees none."""
+    """Standardised modes of a coder as functions of the coordinates, (S, m, r); m is 0 without modes."""
     if coder.basis is None or not coder.size:
         return np.zeros((len(back), 0, back.shape[1]))
     basis = (coder.basis / coder.scale).to(shapes)
@@ -195,37 +195,38 @@ def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatAr
 
 
 def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
-    """(3 N, r) columns Psi, orthonormal in the mass, that span vibrations (S, 3 N, r) best."""
+    """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace of vibrations (S, 3 N, r)."""
     root = mass.sqrt()[:, None]
     columns = (root * shapes).permute(1, 0, 2).flatten(1)
-    found = torch.linalg.svd(columns, full_matrices=False)[0][:, : shapes.shape[2]]
-    return torch.where(root > 0.0, found / root.clamp_min(1e-300), 0.0)
+    basis = torch.linalg.svd(columns, full_matrices=False)[0][:, : shapes.shape[2]]
+    return torch.where(root > 0.0, basis / root.clamp_min(1e-300), 0.0)
 
 
 def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tuple[FloatArray, ...]) -> ReducedModel:
-    """The same with y_0, of equilibria, and H, of motions.
+    """Adds y_0, fitted to equilibria, and H, fitted to motions.
 
-    Both are coordinates (S, r), inputs (S, n) and what was observed (S, 3 M) [m]. In fast motions more modes take part
-    than the model has: y_0, fitted to these too, would make up for them and be wrong at rest.
+    Both arguments are coordinates (S, r), inputs (S, n) and observed points (S, 3 M) [m]. Fast motions excite more
+    modes than the model has; fitted to them as well, y_0 would compensate for these and be wrong at rest.
     """
 
-    def left(z: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residual(z: FloatArray, u: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         off = z - model.static(u)
         return off, y - (model.shown(u) @ off[..., None])[..., 0]
 
-    observed = Polynomial.fitted(rests[1], left(*rests)[1], model.static.order)
-    off, rest = left(*motions)
+    observed = Polynomial.fitted(rests[1], residual(*rests)[1], model.static.order)
+    off, remainder = residual(*motions)
     first, second = np.triu_indices(model.modes)
-    curved = np.zeros((model.modes, model.modes, rest.shape[1]))
-    curved[first, second] = 0.5 * solve_ridge(off[:, first] * off[:, second], rest - observed(motions[1]))
+    curved = np.zeros((model.modes, model.modes, remainder.shape[1]))
+    curved[first, second] = 0.5 * solve_ridge(off[:, first] * off[:, second], remainder - observed(motions[1]))
     return replace(model, observed=observed, curved=curved + curved.swapaxes(0, 1))
 
 
 def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatArray, first: int) -> dict[str, float]:
-    """How far the model is from the robot, over windows and over whole motions, from one on [mm]."""
-    steps, chosen = round(_WINDOW / model.time_step), slice(first, None)
-    z, rates, y, acting = (each[:, chosen] for each in (z, rates, motions.y, motions.acting))
-    commands = motions.commands[:, chosen]
+    """Distances of the model from the robot over windows and whole motions, for the motions from ``first`` on [mm]."""
+    steps = round(_WINDOW / model.time_step)
+    z, rates, y, acting, commands = (
+        series[:, first:] for series in (z, rates, motions.y, motions.acting, motions.commands)
+    )
     memories = [model.response.still(np.zeros(commands.shape[1:]))]
     for now in commands:
         memories.append(model.response(memories[-1], now[None])[2])
@@ -233,8 +234,8 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
         start = ReducedState(z[at], rates[at], acting[at - 1], memories[at], before, looks)
-        found, true = model.move(start, commands[at : at + steps] * model.scale).y, y[at + 1 : at + steps + 1]
-        off.append(_distances(found, true).mean())
+        predicted, true = model.move(start, commands[at : at + steps] * model.scale).y, y[at + 1 : at + steps + 1]
+        off.append(_distances(predicted, true).mean())
         moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())
     whole = model.move(model.rest(count=z.shape[1]), commands * model.scale).y
     return {
@@ -247,5 +248,5 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
 
 
 def _distances(left: FloatArray, right: FloatArray) -> FloatArray:
-    """(P, M) distances of points (P, 3 M), or with more axes [mm]."""
+    """Distances between corresponding points of two arrays (..., 3 M), flattened [mm]."""
     return np.asarray(1e3 * np.linalg.norm(left.reshape(-1, 3) - right.reshape(-1, 3), axis=1))

@@ -1,8 +1,8 @@
-"""Paths that points of a robot are to follow: circles, figures of eight and letters, at a speed."""
+"""Paths for a point of a robot: circles, figures of eight and letters, and their timing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,9 @@ from ..io.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
-_SPACING: Final = 2000  # points of a path, between which it is straight
-_CORNER: Final = 0.02  # of the length of a path, over which its corners are rounded
-# The strokes of letters as one line each, on a grid of columns 0 to 4 and rows 0 to 6.
+_SPACING: Final = 2000  # number of points of a path
+_CORNER: Final = 0.02  # length over which corners are rounded, as a share of the path
+# Strokes of the letters, a polyline for each, on a grid of columns 0 to 4 and rows 0 to 6.
 _LETTERS: Final[Mapping[str, str]] = {
     "A": "00 26 40 33 13",
     "B": "00 06 26 35 34 23 03 23 42 41 30 00",
@@ -47,14 +47,14 @@ _LETTERS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Path:
-    """A curve in a plane that a point is to follow.
+    """A plane curve.
 
     Attributes:
         name: ``circle``, ``eight`` or a capital letter.
         size: of its larger side [m].
         centre: (3,) of its bounding box [m].
         right: (3,) the direction of its width.
-        up: (3,) the direction of its height; made perpendicular.
+        up: (3,) the direction of its height; made perpendicular to ``right``.
     """
 
     name: str
@@ -65,10 +65,10 @@ class Path:
 
     @property
     def points(self) -> FloatArray:
-        """(P, 3) of the curve, evenly spaced [m]; its corners are rounded.
+        """Evenly spaced points (P, 3) of the curve, with rounded corners [m].
 
         Raises:
-            InputError: an unknown shape, a size that is not positive, or directions of no plane.
+            InputError: an unknown shape, a size that is not positive, or parallel directions.
         """
         if not self.size > 0.0:
             raise InputError(f"the size of the path {self.name} is {self.size:g}: it must be positive, in m.")
@@ -77,7 +77,7 @@ class Path:
         flat = (flat - 0.5 * (low + high)) * (self.size / float((high - low).max()))
         first, second = np.asarray(self.right, dtype=np.float64), np.asarray(self.up, dtype=np.float64)
         if not np.linalg.norm(np.cross(first, second)) > 1e-9:
-            raise InputError(f"the path {self.name} lies in no plane: give two directions that are not parallel.")
+            raise InputError(f"right and up of the path {self.name} are parallel: give two different directions.")
         first = first / np.linalg.norm(first)
         second = second - (second @ first) * first
         second /= np.linalg.norm(second)
@@ -85,35 +85,35 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Of the curve [m]."""
+        """Length of the curve [m]."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     def timed(self, seconds: float, time_step: float, lead: FloatArray | None = None) -> FloatArray:
-        """(T + 1, 3) where the point is to be at the steps [m], beginning and ending at rest.
+        """Positions of the point (T + 1, 3) at the time steps [m]; it starts and ends at rest.
 
         Args:
-            seconds: that the curve takes.
+            seconds: duration of the curve.
             time_step: h [s].
-            lead: (3,) from where it goes to the curve's first point, in a quarter of that time [m]; none if left out.
+            lead: (3,) point from which it first moves to the start of the curve, in a quarter of the duration [m].
 
         Raises:
-            InputError: less than ten steps.
+            InputError: the duration is shorter than ten steps.
         """
         steps = round(seconds / time_step)
         if steps < 10:
-            raise InputError(f"the path {self.name} is to take {seconds:g} s: that is less than ten steps.")
+            raise InputError(f"the path {self.name} takes {seconds:g} s: give at least ten steps of {time_step:g} s.")
         curve = self.points
         at = _eased(np.arange(steps + 1) / steps) * (len(curve) - 1)
-        found = np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1)
+        points = _interpolated(at, np.arange(len(curve)), curve)
         if lead is None:
-            return found
+            return points
         before = max(steps // 4, 5)
         share = _smooth(np.arange(before) / before)[:, None]
-        return np.concatenate([lead + share * (found[0] - lead), found])
+        return np.concatenate([lead + share * (points[0] - lead), points])
 
 
 def _curve(name: str) -> FloatArray:
-    """(P, 2) of a shape of any size, evenly spaced."""
+    """Evenly spaced points (P, 2) of a shape, in its own units."""
     angle = np.linspace(0.0, 2.0 * np.pi, _SPACING)
     if name == "circle":
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -123,24 +123,26 @@ def _curve(name: str) -> FloatArray:
         raise InputError(f"the path is {name!r}: choose circle, eight, or a capital letter.")
     corners = np.array([[float(x) for x in (at.split(",") if "," in at else at)] for at in _LETTERS[name].split()])
     straight = _even(corners)
-    width = _CORNER * _SPACING / 2.0
-    return _even(np.stack([gaussian_filter1d(column, width, mode="nearest") for column in straight.T], axis=1))
+    return _even(gaussian_filter1d(straight, _CORNER * _SPACING / 2.0, axis=0, mode="nearest"))
 
 
 def _even(points: FloatArray) -> FloatArray:
-    """The same curve with points at equal distances."""
+    """Resamples a curve at equal distances."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    wanted = np.linspace(0.0, along[-1], _SPACING)
-    return np.stack([np.interp(wanted, along, column) for column in points.T], axis=1)
+    return _interpolated(np.linspace(0.0, along[-1], _SPACING), along, points)
+
+
+def _interpolated(at: FloatArray, knots: NDArray[Any], values: FloatArray) -> FloatArray:
+    return np.stack([np.interp(at, knots, column) for column in values.T], axis=1)
 
 
 def _smooth(share: FloatArray) -> FloatArray:
-    """From 0 to 1 without velocity or acceleration at the ends."""
+    """Smooth step from 0 to 1, with zero velocity and acceleration at both ends."""
     return np.asarray(share**3 * (10.0 - 15.0 * share + 6.0 * share**2))
 
 
-def _eased(share: FloatArray, ends: float = 0.1) -> FloatArray:
-    """From 0 to 1 at an even speed, but for the first and the last tenth, in which it grows and fades."""
-    rate = np.minimum(_smooth(np.clip(share / ends, 0.0, 1.0)), _smooth(np.clip((1.0 - share) / ends, 0.0, 1.0)))
+def _eased(share: FloatArray) -> FloatArray:
+    """Progress from 0 to 1 at constant speed, except that it accelerates and decelerates in the outer tenths."""
+    rate = _smooth(np.clip(10.0 * np.minimum(share, 1.0 - share), 0.0, 1.0))
     gone = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))])
     return np.asarray(gone / gone[-1])

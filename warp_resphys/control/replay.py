@@ -1,4 +1,4 @@
-"""What controllers did on the simulated laboratory, done again to be looked at."""
+"""Replays motions that controllers have driven on the simulated laboratory, with the whole body."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ FloatArray = NDArray[np.float64]
 
 
 def driven_settings(folder: Path) -> DriveStage:
-    """Settings of a run whose laboratory controllers have driven.
+    """Returns the settings with which controllers have driven the laboratory of a run.
 
     Raises:
-        InputError: none have.
-        DataFileError: there is no such run, or it has changed since.
+        InputError: no motion was driven.
+        DataFileError: there is no such run, or its files have changed.
     """
     if (folder / "stages").is_dir() and not (folder / DRIVEN).is_file():
         raise InputError(
@@ -40,14 +40,14 @@ def driven_settings(folder: Path) -> DriveStage:
 
 @dataclass(frozen=True)
 class DrivenReplay:
-    """A motion as C controllers drove it.
+    """A motion that C controllers have driven.
 
     Attributes:
         times: (T + 1,) since the first command [s].
-        triangles: (S, 3) of the surface of the laboratory's body.
-        bodies: (C, T + 1, N, 3) its vertices [m].
-        points: (C, T + 1, 3) where the point was that is to follow the path [m].
-        driven: the motion.
+        triangles: (S, 3) surface of the laboratory's body.
+        bodies: (C, T + 1, N, 3) vertices [m].
+        points: (C, T + 1, 3) positions of the tracked point [m].
+        driven: the motion as it was recorded.
         gravity: (3,) in the frame of the bodies [m/s^2].
     """
 
@@ -60,26 +60,26 @@ class DrivenReplay:
 
 
 def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenReplay:
-    """Gives the laboratory the inputs that it was given, for the first seconds of a motion.
+    """Drives the laboratory with the recorded inputs of a motion.
 
     Args:
         folder: of the run.
         motion: such as ``eight_4s``.
         controllers: such as ``open_resphys``.
-        seconds: of the motion.
+        seconds: after which the replay stops.
 
     Raises:
-        InputError: no such motion or controller, or see `driven_settings`.
-        DataFileError: likewise.
+        InputError: no such motion or controller, or no motion was driven.
+        DataFileError: there is no such run, or its files have changed.
         ConvergenceError: the simulation diverges.
     """
     settings = driven_settings(folder)
     control = settings.control
-    known = controllers_of(control)
+    names = controllers_of(control)
     _check("motion", [motion], motions_of(control))
-    _check("controllers", controllers, known)
+    _check("controllers", controllers, names)
     robot = load(folder, control.models[-1], settings.device)
-    driven, rows = read_driven(folder / DRIVEN, motion), [known.index(each) for each in controllers]
+    driven, rows = read_driven(folder / DRIVEN, motion), [names.index(name) for name in controllers]
     steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings.played, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)
@@ -90,18 +90,18 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
             bodies.append(laboratory.bodies()[1])
             points.append(laboratory.markers())
             progress.advance()
-    places = np.stack(points, 1)  # (C, T + 1, M, 3)
+    markers = np.stack(points, 1)  # (C, T + 1, M, 3)
     return DrivenReplay(
         robot.time_step * np.arange(steps + 1, dtype=np.float64),
         laboratory.bodies()[0],
         np.stack(bodies, 1),
-        places.reshape(*places.shape[:2], -1) @ tracked.T,
+        markers.reshape(*markers.shape[:2], -1) @ tracked.T,
         driven,
         np.asarray(robot.simulator.gravity, dtype=np.float64),
     )
 
 
-def _check(key: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-    unknown = [each for each in wanted if each not in known]
+def _check(key: str, wanted: Sequence[str], choices: Sequence[str]) -> None:
+    unknown = [name for name in wanted if name not in choices]
     if unknown or not wanted:
-        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose of {', '.join(known)}.")
+        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(choices)}.")

@@ -1,4 +1,4 @@
-"""Stages: reduced models of the robot, plans on them, baselines without a simulator, and all of them driven."""
+"""Control stages: reduced models, plans, baselines without a simulator, and all controllers on the laboratory."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -52,35 +52,34 @@ from .files import (
 )
 from .laboratory import Laboratory
 from .open_loop import Follower
-from .reduced import ReducedModel
 from .reduction import reduce
 from .sampling import Sampling, driven_input
-from .task import Task, motion_name
+from .task import Task, motion_name, motions_of
 
 FloatArray = NDArray[np.float64]
 
-_ALL_SEEN: Final = 0.5  # of the frames of a trial, that must be whole for a linear model
+_ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
 
 
 def reduce_robot(context: StageContext) -> None:
-    """Writes the reduced model of a model.
+    """Writes the reduced form of a model.
 
     Raises:
-        InputError, ConvergenceError: it cannot be reduced, see `reduction.reduce`.
+        InputError, ConvergenceError: the model cannot be reduced, see `reduction.reduce`.
     """
     settings: ReduceStage = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
     sampling = Sampling(**dict(settings.reduction), seed=settings.seed)
     with Progress(context.name, sampling.total, "samples") as progress:
-        found = reduce(robot, sampling, progress.advance)
-    write_reduced(context.run_dir / reduced_file(settings.model), found)
+        reduced = reduce(robot, sampling, progress.advance)
+    write_reduced(context.run_dir / reduced_file(settings.model), reduced)
 
 
 def plan_motions(context: StageContext) -> None:
     """Writes the plans of all motions on a model, as HDF5 and as tables to be played on a robot.
 
     Raises:
-        InputError: the robot cannot reach a path, and is the one that must.
+        InputError: the robot cannot reach a path, and ``must_reach`` is set.
         ConvergenceError: the robot diverges on a plan.
     """
     settings: PlanStage = context.settings
@@ -90,60 +89,53 @@ def plan_motions(context: StageContext) -> None:
     reduced = read_reduced(context.run_dir / reduced_file(model), robot.description.learned)
     if settings.must_reach:
         task.check_reach(reduced, plan.reach)
-    start, seconds = _start(context.run_dir, task), settings.figures.seconds
+    # The point starts where the recordings have it before anything moved.
+    start = task.tracked @ np.nanmean(read_dataset(context.run_dir / DATASET).held, axis=0).ravel()
     checkpoint = context.run_dir / f"{context.name}.state.safetensors"
     kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
-    found = {} if kept is None else plans_from_plain(*kept)
+    plans = {} if kept is None else plans_from_plain(*kept)
     followers = {
-        each: Follower(robot, reduced, task.planner(reduced, each, plan), plan.corrections, plan.gradient)
-        for each in seconds
+        seconds: Follower(robot, reduced, task.planner(reduced, seconds, plan), plan.corrections, plan.gradient)
+        for seconds in settings.figures.seconds
     }
-    total = sum(each.rollouts * task.steps(time) for time, each in followers.items())
-    done = sum(followers[each].rollouts * task.steps(each) for each in seconds if _names(task, each)[0] in found)
-    with Progress(context.name, total, "steps", done) as progress:
-        for each, follower in followers.items():
-            names = _names(task, each)
-            if names[0] in found:
-                continue
-            paths = np.stack([task.timed(path, each, start) for path in task.paths])
-            found |= dict(zip(names, follower.follow(paths, progress.advance), strict=True))
-            tensors, plain = plain_plans(found)
+    work = {seconds: follower.rollouts * task.steps(seconds) for seconds, follower in followers.items()}
+    done = [seconds for seconds in work if _names(task, seconds)[0] in plans]
+    with Progress(context.name, sum(work.values()), "steps", sum(work[seconds] for seconds in done)) as progress:
+        for seconds in [seconds for seconds in work if seconds not in done]:
+            paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
+            followed = followers[seconds].follow(paths, progress.advance)
+            plans |= dict(zip(_names(task, seconds), followed, strict=True))
+            tensors, plain = plain_plans(plans)
             keep_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
-    write_plans(context.run_dir / plans_file(model), found)
-    given = driven_input(robot)
-    for name, motion in found.items():
-        columns = input_columns(given.name, given.parts, given.unit, motion.inputs)
+    write_plans(context.run_dir / plans_file(model), plans)
+    driven = driven_input(robot)
+    for name, motion in plans.items():
+        columns = input_columns(driven.name, driven.parts, driven.unit, motion.inputs)
         markers = motion.markers.reshape(len(motion.markers), -1, 3)
         times = robot.time_step * np.arange(len(markers), dtype=np.float64)
         write_csv(context.run_dir / plan_table(model, name), times, robot.labels, markers, columns)
     forget_checkpoint(checkpoint)
 
 
-def _start(folder: Path, task: Task) -> FloatArray:
-    """(3,) where the point was in the recordings before anything moved [m]."""
-    found = task.tracked @ np.nanmean(read_dataset(folder / DATASET).held, axis=0).ravel()
-    return np.asarray(found)
-
-
 def fit_baselines(context: StageContext) -> None:
-    """Writes the linear model of the recordings, and the Jacobian that the laboratory shows when inputs are pressed.
+    """Writes the linear model of the recordings, and the Jacobian of the laboratory, measured one input at a time.
 
     Raises:
         InputError: too few frames of the trials show all markers.
     """
     settings: BaselinesStage = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    task, known, data = task_of(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
-    assert known.high is not None
+    task, driven, data = task_of(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    assert driven.high is not None
     train, validation = (
-        [_series(data, name, known.name, robot.time_step) for name in names]
+        [_series(data, name, driven.name, robot.time_step) for name in names]
         for names in (settings.split.train, settings.split.validation)
     )
-    linear = fit_linear(train, validation or train, np.asarray(known.high), robot.time_step)
+    linear = fit_linear(train, validation or train, np.asarray(driven.high), robot.time_step)
     feedback, limits = settings.feedback, task.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
     pressed = feedback.pressed * np.diag(limits.range)
-    laboratory = Laboratory(settings.played, context.run_dir, known.name, parts, len(task.motions))
+    laboratory = Laboratory(settings.played, context.run_dir, driven.name, parts, len(motions_of(settings.figures)))
     rest, seen = laboratory.rest(), []
     with Progress(context.name, steps, "steps") as progress:
         for number in range(steps):
@@ -155,24 +147,27 @@ def fit_baselines(context: StageContext) -> None:
     write_baselines(context.run_dir / BASELINES, linear, moved.T / np.diag(pressed))
 
 
-def _series(data: Dataset, name: str, given: str, time_step: float) -> tuple[FloatArray, FloatArray]:
-    """(T + 1, 3 M) the markers of a trial at the steps of a robot [m], and (T, n) its inputs."""
+def _series(data: Dataset, name: str, driven: str, time_step: float) -> tuple[FloatArray, FloatArray]:
+    """Resamples a trial at a robot's steps: markers (T + 1, 3 M) [m] and inputs (T, n)."""
     (row,) = data.rows([name])
     observed = data.observed if data.smoothed is None else data.smoothed
     seen, times = observed[row].reshape(len(data.times[row]), -1), data.times[row]
     whole = np.isfinite(seen).all(1)
     if whole.mean() < _ALL_SEEN:
-        raise InputError(f"trial {name} shows all markers in {100 * whole.mean():.0f} % of its frames: too few.")
+        raise InputError(
+            f"trial {name} shows all markers in {100 * whole.mean():.0f} % of its frames: the linear model of control "
+            f"needs {100 * _ALL_SEEN:.0f} %."
+        )
     steps = round(float(times[whole].max()) / time_step)
     at = time_step * np.arange(steps + 1)
     markers = np.stack([np.interp(at, times[whole], column[whole]) for column in seen.T], axis=1)
-    inputs = data.inputs[given][row]
+    inputs = data.inputs[driven][row]
     number = np.minimum((at[:-1] / data.time_step + 1e-9).astype(np.int64), len(inputs) - 1)
     return markers, inputs[number]
 
 
 def drive(context: StageContext, workers: Workers = ALONE) -> None:
-    """Writes how all controllers drive all motions on the simulated laboratory."""
+    """Drives all motions on the simulated laboratory with all controllers, and writes the result."""
     settings: DriveStage = context.settings
     control = settings.control
     controllers = controllers_of(control)
@@ -194,7 +189,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
 
 
 def controllers_of(control: ControlSettings) -> list[str]:
-    """What drives, in the order of the tables."""
+    """Returns the names of all controllers, in the order of the tables."""
     return [
         *(f"{OPEN}{model}" for model in control.models),
         *(f"{RECEDING}{model}" for model in control.receding),
@@ -206,28 +201,28 @@ def controllers_of(control: ControlSettings) -> list[str]:
 def receding_controllers(
     settings: DriveStage, folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
 ) -> list[Controller]:
-    """Those that plan anew at each step, on the reduced models and at last on the linear one.
+    """Returns the receding-horizon controllers, on the reduced models and finally on the linear model.
 
     Args:
         settings: of the stage drive.
         folder: of the run.
         robot: with the last of the models.
-        path: (T, d) where the point is to be after each step [m].
-        rests: (>= C, M, 3) the markers that each of them sees as the robot hangs without inputs [m].
+        path: (T, d) reference of the point after each step [m].
+        rests: (>= C, M, 3) markers that each controller observes while the robot rests without inputs [m].
     """
     control = settings.control
-    task, noise, found = task_of(control, robot), Noise(**dict(control.estimate)), list[Controller]()
+    task, noise, controllers = task_of(control, robot), Noise(**dict(control.estimate)), list[Controller]()
     limits, horizon = task.limits, task.horizon(control.horizon)
-    for model in control.receding:
+    for model, rest in zip(control.receding, rests, strict=False):
         learned = robot if model == robot.description.model else load(folder, model, settings.device)
-        reduced: ReducedModel = read_reduced(folder / reduced_file(model), learned.description.learned)
-        found.append(RecedingHorizon(reduced, task.tracked, limits, horizon, noise, path, rests[len(found)]))
-    linear = read_baselines(folder / BASELINES)[0]
-    return [*found, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rests[len(found)])]
+        reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
+        controllers.append(RecedingHorizon(reduced, task.tracked, limits, horizon, noise, path, rest))
+    linear, rest = read_baselines(folder / BASELINES)[0], rests[len(controllers)]
+    return [*controllers, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest)]
 
 
 class _Drive(ResumableRollout):
-    """One motion, driven by all controllers at once."""
+    """Drives one motion with all controllers, each on a body of its own."""
 
     def __init__(self, part: TrialPart) -> None:
         settings: DriveStage = part.context.settings
@@ -235,14 +230,14 @@ class _Drive(ResumableRollout):
         control = settings.control
         names = controllers_of(control)
         robot = load(self._folder, control.models[-1], settings.device)
-        self._task, known = task_of(control, robot), driven_input(robot)
-        number = self._task.motions.index(self._name)
-        self._laboratory = Laboratory(settings.played, self._folder, known.name, len(names), number)
+        self._task, driven = task_of(control, robot), driven_input(robot)
+        number = motions_of(control).index(self._name)
+        self._laboratory = Laboratory(settings.played, self._folder, driven.name, len(names), number)
         self._controllers = self._made(robot)
         self.like, self.frames, count = self._laboratory.state.q, part.frames, len(names)
         self.fields = {
             "points": Field((count, 3), "m"),
-            "inputs": Field((count, self._task.parts), known.unit),
+            "inputs": Field((count, self._task.parts), driven.unit),
             "seconds": Field((count,), "s"),
         }
         self._inputs, self._seconds = np.zeros((count, self._task.parts)), np.zeros(count)
@@ -251,13 +246,13 @@ class _Drive(ResumableRollout):
         control, task, folder = self._settings.control, self._task, self._folder
         plans = {model: read_plan(folder / plans_file(model), self._name) for model in control.models}
         rest, path = self._laboratory.rest(), plans[control.models[-1]].path
-        found: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
-        found += receding_controllers(self._settings, folder, robot, path, rest[len(found) :])
+        controllers: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
+        controllers += receding_controllers(self._settings, folder, robot, path, rest[len(controllers) :])
         limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
         for gain in control.feedback.gains:
-            own = rest[len(found)]
-            found.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
-        return found
+            own = rest[len(controllers)]
+            controllers.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
+        return controllers
 
     @override
     def begin(self) -> State:
@@ -266,10 +261,10 @@ class _Drive(ResumableRollout):
     @override
     def step(self, number: int) -> State:
         seen = self._laboratory.seen(number - 1)
-        pairs = [
-            timed_command(each, number - 1, markers) for each, markers in zip(self._controllers, seen, strict=True)
+        commands = [
+            timed_command(controller, number - 1, seen[row]) for row, controller in enumerate(self._controllers)
         ]
-        self._inputs, self._seconds = np.stack([each[0] for each in pairs]), np.array([each[1] for each in pairs])
+        self._inputs, self._seconds = (np.array(column) for column in zip(*commands, strict=True))
         self._laboratory.step(self._inputs)
         return self._laboratory.state
 
@@ -280,34 +275,34 @@ class _Drive(ResumableRollout):
 
     @override
     def snapshot(self) -> dict[str, torch.Tensor]:
-        found = super().snapshot()
-        for number, each in enumerate(self._controllers):
-            found |= {f"{number}.{key}": torch.from_numpy(value.copy()) for key, value in each.remembered().items()}
-        return found
+        tensors = super().snapshot()
+        for row, controller in enumerate(self._controllers):
+            memory = controller.remembered()
+            tensors |= {f"{row}.{key}": torch.from_numpy(value.copy()) for key, value in memory.items()}
+        return tensors
 
     @override
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore({key: each for key, each in tensors.items() if not key.split(".")[0].isdecimal()})
+        super().restore({key: tensor for key, tensor in tensors.items() if not key.split(".")[0].isdecimal()})
         self._laboratory.state = self.state
-        for number, controller in enumerate(self._controllers):
-            own = f"{number}."
-            known = {key.removeprefix(own): each.numpy() for key, each in tensors.items() if key.startswith(own)}
-            controller.recall(known)
+        for row, controller in enumerate(self._controllers):
+            own = f"{row}."
+            controller.recall({key.removeprefix(own): x.numpy() for key, x in tensors.items() if key.startswith(own)})
 
 
 def _summary(
     folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, DrivenMotion]
 ) -> dict[str, Any]:
-    """What control.json says: errors [mm] by speed and controller, and of each motion; times; the reduced models."""
+    """Content of control.json: errors [mm] by speed and controller, computing times, quality of the reduced models."""
     by_speed: dict[str, Any] = {}
     for seconds in control.seconds:
         names = [motion_name(shape, seconds) for shape in control.shapes]
-        each = {name: 1e3 * np.linalg.norm(motions[name].points - motions[name].path, axis=2) for name in names}
+        errors = {name: 1e3 * np.linalg.norm(motions[name].points - motions[name].path, axis=2) for name in names}
         by_speed[f"{seconds:g}"] = {
             controller: {
-                "mean_mm": float(np.mean([errors[row].mean() for errors in each.values()])),
-                "max_mm": float(max(errors[row].max() for errors in each.values())),
-                "motions_mm": {name: float(errors[row].mean()) for name, errors in each.items()},
+                "mean_mm": float(np.mean([of_motion[row].mean() for of_motion in errors.values()])),
+                "max_mm": float(max(of_motion[row].max() for of_motion in errors.values())),
+                "motions_mm": {name: float(of_motion[row].mean()) for name, of_motion in errors.items()},
             }
             for row, controller in enumerate(controllers)
         }
@@ -330,10 +325,10 @@ def _summary(
 
 
 def task_of(figures: FigureSettings, robot: Robot) -> Task:
-    """The figures that a robot is to follow."""
+    """Returns the task of a robot: the figures that its point follows."""
     return Task(figures, robot.labels, robot.time_step, len(driven_input(robot).parts))
 
 
 def _names(task: Task, seconds: float) -> list[str]:
-    """Of the motions at a speed."""
+    """Names of the motions whose curves take so long."""
     return [motion_name(path.name, seconds) for path in task.paths]

@@ -1,4 +1,4 @@
-"""What is to be followed, by what, within which limits: the group ``control`` of a configuration."""
+"""The tracking task of the configuration group ``control``: paths, tracked point, limits of the inputs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,25 +10,24 @@ from scipy.optimize import least_squares
 
 from ..io.errors import InputError
 from ..settings.control import FigureSettings, HorizonSettings, PlanSettings
-from .controllers import Horizon
-from .plan import Limits, Planner, Weights, tracked_of
+from .plan import Horizon, Limits, Planner, Weights, tracked_of
 from .reduced import ReducedModel
 from .reference import Path
 
 FloatArray = NDArray[np.float64]
 
-_POINTS = 40  # of a path, that are to be in reach
+_POINTS = 40  # number of points of a path whose reach is checked
 
 
 @dataclass(frozen=True)
 class Task:
-    """See the module.
+    """Figures that a point of a robot follows.
 
     Attributes:
-        figures: that are followed.
+        figures: settings of the figures.
         labels: of the M markers.
         time_step: h [s].
-        parts: n inputs.
+        parts: number n of inputs.
     """
 
     figures: FigureSettings
@@ -38,56 +37,51 @@ class Task:
 
     @cached_property
     def tracked(self) -> FloatArray:
-        """(3, 3 M) from the markers to the point that is to follow, which is the mean of some."""
+        """Matrix (3, 3 M) from the markers to the tracked point, a mean of some of them."""
         return tracked_of(self.labels, self.figures.tracked)
 
     @property
     def limits(self) -> Limits:
-        """Of the inputs."""
+        """Limits of the inputs."""
         limits = self.figures.limits
-        return Limits(*(np.full(self.parts, each) for each in (limits.low, limits.high, limits.rate)))
+        return Limits(*(np.full(self.parts, bound) for bound in (limits.low, limits.high, limits.rate)))
 
     @property
     def paths(self) -> list[Path]:
-        """The curves."""
+        """The curves, one for each shape."""
         own = self.figures
         return [Path(name, size=own.size, centre=own.centre, right=own.right, up=own.up) for name in own.shapes]
 
-    @property
-    def motions(self) -> list[str]:
-        """Their names: each curve at each speed, such as ``eight_4s``."""
-        return motions_of(self.figures)
-
     def steps(self, seconds: float) -> int:
-        """T of a motion whose curve takes so long."""
+        """Number T of steps of a motion whose curve takes so long."""
         return len(self.timed(self.paths[0], seconds, np.zeros(3)))
 
     def timed(self, path: Path, seconds: float, start: FloatArray) -> FloatArray:
-        """(T, 3) where the point is to be after each step of a motion that begins at (3,) [m]."""
+        """Reference (T, 3) after each step of a motion from a start (3,) [m]."""
         return path.timed(seconds, self.time_step, lead=start)[1:]
 
     def planner(self, model: ReducedModel, seconds: float, plan: PlanSettings) -> Planner:
-        """Of whole motions."""
+        """Planner of whole motions."""
         steps = self.steps(seconds)
-        pieces = max(round(steps * self.time_step / plan.spacing), 1)
-        weights = Weights(plan.effort, plan.change)
-        return Planner(model, self.tracked, self.limits, steps, min(pieces, steps), weights, iterations=plan.iterations)
+        pieces = min(max(round(steps * self.time_step / plan.spacing), 1), steps)
+        horizon = Horizon(steps, pieces, Weights(plan.effort, plan.change), plan.iterations)
+        return Planner(model, self.tracked, self.limits, horizon)
 
     def horizon(self, settings: HorizonSettings) -> Horizon:
-        """Of receding plans."""
+        """Horizon of receding plans."""
         steps = max(round(settings.seconds / self.time_step), 1)
         weights = Weights(settings.effort, settings.change)
         return Horizon(steps, min(settings.pieces, steps), weights, settings.iterations)
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
-        """Sees to it that the robot can come to rest at every point of the paths.
+        """Checks that the robot has an equilibrium at every point of the paths.
 
         Args:
             model: of the robot.
             reach: distance that a point may be out of reach [m].
 
         Raises:
-            InputError: it cannot; the nearest point that it reaches is named.
+            InputError: a point is out of reach; the error names the nearest reachable point.
         """
         for path in self.paths:
             curve = path.points
@@ -98,42 +92,39 @@ class Task:
                 if distance > worst:
                     worst, shown = distance, (point, near)
             if worst > reach:
-                wanted, reached = (_millimetres(each) for each in shown)
+                wanted, reached = ("(" + ", ".join(f"{1e3 * x:.1f}" for x in point) + ")" for point in shown)
                 raise InputError(
-                    f"the path {path.name} leaves what the robot reaches: of {wanted} mm, the nearest point that it "
-                    f"reaches is {reached} mm, {1e3 * worst:.1f} mm away: set control.centre, control.size or "
-                    "control.limits.high, or allow for more by control.plan.reach."
+                    f"the robot cannot reach the path {path.name}: the reachable point nearest to {wanted} mm is "
+                    f"{reached} mm, {1e3 * worst:.1f} mm away. Change control.centre, control.size or "
+                    "control.limits.high, or allow this distance by control.plan.reach."
                 )
 
     def _nearest(
         self, model: ReducedModel, point: FloatArray, guess: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
-        """(n,) shares of the inputs that bring the point nearest to another at rest, and (3,) where it is then [m]."""
-        limits, best = self.limits, None
+        """Inputs (n,) as shares whose equilibrium is nearest to a point, and its position (3,) there [m]."""
+        limits = self.limits
 
         def place(shares: FloatArray) -> tuple[FloatArray, FloatArray]:
-            found, slopes = model.rest_observed(limits.low + limits.range * shares)
-            return self.tracked @ found, self.tracked @ slopes * limits.range
+            points, slopes = model.rest_observed(limits.low + limits.range * shares)
+            return self.tracked @ points, self.tracked @ slopes * limits.range
 
-        for begin in (np.full(self.parts, 0.4), *(() if guess is None else (np.clip(guess, 0.01, 0.99),))):
-            found = least_squares(
-                lambda x: 1e3 * (place(x)[0] - point), begin, lambda x: 1e3 * place(x)[1], (0.0, 1.0), xtol=1e-4
+        starts = [np.full(self.parts, 0.4)] + ([] if guess is None else [np.clip(guess, 0.01, 0.99)])
+        searches = [
+            least_squares(
+                lambda x: 1e3 * (place(x)[0] - point), start, lambda x: 1e3 * place(x)[1], (0.0, 1.0), xtol=1e-4
             )
-            if best is None or found.cost < best.cost:
-                best = found
-        assert best is not None
-        return best.x, place(best.x)[0]
+            for start in starts
+        ]
+        best = min(searches, key=lambda search: search.cost).x
+        return best, place(best)[0]
 
 
 def motions_of(figures: FigureSettings) -> list[str]:
-    """The names of the motions that are asked for."""
+    """Returns the names of all motions: each curve at each speed, such as ``eight_4s``."""
     return [motion_name(shape, seconds) for seconds in figures.seconds for shape in figures.shapes]
 
 
 def motion_name(shape: str, seconds: float) -> str:
-    """That files and tables have."""
+    """Returns the name of a motion in files and tables."""
     return f"{shape}_{seconds:g}s"
-
-
-def _millimetres(point: FloatArray) -> str:
-    return "(" + ", ".join(f"{1e3 * each:.1f}" for each in point) + ")"

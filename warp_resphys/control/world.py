@@ -1,4 +1,4 @@
-"""Bodies that are commanded and seen step by step, whatever simulates them."""
+"""Interface of simulated bodies that are commanded and observed step by step."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ IntArray = NDArray[np.int64]
 
 
 class World(ABC):
-    """B bodies that take commands and show markers.
+    """B bodies that take commands and have markers.
 
     Attributes:
         count: B.
         time_step: h [s].
         input: name of the commanded input.
-        parts: n of its values.
-        noise: standard deviation of the markers that cameras see [m]; None where that is the caller's choice.
+        parts: number n of its values.
+        noise: standard deviation of observed markers [m]; None if the caller chooses it.
     """
 
     count: int
@@ -34,16 +34,16 @@ class World(ABC):
 
     @abstractmethod
     def step(self, commands: FloatArray) -> BoolArray:
-        """Makes one time step under commands (B, n); returns which bodies (B,) have failed since they began."""
+        """Makes one time step under commands (B, n); returns which bodies (B,) have failed since `begin`."""
 
     @abstractmethod
     def markers(self) -> FloatArray:
-        """(B, M, 3) positions of the markers, without noise [m]."""
+        """Markers (B, M, 3), without noise [m]."""
 
     def vary(self, random: Sequence[np.random.Generator]) -> None:
         """Draws new parameters, by a generator for each body; all bodies `begin` afterwards."""
         del random
 
     def bodies(self) -> tuple[IntArray, FloatArray]:
-        """(S, 3) surface triangles of a body, and (B, N, 3) vertices [m]; empty where only markers are known."""
+        """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))

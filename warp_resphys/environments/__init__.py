@@ -1,1 +1,1 @@
-"""Gymnasium environments on corrected simulators: to learn policies in, and to try these on what plays the robot."""
+"""Gymnasium environments on corrected simulators, to learn policies and to test them on the simulated laboratory."""

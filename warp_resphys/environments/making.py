@@ -1,4 +1,4 @@
-"""Environments of a run, by the names of tasks, and their registration in Gymnasium."""
+"""Makes environments of a run by the name of a task, and registers the tasks in Gymnasium."""
 
 import functools
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ FloatArray = NDArray[np.float64]
 
 TASKS: Final = ("reach", "follow", "swing_up")
 WORLDS: Final = ("simulator", "reduced", "laboratory")
-_PLACES: Final = 64  # equilibria that tell where a point can be
-_RISE: Final = 0.1  # s in which an input can go from its least to its greatest value
-_NEAR_TIP: Final = 0.9  # of the largest distance from what is fixed, from which on markers are those of the tip
-_SHOWN: Final = 4  # vertices of a robot without markers, that are seen
-_BASE: Final = 0.01  # m that a base may move to either side
-_BASE_SPEED: Final = 0.2  # m/s
+_PLACES: Final = 64  # number of equilibria that sample the reachable places
+_RISE: Final = 0.1  # time in which an input can go from its least to its greatest value [s]
+_NEAR_TIP: Final = 0.9  # distance of tip markers from the fixed vertices, relative to the largest
+_SHOWN: Final = 4  # number of observed vertices of a robot without markers
+_BASE: Final = 0.01  # travel of a base to either side [m]
+_BASE_SPEED: Final = 0.2  # largest speed of a base [m/s]
 
 
 def make_vector(
@@ -60,31 +60,31 @@ def make_vector(
     seed: int = 0,
     reach: Reach | None = None,
 ) -> RobotVectorEnv:
-    """Robots of a run, or of a file, with a task.
+    """Makes a vector environment of robots of a run, or of a file, with a task.
 
     Args:
-        task: ``reach``, ``follow``, or ``swing_up``, by the base.
+        task: ``reach``, ``follow``, or ``swing_up``, which moves the base.
         run: the run folder, or a file of `Robot.save`.
         num_envs: B.
-        model: of the run; ``resphys`` if left out.
-        world: ``simulator``; ``reduced``, its reduced model, which is fast, has no parameters that vary, and is made
-            in some minutes where the run has none; or ``laboratory``, the simulation that plays the real robot.
-        spread: by how many standard deviations of their identification parameters vary between the robots.
-        seconds: of an episode.
-        action_time: of an action [s], a multiple of the time step.
-        noise: standard deviation of the coordinates of markers that are seen [m]; a laboratory has its own.
-        tracked: the markers whose mean has the task; those of the tip, if left out.
+        model: of the run; ``resphys`` if omitted.
+        world: ``simulator``; ``reduced``, the reduced model, which is fast and has fixed parameters (computing it takes
+            minutes if the run has none); or ``laboratory``, the simulation that stands in for the real robot.
+        spread: variation of the parameters between robots, in standard deviations of their identification.
+        seconds: duration of an episode.
+        action_time: duration of an action [s], a multiple of the time step.
+        noise: standard deviation of the observed markers' coordinates [m]; a laboratory has its own.
+        tracked: the markers whose mean is the point of the task; those of the tip if omitted.
         axis: along which a base moves.
         render_mode: ``rgb_array`` for pictures as arrays, or None.
-        autoreset_mode: see Gymnasium.
+        autoreset_mode: as in Gymnasium.
         device: of the simulation.
-        seed: of the places at which robots are sampled.
-        reach: ``task.reach`` of another environment, so that both ask for the same places and show them in the same
-            units; where this robot can rest, if left out.
+        seed: of the sampled inputs whose equilibria are the reachable places.
+        reach: ``task.reach`` of another environment, so that both have the same goals and the same units; sampled from
+            this robot if omitted.
 
     Raises:
-        InputError: an unknown task or world, or a robot that has no such input.
-        DataFileError: see `load`.
+        InputError: an unknown task or world, or a robot without the input that the task needs.
+        DataFileError: the run is missing, unfinished or changed.
     """
     if task not in TASKS:
         raise InputError(f"the task is {task!r}: choose {', '.join(TASKS)}.")
@@ -98,78 +98,74 @@ def make_vector(
         )
     swings = task == "swing_up"
     if swings and (BASE not in robot.inputs or world != "simulator"):
-        raise InputError("swing_up moves the base of a simulated robot: take one that is fixed to something.")
+        raise InputError("swing_up moves the base of a simulated robot: choose a robot with fixed vertices.")
     actions, shown = max(round(seconds / action_time), 1), None if robot.labels else _spread_vertices(robot)
-    place: World
+    bodies: World
     if world == "simulator":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         name, mixed = (BASE, along) if swings else (driven_input(robot).name, None)
-        place = RobotWorld(robot, name, num_envs, spread, mixed, shown)
+        bodies = RobotWorld(robot, name, num_envs, spread, mixed, shown)
     elif world == "reduced":
-        place = ReducedWorld(_reduced(robot, Path(run).expanduser(), seed), num_envs)
+        bodies = ReducedWorld(_reduced(robot, Path(run).expanduser(), seed), num_envs)
     else:
         folder = Path(run).expanduser()
         settings = parse(LaboratoryStage, finished_record(folder, "laboratory")["settings"]).changed(device="cpu")
-        place = Laboratory(settings, folder, driven_input(robot).name, num_envs, seed, "count")
-    markers = place.markers()[0]
+        bodies = Laboratory(settings, folder, driven_input(robot).name, num_envs, seed, "count")
+    markers, up = bodies.markers()[0], _up(robot)
     point = _tip(robot, markers, tracked, shown)
-    asked: RobotTask
+    goals: RobotTask
     if swings:
         rest = point @ markers.ravel()
-        asked = SwingTask(num_envs, _up(robot), rest, float(np.linalg.norm(rest - _fixed(robot))))
+        goals = SwingTask(num_envs, up, rest, float(np.linalg.norm(rest - _fixed(robot))))
         mapping = ActionMapping(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
     else:
-        known = driven_input(robot)
-        low, high = np.array(known.low), np.array(known.high)
-        goals = _reach(robot, known.name, low, high, point, shown, seed) if reach is None else reach
-        asked = ReachTask(num_envs, actions, goals)
+        driven = driven_input(robot)
+        low, high = np.array(driven.low), np.array(driven.high)
+        reach = _reach(robot, driven.name, low, high, point, shown, seed) if reach is None else reach
+        goals = ReachTask(num_envs, actions, reach)
         if task == "follow":
-            asked = FollowTask(num_envs, actions, goals, action_time)
+            goals = FollowTask(num_envs, actions, reach, action_time)
         # Worlds begin without inputs.
         mapping = ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
-    seen_noise = noise if place.noise is None else place.noise
-    return RobotVectorEnv(place, asked, mapping, point, actions, seen_noise, autoreset_mode, render_mode, _up(robot))
+    noise = noise if bodies.noise is None else bodies.noise
+    return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
 
 
 def _reach(
     robot: Robot, name: str, low: FloatArray, high: FloatArray, point: FloatArray, shown: list[int] | None, seed: int
 ) -> Reach:
-    """Where the point is in equilibria of the robot under random inputs within their range."""
+    """Samples equilibria of the robot under random inputs within their range."""
     shares = np.random.default_rng(seed).random((_PLACES, len(low)))
     shares[0] = 0.0
     with torch.no_grad():
         q, settled = robot.settle_some(len(shares), **{name: low + shares * (high - low)})
-        found = robot.observe(robot.state(q[settled])).double().cpu().numpy()
-    found = found if shown is None else found[:, shown]
-    return Reach(found.reshape(len(found), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)
+        markers = robot.observe(robot.state(q[settled])).double().cpu().numpy()
+    markers = markers if shown is None else markers[:, shown]
+    return Reach(markers.reshape(len(markers), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)
 
 
 def _up(robot: Robot) -> FloatArray:
-    """(3,) against gravity; z where there is none."""
+    """Direction (3,) against gravity; z without gravity."""
     up = -np.asarray(robot.simulator.gravity, dtype=np.float64)
     return up if up.any() else np.array([0.0, 0.0, 1.0])
 
 
 def _reduced(robot: Robot, run: Path, seed: int) -> ReducedModel:
-    """The reduced model of the run, or a new one."""
-    known = robot.description
-    path = run / reduced_file(known.model)
+    """Reads the reduced model of the run, or computes one."""
+    description = robot.description
+    path = run / reduced_file(description.model)
     if path.is_file():
-        finished_record(run, f"reduce_{known.model}")
-        return read_reduced(path, known.learned)
-    return _made(str(run), _changed(run), known.model, seed)
-
-
-def _changed(run: Path) -> float:
-    """When a run, or a file of a robot, was written."""
+        finished_record(run, f"reduce_{description.model}")
+        return read_reduced(path, description.learned)
     record = run / "stages" / "evaluate.json"
-    return (record if record.is_file() else run).stat().st_mtime
+    written = (record if record.is_file() else run).stat().st_mtime
+    return _new_reduced(str(run), written, description.model, seed)
 
 
 @functools.lru_cache(maxsize=4)
-def _made(run: str, changed: float, model: str, seed: int) -> ReducedModel:
-    """A new reduced model, which takes minutes: kept for environments that are made one after another."""
-    del changed  # It says that the run is another one.
+def _new_reduced(run: str, written: float, model: str, seed: int) -> ReducedModel:
+    """Computes a reduced model, which takes minutes; cached until the run is written again."""
+    del written
     sampling = Sampling(seed=seed)
     with Progress("reduced model", sampling.total, "samples") as progress:
         robot = load(run, model if Path(run).is_dir() else None, "cpu", "count")
@@ -177,32 +173,32 @@ def _made(run: str, changed: float, model: str, seed: int) -> ReducedModel:
 
 
 def _fixed(robot: Robot) -> FloatArray:
-    """(3,) the middle of the fixed vertices [m]."""
+    """Centre (3,) of the fixed vertices [m]."""
     body = robot.simulator.body
     return np.asarray(body.mesh.vertices[body.fixed_vertices].mean(axis=0))
 
 
 def _spread_vertices(robot: Robot) -> list[int]:
-    """Some vertices, each as far from the others and from what is fixed as can be."""
+    """Chooses vertices by farthest-point sampling, away from the fixed ones."""
     vertices = robot.simulator.body.mesh.vertices
     nearest = np.linalg.norm(vertices - _fixed(robot), axis=1)
-    found: list[int] = []
+    chosen: list[int] = []
     for _ in range(_SHOWN):
-        found.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(vertices - vertices[found[-1]], axis=1))
-    return found
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(vertices - vertices[chosen[-1]], axis=1))
+    return chosen
 
 
 def _tip(robot: Robot, markers: FloatArray, tracked: Sequence[str] | None, shown: Sequence[int] | None) -> FloatArray:
-    """(3, 3 M) from markers (M, 3) to the mean of some of them."""
-    names = robot.labels or [str(each) for each in shown or ()]
+    """Matrix (3, 3 M) from markers (M, 3) to the point of the task, the mean of some of them."""
+    names = robot.labels or [str(vertex) for vertex in shown or ()]
     far = np.linalg.norm(markers - _fixed(robot), axis=1)
     of_tip = [name for name, distance in zip(names, far, strict=True) if distance >= _NEAR_TIP * far.max()]
     return tracked_of(names, of_tip if tracked is None else tracked)
 
 
 class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """One robot, as Gymnasium's environments are; for many at once, see `make_vector`, whose arguments it takes."""
+    """A single robot as a Gymnasium environment, with the arguments of `make_vector`."""
 
     def __init__(self, task: str, run: str | Path, render_mode: str | None = None, **settings: Any) -> None:
         self._one = make_vector(
@@ -218,19 +214,18 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
         first = int(self.np_random.integers(2**31)) if seed is None else seed
-        found, _ = self._one.reset(seed=first)
-        return found[0], {}
+        return self._one.reset(seed=first)[0][0], {}
 
     @override
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         seen, reward, terminated, truncated, info = self._one.step(np.asarray(action)[None])
-        own = {"error_mm": float(info["error_mm"][0])}
-        return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), own
+        first = {"error_mm": float(info["error_mm"][0])}
+        return seen[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), first
 
     @override
     def render(self) -> NDArray[np.uint8] | None:
-        found = self._one.render()
-        return None if found is None else found[0]
+        pictures = self._one.render()
+        return None if pictures is None else pictures[0]
 
     @override
     def close(self) -> None:
@@ -238,7 +233,7 @@ class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def register() -> None:
-    """Makes the tasks known to Gymnasium, as ``warp_resphys/Reach-v0``, ``warp_resphys/Follow-v0`` and so on."""
+    """Registers the tasks in Gymnasium, as ``warp_resphys/Reach-v0``, ``warp_resphys/Follow-v0`` and so on."""
     for task in TASKS:
         name = f"warp_resphys/{''.join(word.capitalize() for word in task.split('_'))}-v0"
         if name not in gym.registry:

@@ -11,22 +11,22 @@ from ..report.camera import frame_of
 from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, view_axes
 
 _SIZE: Final = (480, 480)  # px
-_TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # of the eye, about the vertical and over the horizon
-_MARGIN: Final = 0.12  # around what is shown, over its longer side
+_TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # azimuth and elevation of the camera
+_MARGIN: Final = 0.12  # around the scene, relative to its longer side
 _GOAL: Final = "#d1495b"
-_RADII: Final = {"marker": 0.015, "goal": 0.022}  # over half the height of the picture
-_BEFORE: Final = {"edges": 0.01, "goals": 4.0, "markers": 5.0}  # the body, over the same
+_RADII: Final = {"marker": 0.015, "goal": 0.022}  # relative to half the height of the picture
+_BEFORE: Final = {"edges": 0.01, "goals": 4.0, "markers": 5.0}  # shift towards the camera, in the same units
 
 
 class Camera:
-    """Looks from afar, so that what is given at first fills the picture.
+    """A distant camera whose frame fits a set of points.
 
     Args:
-        up: (3,) direction that is up in pictures.
-        points: (P, 3) that are to be in it [m].
+        up: (3,) upward direction of the pictures.
+        points: (P, 3) that fill the frame [m].
 
     Raises:
-        DrawingError: nothing can be drawn on this machine.
+        DrawingError: this machine cannot render.
     """
 
     def __init__(self, up: FloatArray, points: FloatArray) -> None:
@@ -47,17 +47,17 @@ class Camera:
         goals: Sequence[FloatArray],
         texts: Sequence[str],
     ) -> list[Pixels]:
-        """Return pictures (H, W, 3) of B robots.
+        """Returns pictures (H, W, 3) of B robots.
 
         Args:
-            triangles: (S, 3) of their surface; none where only markers are known.
+            triangles: (S, 3) of their surface; empty if only markers are known.
             vertices: (B, N, 3) [m].
             markers: (B, M, 3) [m].
-            goals: B paths or places (K, 3) that their tasks ask for [m].
-            texts: B that stand above.
+            goals: B paths or places (K, 3) of their tasks [m].
+            texts: B captions.
 
         Raises:
-            DrawingError: nothing can be drawn on this machine.
+            DrawingError: this machine cannot render.
         """
         most = max(map(len, goals))
         paths = np.stack([np.pad(path, ((0, most - len(path)), (0, 0)), mode="edge") for path in goals])
@@ -77,5 +77,5 @@ class Camera:
         return list(self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts)))
 
     def close(self) -> None:
-        """Ends the process that draws."""
+        """Ends the rendering process."""
         self._renderer.close()

@@ -1,4 +1,4 @@
-"""Policies for environments: a scripted one, how well one does, and learning them with Stable-Baselines3."""
+"""Policies for environments: a scripted one, their errors, and training with Stable-Baselines3."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,22 +18,21 @@ from .vector import Observation, RobotVectorEnv
 FloatArray = NDArray[np.float64]
 Policy = Callable[[Observation], NDArray[np.float32]]
 
-_NETWORK: Final = 128  # Width of its layers.
-_ORDER: Final = 2  # of the polynomial that says where the robot rests
-_EFFORT: Final = 3e-3  # of squared actions beside the squared distance, for places of size one
-_ITERATIONS, _STRIDE = 16, 0.25  # of Gauss-Newton, and the longest change of an action in one
+_NETWORK: Final = 128  # width of the policy's layers
+_ORDER: Final = 2  # of the polynomial from actions to equilibria
+_EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
+_ITERATIONS, _STRIDE = 16, 0.25  # Gauss-Newton iterations, and the largest change of an action in one
 
 
 class ScriptedPolicy:
-    """Commands under which the robot would rest at one of the places that it is told, with as little effort as does.
+    """Commands the inputs whose equilibrium is nearest to one of the observed goals, with a small penalty on effort.
 
-    What is told of the places says how far they are from the point as it is seen, so that it sees where the point is,
-    too. It knows of no motion: where the robot is slow, it is late, and where it swings, it swings with it.
+    It is quasi-static: where the robot is slow it is late, and it does not damp vibrations.
 
     Args:
-        environment: with a task of goals, for the robot of which it is.
-        ahead: which of the places that it is told, 0 for the next one.
-        reach: where it takes the robot to rest; as the task has it, if left out.
+        environment: with a task of goals.
+        ahead: number of the observed goal, 0 for the next one.
+        reach: equilibria of the robot; those of the task if omitted.
 
     Raises:
         InputError: the task has no goals.
@@ -42,14 +41,14 @@ class ScriptedPolicy:
     def __init__(self, environment: RobotVectorEnv, ahead: int = 0, reach: Reach | None = None) -> None:
         task = environment.task
         if not isinstance(task, GoalTask):
-            raise InputError("the scripted policy goes to places: take reach or follow.")
-        known = task.reach if reach is None else reach
-        self._rests = Polynomial.fitted(known.actions, known.places / task.size, _ORDER)
+            raise InputError("the scripted policy needs a task with goals: choose reach or follow.")
+        reach = task.reach if reach is None else reach
+        self._rests = Polynomial.fitted(reach.actions, reach.places / task.size, _ORDER)
         self._rest, self._tracked, self._size = environment.rests[0].ravel(), environment.tracked, task.size
         self._parts, self._ahead = task.reach.actions.shape[1], ahead
 
     def __call__(self, seen: Observation) -> NDArray[np.float32]:
-        """(B, n) actions for observations (B, width)."""
+        """Returns actions (B, n) for observations (B, width)."""
         width = self._rest.size
         point = (self._rest + self._size * seen[:, :width].astype(np.float64)) @ self._tracked.T
         first = 2 * width + self._parts + 3 * self._ahead
@@ -57,47 +56,47 @@ class ScriptedPolicy:
         return self._actions(goal / self._size).astype(np.float32)
 
     def _actions(self, goals: FloatArray) -> FloatArray:
-        """(B, n) whose resting places are closest to goals (B, 3), by Gauss-Newton's method within the bounds."""
-        found = np.zeros((len(goals), self._parts))
+        """Actions (B, n) whose equilibria are closest to goals (B, 3), by Gauss-Newton's method within the bounds."""
+        actions = np.zeros((len(goals), self._parts))
         for _ in range(_ITERATIONS):
-            slope = self._rests.slopes(Monomials(found))  # (B, n, 3)
+            slope = self._rests.slopes(Monomials(actions))  # (B, n, 3)
             matrix = slope @ slope.swapaxes(1, 2) + _EFFORT * np.eye(self._parts)
-            force = (slope @ (goals - self._rests(found))[..., None])[..., 0] - _EFFORT * found
-            held = (np.abs(found) >= 1.0) & (found * force > 0.0)  # at a bound, and pushed beyond it
+            force = (slope @ (goals - self._rests(actions))[..., None])[..., 0] - _EFFORT * actions
+            held = (np.abs(actions) >= 1.0) & (actions * force > 0.0)  # at a bound, and pushed beyond it
             matrix = np.where(held[:, :, None] | held[:, None, :], np.eye(self._parts), matrix)
             moved = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
-            found = np.clip(found + np.clip(moved, -_STRIDE, _STRIDE), -1.0, 1.0)
-        return found
+            actions = np.clip(actions + np.clip(moved, -_STRIDE, _STRIDE), -1.0, 1.0)
+        return actions
 
 
 def errors_mm(
     environment: RobotVectorEnv, policy: Policy, seed: int, on_action: Callable[[], None] = lambda: None
 ) -> FloatArray:
-    """(A, B) how far points are from what is asked in one episode of each robot [mm]; NaN from a failure on."""
+    """Distances (A, B) of the points from their goals in one episode of B robots [mm]; NaN after a failure."""
     seen, _ = environment.reset(seed=seed)
-    found = np.full((environment.actions, environment.num_envs), np.nan)
+    errors = np.full((environment.actions, environment.num_envs), np.nan)
     alive = np.ones(environment.num_envs, dtype=np.bool_)
     for number in range(environment.actions):
         seen, _, terminated, _, info = environment.step(policy(seen))
         alive &= ~terminated
-        found[number, alive] = info["error_mm"][alive]
+        errors[number, alive] = info["error_mm"][alive]
         on_action()
-    return found
+    return errors
 
 
 def learn(
     environment: RobotVectorEnv, steps: int, seed: int = 0, on_progress: Callable[[int], None] = lambda steps: None
 ) -> Any:
-    """A policy by proximal policy optimisation (PPO, Schulman et al. 2017), of Stable-Baselines3.
+    """Trains a policy by proximal policy optimisation (PPO, Schulman et al. 2017), with Stable-Baselines3.
 
     Args:
         environment: with ``autoreset_mode`` SAME_STEP.
-        steps: actions of all robots together.
-        seed: of the network and of what is drawn.
-        on_progress: told how many more actions are done.
+        steps: total number of actions of all robots.
+        seed: of the network and of the sampled actions.
+        on_progress: called with the number of further actions done.
 
     Returns:
-        A ``stable_baselines3.PPO``; `acting` makes a policy of it.
+        A ``stable_baselines3.PPO``; `acting` converts it to a policy.
 
     Raises:
         InputError: Stable-Baselines3 is not installed, or another reset mode.
@@ -112,14 +111,14 @@ def learn(
     if environment.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
         raise InputError("learning needs an environment with autoreset_mode='SameStep'.")
 
-    class Told(BaseCallback):
+    class Reports(BaseCallback):
         @override
         def _on_step(self) -> bool:
             on_progress(environment.num_envs)
             return True
 
     with threads_for(_NETWORK):
-        made = PPO(
+        model = PPO(
             "MlpPolicy",
             Robots(environment),
             n_steps=max(2048 // environment.num_envs, 8),
@@ -131,11 +130,11 @@ def learn(
             seed=seed,
             device="cpu",
         )
-        return made.learn(steps, Told())
+        return model.learn(steps, Reports())
 
 
-def learned_before(path: Path) -> Any:
-    """A ``stable_baselines3.PPO`` that was saved.
+def load_model(path: Path) -> Any:
+    """Loads a ``stable_baselines3.PPO``.
 
     Raises:
         InputError: Stable-Baselines3 is not installed.
@@ -152,7 +151,7 @@ def _missing(error: ImportError) -> InputError:
 
 
 def acting(model: Any) -> Policy:
-    """The policy of a model of Stable-Baselines3, without noise."""
+    """Returns the deterministic policy of a model of Stable-Baselines3."""
 
     def act(seen: Observation) -> NDArray[np.float32]:
         with threads_for(_NETWORK):

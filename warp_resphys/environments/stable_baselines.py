@@ -1,4 +1,4 @@
-"""Environments as Stable-Baselines3 has them."""
+"""Adapter from the vector environment to Stable-Baselines3."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from .vector import RobotVectorEnv
 
 
 class Robots(VecEnv):
-    """Robots that begin anew in the step that ends an episode.
+    """Robots that are reset in the step that ends an episode.
 
     Args:
         environment: with ``autoreset_mode`` SAME_STEP.
@@ -36,12 +36,12 @@ class Robots(VecEnv):
 
     @override
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        seen, rewards, terminated, truncated, told = self.environment.step(self._actions)
+        seen, rewards, terminated, truncated, info = self.environment.step(self._actions)
         over = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in over]
         for row in np.flatnonzero(over):
             infos[row] = {
-                "terminal_observation": told["final_obs"][row],
+                "terminal_observation": info["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
             }
         return seen, rewards.astype(np.float32), over, infos
@@ -60,8 +60,8 @@ class Robots(VecEnv):
 
     @override
     def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> list[Any]:
-        found = getattr(self.environment, method_name)(*arguments, **named)
-        return [found] * len(list(self._get_indices(indices)))
+        result = getattr(self.environment, method_name)(*arguments, **named)
+        return [result] * len(list(self._get_indices(indices)))
 
     @override
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

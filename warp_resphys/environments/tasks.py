@@ -1,7 +1,6 @@
-"""What is to be done: reach a place, follow a figure, swing a body up. Rewards are one at best at each step."""
+"""Tasks: reach a place, follow a figure, swing a body up. The largest reward of a step is one."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,19 +13,19 @@ from ..io.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
-PREVIEW: Final = (0, 2, 5)  # actions ahead, of the places that a follower is told
+PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed
 _FIGURES: Final = ("circle", "eight", "R", "E", "S")
-_LAPS_S: Final = (2.0, 5.0)  # s that a figure takes
+_LAPS_S: Final = (2.0, 5.0)  # range of the durations of a figure [s]
 _OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Where a point of a robot can be at rest.
+    """Positions of a point of a robot in equilibrium.
 
     Attributes:
-        places: (S, 3) some of these places [m].
-        actions: (S, n) from -1 to 1, of the inputs under which it rests there.
+        places: (S, 3) sampled positions [m].
+        actions: (S, n) of the inputs, from -1 to 1.
     """
 
     places: FloatArray
@@ -39,23 +38,23 @@ class Reach:
 
     @property
     def middle(self) -> FloatArray:
-        """(3,) of the places [m]."""
+        """Mean (3,) of the places [m]."""
         return np.asarray(self.places.mean(axis=0))
 
     @property
     def plane(self) -> FloatArray:
-        """(2, 3) the directions in which the places spread most."""
+        """Directions (2, 3) in which the places spread most."""
         directions = np.linalg.svd(self.places - self.middle, full_matrices=False)[2][:2]
         largest = np.abs(directions).argmax(axis=1)
         return np.asarray(directions * np.sign(directions[[0, 1], largest])[:, None])
 
 
 class RobotTask(ABC):
-    """What is asked of B robots, of each by itself.
+    """A task of B robots, with a goal for each.
 
     Attributes:
-        size: that observations of places are divided by [m].
-        width: of what is observed of the task.
+        size: scale of observed positions [m].
+        width: number of observed values of the task.
     """
 
     size: float
@@ -63,29 +62,29 @@ class RobotTask(ABC):
 
     @abstractmethod
     def begin(self, row: int, random: np.random.Generator) -> None:
-        """A new episode of a robot."""
+        """Begins a new episode of a robot."""
 
     @abstractmethod
     def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """(B, width) of points (B, 3) [m] after so many actions (B,)."""
+        """Observed values (B, width) for points (B, 3) [m] after so many actions (B,)."""
 
     @abstractmethod
     def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """(B,) at most one."""
+        """Rewards (B,), at most one."""
 
     @abstractmethod
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        """(B,) how far off points are [mm]."""
+        """Distances (B,) of the points from their goals [mm]."""
 
     @abstractmethod
     def wanted(self, row: int, number: int) -> FloatArray:
-        """(K, 3) places to be at after so many actions, and later [m]."""
+        """Goals (K, 3) of a robot from a number of actions on [m]."""
 
 
 class GoalTask(RobotTask):
-    """Places (B, A + 1, 3) where the points are to be after each of A actions [m].
+    """A task of goals (B, A + 1, 3), at the start and after each of A actions [m].
 
-    Observed are the vectors to the next places; the reward is one, less the distance over the size of the reach.
+    The vectors to the next goals are observed; the reward is one minus the distance over the size of the reach.
     """
 
     def __init__(self, count: int, actions: int, reach: Reach) -> None:
@@ -115,7 +114,7 @@ class GoalTask(RobotTask):
 
 
 class ReachTask(GoalTask):
-    """Be at one of the places where the robot can rest, soon, and stay there."""
+    """Reach one of the robot's equilibria quickly, and stay there."""
 
     @override
     def begin(self, row: int, random: np.random.Generator) -> None:
@@ -130,48 +129,45 @@ class FollowTask(GoalTask):
         actions: A.
         reach: of the point.
         action_time: of an action [s].
-        figures: which are drawn.
     """
 
-    def __init__(
-        self, count: int, actions: int, reach: Reach, action_time: float, figures: Sequence[str] = _FIGURES
-    ) -> None:
+    def __init__(self, count: int, actions: int, reach: Reach, action_time: float) -> None:
         super().__init__(count, actions, reach)
-        self._time, self._figures = action_time, tuple(figures)
+        self._time = action_time
 
     @override
     def begin(self, row: int, random: np.random.Generator) -> None:
         reach = self.reach
-        name = self._figures[random.integers(len(self._figures))]
+        name = _FIGURES[random.integers(len(_FIGURES))]
         first, second = reach.plane
         spread = np.ptp((reach.places - reach.middle) @ reach.plane.T, axis=0).min()
         size = _OF_REACH * float(spread) * random.uniform(0.5, 1.0)
         curve = Path(name, size, tuple(reach.middle), tuple(first), tuple(second)).points
-        curve = np.concatenate([curve, curve[-2::-1]])  # and back, so that it has no end
+        curve = np.concatenate([curve, curve[-2::-1]])  # there and back, a closed curve
         laps = self._time * np.arange(self.goals.shape[1]) / random.uniform(*_LAPS_S) + random.uniform()
         at = (laps % 1.0) * (len(curve) - 1)
         self.goals[row] = np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], axis=1)
 
 
 class SwingTask(RobotTask):
-    """Swing a point up by the base: one body length above its rest is the goal, and the reward the share of it.
+    """Swing a point up by moving the base; the reward is its height above rest over the body's length, up to one.
 
     Args:
         count: B.
         up: (3,) direction.
         rest: (3,) of the point [m].
-        length: of the body, by which heights are divided [m].
+        length: of the body [m].
     """
 
     def __init__(self, count: int, up: FloatArray, rest: FloatArray, length: float) -> None:
         if not length > 0.0:
-            raise InputError("the body has no length along which it could be swung up.")
+            raise InputError("swing_up needs a tracked point away from the base: choose others in tracked.")
         self._up, self._rest, self._count = up / np.linalg.norm(up), rest, count
         self.size, self.width = length, 1
 
     @override
     def begin(self, row: int, random: np.random.Generator) -> None:
-        pass  # Episodes differ by the world alone.
+        pass  # All episodes have the same goal.
 
     def _height(self, points: FloatArray) -> FloatArray:
         return np.asarray((points - self._rest) @ self._up / self.size)

@@ -1,4 +1,4 @@
-"""The environments: B robots that get actions and give what cameras see of them, rewards and ends of episodes."""
+"""The vector environment: B robots that take actions and return observed markers, rewards and ends of episodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ FloatArray = NDArray[np.float64]
 Observation = NDArray[np.float32]
 
 RENDER_MODES: Final = ("rgb_array",)
-_LOST: Final = -10.0  # reward of a simulation that failed
-_SMOOTH: Final = 0.05  # of the mean square change of an action, taken from the reward
+_LOST: Final = -10.0  # reward of a failed simulation
+_SMOOTH: Final = 0.05  # penalty on the mean square change of the inputs, as shares of their ranges
 
 
 @dataclass(frozen=True)
 class ActionMapping:
-    """What actions do.
+    """Map from actions to the input of a world.
 
     Attributes:
         low: (n,) of the input, at actions of -1.
-        high: (n,) at actions of 1.
-        rate: (n,) by which it may change in a second.
-        start: (n,) before the first action.
-        frames: steps of the simulation that an action lasts.
+        high: (n,) of the input, at actions of 1.
+        rate: (n,) largest change of the input per second.
+        start: (n,) of the input before the first action.
+        frames: number of simulation steps of an action.
     """
 
     low: FloatArray
@@ -43,33 +43,33 @@ class ActionMapping:
 
 
 class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
-    """B robots with one task, of which each begins anew by itself.
+    """B robots with one task, whose episodes end and begin independently.
 
-    An observation has, of each of M markers, the place beside where it rests over the size of the task, and the change
-    since the last action; the command of each input, from -1 to 1; and what the task shows. An action is what each
-    input is to become, from -1 to 1, at the rate that it can.
+    An observation contains the displacements of the M markers from rest, divided by the size of the task; their changes
+    since the last action; the current inputs, from -1 to 1; and the observed values of the task. An action gives target
+    values of the inputs, from -1 to 1, which are approached at their largest rate.
 
     Args:
-        world: that is stepped.
-        task: that is to be done.
-        mapping: what actions do to the input of the world.
+        world: the simulated bodies.
+        task: of the robots.
+        mapping: from actions to the input of the world.
         tracked: (3, 3 M) from the markers to the point of the task.
-        actions: A of an episode, after which it is cut off.
-        noise: standard deviation of each coordinate that is seen [m].
-        autoreset_mode: when robots begin anew, see Gymnasium.
+        actions: number A of actions of an episode.
+        noise: standard deviation of observed coordinates [m].
+        autoreset_mode: when episodes are reset, as in Gymnasium.
         render_mode: ``rgb_array`` for pictures, or None.
-        up: (3,) direction that is up in these.
+        up: (3,) upward direction of the pictures.
 
     Attributes:
         actions: A.
-        frames: steps of the simulation that an action lasts.
-        task: that is to be done.
+        frames: number of simulation steps of an action.
+        task: of the robots.
         tracked: (3, 3 M).
-        world: that is stepped.
-        rests: (B, M, 3) of the markers, where the robots began [m].
+        world: the simulated bodies.
+        rests: (B, M, 3) markers at the beginning of the episodes [m].
 
     Raises:
-        InputError: another mode.
+        InputError: an unknown render mode.
     """
 
     def __init__(
@@ -112,25 +112,24 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins all episodes, or those of ``options["reset_mask"]``, anew; with parameters drawn anew if all.
+        """Begins new episodes of all robots, with newly drawn parameters, or of those in ``options["reset_mask"]``.
 
         Args:
-            seed: of the first robot, the next of the others; or of each.
-            options: see above.
+            seed: of the first robot, followed by the next integers for the others; or a seed for each robot.
+            options: ``reset_mask``, (B,) bool.
+
+        Raises:
+            InputError: a mask of another shape or type.
         """
         count = self.num_envs
         if seed is not None or self._random is None:
-            first = np.random.default_rng().integers(2**31) if seed is None else seed
-            each = (
-                [None if s is None else int(s) for s in first]
-                if isinstance(first, Sequence)
-                else range(int(first), int(first) + count)
-            )
-            self._random = [np.random.default_rng(s) for s in each]
+            first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+            seeds = first if isinstance(first, Sequence) else range(first, first + count)
+            self._random = [np.random.default_rng(number) for number in seeds]
         mask = (options or {}).get("reset_mask")
         chosen = np.ones(count, dtype=np.bool_) if mask is None else np.asarray(mask)
         if chosen.shape != (count,) or chosen.dtype != np.bool_:
-            raise InputError(f"reset_mask must be {count} truth values, one for each robot.")
+            raise InputError(f"reset_mask must be a boolean array of shape ({count},).")
         if chosen.all():
             self.world.vary(self._random)
         self._begin(chosen)
@@ -149,30 +148,30 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
 
     def _cameras(self, chosen: NDArray[np.bool_]) -> FloatArray:
-        """(B, M, 3) what is seen of the markers [m], with noise in those of some of the robots."""
+        """Observed markers (B, M, 3) [m], with noise for the chosen robots."""
         assert self._random is not None
-        found = self.world.markers().copy()
+        markers = self.world.markers().copy()
         if self._noise:
             for row in np.flatnonzero(chosen):
-                found[row] += self._noise * self._random[row].standard_normal(found[row].shape)
-        return found
+                markers[row] += self._noise * self._random[row].standard_normal(markers[row].shape)
+        return markers
 
     @property
     def _points(self) -> FloatArray:
-        """(B, 3) of the task, without noise of what is seen."""
+        """Points (B, 3) of the task, without noise [m]."""
         return np.asarray(self.world.markers().reshape(self.num_envs, -1) @ self.tracked.T)
 
     def _errors(self) -> FloatArray:
-        """(B,) how far the points are from what is asked now [mm]."""
+        """Distances (B,) of the points from their current goals [mm]."""
         return self.task.errors_mm(self._points, self._number)
 
     @override
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """B pictures (H, W, 3) of the robots, their markers and what is asked of them; None without a render mode.
+        """Returns B pictures (H, W, 3) of robots, markers and goals; None without a render mode.
 
         Raises:
-            InputError: it was not reset before.
-            DrawingError: nothing can be drawn on this machine.
+            InputError: the environment was not reset.
+            DrawingError: this machine cannot render.
         """
         if self.render_mode is None:
             return None
@@ -182,7 +181,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         markers, number = self.world.markers(), self._number
         wanted = [self.task.wanted(row, int(number[row])) for row in range(self.num_envs)]
         if self._camera is None:
-            # Around the first robot: as large to each side as what it is asked for could be.
+            # The frame of the first robot, with the size of the task to all sides.
             middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
             self._camera = Camera(self._up, np.concatenate([self.rests[0], vertices[0], *wanted, middle + around]))
@@ -193,38 +192,37 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     @override
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the process that draws pictures."""
+        """Ends the rendering process."""
         if self._camera is not None:
             self._camera.close()
 
     def _observed(self) -> Observation:
         count, size = self.num_envs, self.task.size
-        off, moved = ((each / size).reshape(count, -1) for each in (self._seen - self.rests, self._seen - self._before))
+        off, moved = ((self._seen - start).reshape(count, -1) / size for start in (self.rests, self._before))
         mapping = self._mapping
-        told = 2.0 * (self._commands - mapping.low) / (mapping.high - mapping.low) - 1.0
-        seen_points = self._seen.reshape(count, -1) @ self.tracked.T
-        task = self.task.observed(seen_points, self._number)
-        return np.concatenate([off, 5.0 * moved, told, task], axis=1).astype(np.float32)
+        commands = 2.0 * (self._commands - mapping.low) / (mapping.high - mapping.low) - 1.0
+        task = self.task.observed(self._seen.reshape(count, -1) @ self.tracked.T, self._number)
+        return np.concatenate([off, 5.0 * moved, commands, task], axis=1).astype(np.float32)
 
     @override
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """One action of each robot.
+        """Makes an action of each robot.
 
         Args:
             actions: (B, n) from -1 to 1.
 
         Raises:
-            InputError: it was not reset before, or actions of another shape.
+            InputError: the environment was not reset, or the actions have another shape or are not finite.
         """
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
         given, mapping = np.asarray(actions, dtype=np.float64), self._mapping
         if given.shape != (self.num_envs, self.world.parts) or not np.isfinite(given).all():
             raise InputError(
-                f"actions have shape {given.shape}: give finite ones of {(self.num_envs, self.world.parts)}, from -1 "
-                "to 1."
+                f"actions have shape {given.shape}: give finite values of shape {(self.num_envs, self.world.parts)}, "
+                "from -1 to 1."
             )
         beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
         if self._mode is AutoresetMode.DISABLED and self._over.any():
@@ -237,10 +235,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             lost |= self.world.step(self._commands)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
-        points = self._points
-        rewards = self.task.reward(points, self._number)
         changed = (self._commands - last) / (mapping.high - mapping.low)
-        rewards = rewards - _SMOOTH * np.square(changed).mean(axis=1)
+        rewards = self.task.reward(self._points, self._number) - _SMOOTH * np.square(changed).mean(axis=1)
         rewards = np.where(lost, _LOST, rewards)
         terminated, truncated = lost.copy(), (self._number >= self.actions) & ~lost
         infos: dict[str, Any] = {"error_mm": self._errors()}

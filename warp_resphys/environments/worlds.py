@@ -1,4 +1,4 @@
-"""Worlds of robots: the simulators of a run, with parameters that vary, and their reduced models."""
+"""Worlds of robots: simulators with varied parameters, and reduced models."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -14,23 +14,23 @@ from ..mesh.mesh import boundary_triangles
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 
-_FURTHEST: Final = 20.0  # times the coordinates of equilibria, beyond which a reduced model has failed
-_LEAST: Final = 1e-3  # of the value in an identification, below which a drawn parameter is not taken
+_FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
+_LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to the identified value
 
 
 class RobotWorld(World):
-    """Robots of a run or of a file.
+    """B copies of a robot in its full simulator.
 
     Args:
-        robot: that was loaded with ``on_failure="count"``.
-        given: the input.
+        robot: loaded with ``on_failure="count"``.
+        given: name of the commanded input.
         count: B.
-        spread: by how many standard deviations of its identification parameters vary; 0 for none.
-        mixed: (k, n) what each of k commands is in the n values of the input; each its own, if left out.
-        shown: numbers of what is shown, of all markers or vertices.
+        spread: variation of the parameters, in standard deviations of their identification; 0 for none.
+        mixed: (k, n) from k commands to the n values of the input; the identity if omitted.
+        shown: numbers of the observed points among all markers or vertices; all if omitted.
 
     Raises:
-        InputError: there is no such input, or parameters are to vary that have no deviations.
+        InputError: there is no such input, or the run has no standard deviations of its parameters.
     """
 
     def __init__(
@@ -46,8 +46,8 @@ class RobotWorld(World):
             raise InputError(f"there is no input {given!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
         if spread > 0.0 and not (robot.description.uncertainty or {}).get("deviation"):
             raise InputError(
-                f"{robot.description.name} has no deviations of its parameters, so that nothing tells how they vary: "
-                "set spread to 0, or take a run that identifies some."
+                f"{robot.description.name} has no standard deviations of its parameters, which spread needs: set "
+                "spread=0, or choose a run that identifies parameters."
             )
         self._nominal = self.robot = robot
         self.count, self.time_step, self.input = count, robot.time_step, given
@@ -59,19 +59,20 @@ class RobotWorld(World):
     def vary(self, random: Sequence[np.random.Generator]) -> None:
         if not self._spread:
             return
-        known = self._nominal.description
-        uncertainty: Mapping[str, Any] = known.uncertainty or {}
+        description = self._nominal.description
+        uncertainty: Mapping[str, Any] = description.uncertainty or {}
         names = list(uncertainty["deviation"])
         deviation = np.array([uncertainty["deviation"][name] for name in names])
         root = np.linalg.cholesky(np.array(uncertainty["correlation"]) + 1e-9 * np.eye(len(names)))
-        mean = np.array([known.parameters[name] for name in names])
-        drawn = np.stack([root @ each.standard_normal(len(names)) for each in random])
+        mean = np.array([description.parameters[name] for name in names])
+        drawn = np.stack([root @ generator.standard_normal(len(names)) for generator in random])
         values = mean + self._spread * deviation * drawn
         values = np.where(mean > 0.0, np.maximum(values, _LEAST * mean), values)
-        limits = {"poissons_ratio": (0.0, 0.499)}
-        given = {name: np.clip(values[:, at], *limits.get(name, (-np.inf, np.inf))) for at, name in enumerate(names)}
-        like = self._nominal.simulator
-        self.robot = self._nominal.with_parameters(**{name: like.tensor(each) for name, each in given.items()})
+        parameters = dict(zip(names, values.T, strict=True))
+        if "poissons_ratio" in parameters:
+            parameters["poissons_ratio"] = parameters["poissons_ratio"].clip(0.0, 0.499)
+        tensor = self._nominal.simulator.tensor
+        self.robot = self._nominal.with_parameters(**{name: tensor(values) for name, values in parameters.items()})
         self._rest = self._begun()
 
     def _begun(self) -> RobotState:
@@ -90,9 +91,9 @@ class RobotWorld(World):
 
     @override
     def markers(self) -> FloatArray:
-        found = self.robot.observe(self._state)
-        found = found if self._shown is None else found[:, list(self._shown)]
-        return np.asarray(found.double().cpu().numpy())
+        markers = self.robot.observe(self._state)
+        markers = markers if self._shown is None else markers[:, list(self._shown)]
+        return np.asarray(markers.double().cpu().numpy())
 
     @override
     def bodies(self) -> tuple[IntArray, FloatArray]:
@@ -100,7 +101,7 @@ class RobotWorld(World):
 
 
 class ReducedWorld(World):
-    """Reduced models of a robot, some hundred times as fast; see `control.reduced`."""
+    """B copies of a robot's reduced model, a few hundred times as fast as its simulator."""
 
     def __init__(self, model: ReducedModel, count: int) -> None:
         self._model, self.count, self.time_step = model, count, model.time_step

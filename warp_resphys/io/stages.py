@@ -1,7 +1,7 @@
-"""Runs the stages of an experiment; a stage runs again only when something that it depends on has changed.
+"""Runs the stages of an experiment; a stage runs again only if its settings, inputs or outputs have changed.
 
-A stage reads and writes files in the run folder. Beside its outputs, it leaves a record of what they were made from
-(`stages/<name>.json`); the fingerprint in it covers the settings of the stage and of all stages before it.
+A stage reads and writes files in the run folder. Its record (`stages/<name>.json`) has a fingerprint of its settings
+and of those of all stages upstream.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class StageContext:
 
     name: str  # of the stage
     run_dir: Path  # the run folder, where outputs are written
-    fingerprint: str  # identifies all that the outputs depend on; resumable files are marked with it
+    fingerprint: str  # identifies everything that the outputs depend on; resumable files contain it
     settings: Any  # of the stage
     memory: WorkersMemory = field(default_factory=WorkersMemory)  # of its worker processes
-    upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages that it reads from, by name
+    upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages whose outputs it reads
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,18 @@ class Stage:
     """A step of an experiment, from files to files."""
 
     name: str  # also of its record
-    function: Callable[[StageContext], None]  # does the work; writes each output whole or not at all
-    outputs: tuple[str, ...]  # names of the files that it writes, relative to the run folder
-    settings: Any  # all that the outputs depend on, and no more: an object of `Settings`, or plain nested data
+    function: Callable[[StageContext], None]  # does the work; writes outputs atomically
+    outputs: tuple[str, ...]  # paths of the files that it writes, relative to the run folder
+    settings: Any  # everything that the outputs depend on, and no more: a `Settings` object or nested plain data
     upstream: tuple[str, ...] = ()  # names of the stages whose outputs it reads
 
 
 class StageInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a stage; the message says what is kept."""
+    """Ctrl-C during a stage; the message lists the finished stages."""
 
 
 def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
-    """SHA-256 of all that a stage's outputs depend on, in hexadecimal."""
+    """SHA-256 of everything that a stage's outputs depend on, in hexadecimal."""
     content = {
         "name": stage.name,
         "format_version": FORMAT_VERSION,
@@ -75,47 +75,45 @@ def run_stages(
     wait: bool = False,
     begins: Callable[[str], None] = lambda name: None,
 ) -> dict[str, float]:
-    """Runs those of the stages whose outputs are missing, damaged or made from other settings.
+    """Runs the stages whose outputs are missing, damaged or of other settings.
 
     Args:
-        stages: in the order in which they run; a stage comes after those it reads from.
-        run_dir: the run folder, made where it is missing; one process at a time may use it.
-        wait: whether to wait for another process that uses it, in place of raising.
+        stages: in the order in which they run; a stage comes after its upstream stages.
+        run_dir: the run folder, created if missing; one process at a time may use it.
+        wait: whether to wait for another process that uses it, instead of raising.
         begins: called with the name of a stage before it is checked and run.
 
     Returns:
-        The seconds that each stage took, summed over interrupted runs.
+        The duration of each stage, summed over interrupted runs [s].
 
     Raises:
         InputError: another process uses the run folder.
         DataFileError: a file cannot be read or written.
-        StageInterrupted: the user pressed Ctrl-C; what is done so far is kept.
+        StageInterrupted: the user pressed Ctrl-C; finished work is kept.
     """
-    run_dir = Path(run_dir)
-    known: dict[str, str] = {}
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
-        for stage in stages:
+        for stage, context in _contexts(stages, Path(run_dir)):
             begins(stage.name)
-            context = _context(stage, run_dir, known)
             took = _valid_seconds(stage, context)
             seconds[stage.name] = _run_stage(stage, context, [*seconds]) if took is None else took
     return seconds
 
 
 def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:
-    """Whether `run_stages` would find nothing to do."""
-    known: dict[str, str] = {}
-    return all(_valid_seconds(stage, _context(stage, Path(run_dir), known)) is not None for stage in stages)
+    """Whether `run_stages` would run no stage."""
+    return all(_valid_seconds(stage, context) is not None for stage, context in _contexts(stages, Path(run_dir)))
 
 
-def _context(stage: Stage, run_dir: Path, known: dict[str, str]) -> StageContext:
-    """The context of a stage; adds its fingerprint to those of the stages before it."""
-    if stage.name in known or not known.keys() >= set(stage.upstream):
-        raise ValueError(f"stage '{stage.name}' is there twice or stands before a stage it reads from")
-    known[stage.name] = fingerprint(stage, known)
-    upstream = {name: known[name] for name in stage.upstream}
-    return StageContext(stage.name, run_dir, known[stage.name], stage.settings, upstream=upstream)
+def _contexts(stages: Sequence[Stage], run_dir: Path) -> Iterator[tuple[Stage, StageContext]]:
+    """Yields stages with their contexts."""
+    fingerprints: dict[str, str] = {}
+    for stage in stages:
+        if stage.name in fingerprints or not fingerprints.keys() >= set(stage.upstream):
+            raise ValueError(f"stage '{stage.name}' occurs twice, or comes before a stage whose outputs it reads")
+        fingerprints[stage.name] = fingerprint(stage, fingerprints)
+        upstream = {name: fingerprints[name] for name in stage.upstream}
+        yield stage, StageContext(stage.name, run_dir, fingerprints[stage.name], stage.settings, upstream=upstream)
 
 
 def _record(run_dir: Path, name: str) -> Path:
@@ -123,25 +121,25 @@ def _record(run_dir: Path, name: str) -> Path:
 
 
 def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> float:
-    """Runs one stage, writes its record and returns its seconds, those of interrupted runs included."""
+    """Runs one stage and writes its record; returns its duration, including interrupted runs [s]."""
     interrupted = _record(context.run_dir, stage.name).with_suffix(".interrupted.json")
     before = read_json(interrupted) if interrupted.is_file() else {}
     seconds = float(before["seconds"]) if before.get("fingerprint") == context.fingerprint else 0.0
-    log.info("%s: %s", stage.name, f"going on after {seconds:.0f} s" if seconds else "started")
+    log.info("%s: %s", stage.name, f"resumed after {seconds:.0f} s" if seconds else "started")
     start = time.perf_counter() - seconds
     try:
         stage.function(context)
         seconds = time.perf_counter() - start
         _write_record(stage, context, seconds)
     except (Exception, KeyboardInterrupt) as error:
-        with suppress(DataFileError):  # A full disk must not hide why the stage is unfinished.
+        with suppress(DataFileError):  # A full disk must not hide the error itself.
             write_json(interrupted, {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start})
         if not isinstance(error, KeyboardInterrupt):
             raise
         kept = f"finished and kept: {', '.join(finished)}; " if finished else ""
         raise StageInterrupted(
-            f"interrupted in stage '{stage.name}' ({kept}what '{stage.name}' has saved is kept); "
-            f"the same command goes on from there"
+            f"interrupted in stage '{stage.name}' ({kept}checkpoints of '{stage.name}' are kept); the same command "
+            "resumes there"
         ) from error
     interrupted.unlink(missing_ok=True)
     log.info("%s: done in %.1f s", stage.name, seconds)
@@ -149,7 +147,7 @@ def _run_stage(stage: Stage, context: StageContext, finished: list[str]) -> floa
 
 
 def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
-    from .machine import made_on  # imports torch, which not all who name stages need
+    from .machine import made_on  # imports torch
 
     write_json(
         _record(context.run_dir, stage.name),
@@ -168,43 +166,39 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
 
 
 def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
-    """The record of a finished stage, whose outputs and all that they were made from are still the same.
-
-    Args:
-        run_dir: the run folder.
-        name: of the stage, whose ``settings`` are in the record.
+    """Returns the record of a finished stage, with its ``settings``, after checking all files that it depends on.
 
     Raises:
-        DataFileError: there is no such folder, the stage was not run to its end, it was made by another version of
-            this program, or a file of it, or of a stage before it, is missing or has changed since.
+        DataFileError: there is no such folder, the stage is unfinished or was run by another version of this program,
+            or an output of it or of a stage upstream is missing or has changed.
     """
     folder = Path(run_dir)
     if not (folder / "stages").is_dir():
-        raise DataFileError(f"{folder} is no run folder: name one that a run of `warp-resphys` has made.")
-    again = "run the command that made it again, to its end"
+        raise DataFileError(f"{folder} is not a run folder: name one that `warp-resphys` has written.")
+    again = "run its command again"
     path = _record(folder, name)
     if not path.is_file():
-        raise DataFileError(f"{folder} is unfinished, as its stage '{name}' was not run to the end: {again}.")
+        raise DataFileError(f"{folder} is unfinished: its stage '{name}' was not completed; {again}.")
     record: dict[str, Any] = read_json(path)
     made, here = (
         versions.get("warp-resphys", "an unknown version") for versions in (record["versions"], package_versions())
     )
     if made.split(".")[:2] != here.split(".")[:2]:
         raise DataFileError(
-            f"{folder} was made by warp-resphys {made}, and this is {here}: {again} in another run folder, or use the "
-            "version that made it."
+            f"{folder} was written by warp-resphys {made}, and this is {here}: {again} in another run folder, or use "
+            "the version that wrote it."
         )
     for output, identity in record["outputs"].items():
         if not _is_same(folder / output, identity):
             raise DataFileError(f"{folder / output} is missing or has changed since it was written: {again}.")
-    for earlier, known in record.get("upstream", {}).items():
-        if finished_record(folder, earlier)["fingerprint"] != known:
-            raise DataFileError(f"{folder} is unfinished, as its stage '{earlier}' was run since '{name}': {again}.")
+    for earlier, expected in record.get("upstream", {}).items():
+        if finished_record(folder, earlier)["fingerprint"] != expected:
+            raise DataFileError(f"{folder} is unfinished: its stage '{earlier}' was run again after '{name}'; {again}.")
     return record
 
 
 def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
-    """The seconds of stages that are done, and the largest of their recorded peaks of memory, for `metrics.json`."""
+    """Returns durations [s] and the largest peak of memory [GiB] of finished stages, for `metrics.json`."""
     paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}
     return {
@@ -214,13 +208,13 @@ def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    """Size, time and digest of a file, which tell it from another one of the same name."""
+    """Size, modification time and digest, which identify the content of a file."""
     status = path.stat()
     return {"bytes": status.st_size, "modified_ns": status.st_mtime_ns, "sha256": digest(path)}
 
 
 def _valid_seconds(stage: Stage, context: StageContext) -> float | None:
-    """The seconds of an earlier run whose outputs are still the ones asked for, or None."""
+    """The duration of an earlier run whose outputs are still valid, or None."""
     path = _record(context.run_dir, stage.name)
     if not path.is_file():
         return None
@@ -242,7 +236,7 @@ def _valid_seconds(stage: Stage, context: StageContext) -> float | None:
 
 
 def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
-    """Compares a file with its identity; its content is read only if the times differ, as after copying."""
+    """Compares a file with its identity; its content is read only if the times differ, as they do after copying."""
     if not path.is_file() or path.stat().st_size != identity["bytes"]:
         return False
     return bool(path.stat().st_mtime_ns == identity["modified_ns"] or digest(path) == identity["sha256"])
@@ -250,15 +244,15 @@ def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:
 
 @contextmanager
 def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
-    """Holds a run folder for this process; the operating system lets go of it however the process ends.
+    """Locks a run folder; the operating system releases the lock when the process ends.
 
     Args:
-        run_dir: the run folder, made where it is missing.
-        wait: whether to wait for another process that holds it, in place of raising.
+        run_dir: the run folder, created if missing.
+        wait: whether to wait for another process that has locked it, instead of raising.
 
     Raises:
-        InputError: another process holds it.
-        DataFileError: the folder cannot be made, or its file system has no locks.
+        InputError: another process has locked it.
+        DataFileError: the folder cannot be created, or its file system has no locks.
     """
     path = Path(run_dir) / ".lock"
     try:
@@ -266,7 +260,7 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
         file = path.open("a")
     except OSError as error:
         raise DataFileError(
-            f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another"
+            f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another one"
         ) from error
     with file:
         try:

@@ -1,5 +1,5 @@
-"""A finished experiment in one's hands: the identified simulator with its learned force, as one object.
+"""A finished experiment as one object: the identified simulator with its learned force.
 
-`loading.load` makes a `robot.Robot` of a run folder or of the file that `Robot.save` wrote; a `motion.Motion` is what
-it does, and goes to CSV, VTK and USD files; `program.export_network` writes what it has learned for torch alone.
+`loading.load` makes a `robot.Robot` from a run folder or from a file of `Robot.save`. Its roll-outs are
+`motion.Motion` objects, which write CSV, VTK and USD files. `program.export_network` exports its network for torch.
 """

@@ -1,4 +1,4 @@
-"""What acts on a robot, by name: numbers, lists, arrays and tensors as values of its parts, checked."""
+"""Inputs of a robot by name: checked values, given as numbers, lists, arrays, tensors or by part."""
 
 import math
 from collections.abc import Mapping
@@ -24,15 +24,15 @@ Given = ArrayLike | torch.Tensor | Mapping[str, float]
 
 @dataclass(frozen=True)
 class RobotInput:
-    """Something that acts on a robot.
+    """An input of a robot.
 
     Attributes:
-        name: by which it is given.
+        name: keyword of the input in `Robot.step`.
         unit: of its values.
-        parts: what has a value each, such as the chambers.
-        low: (C,) the least value of each part in the experiment's trials; None where these have none.
-        high: (C,) the greatest.
-        quantity: with the range that a simulation takes.
+        parts: names of its C values, such as the chambers.
+        low: (C,) least values in the experiment's trials; None if the trials lack the input.
+        high: (C,) greatest values in the experiment's trials.
+        quantity: with the range that a simulation accepts.
     """
 
     name: str
@@ -44,93 +44,93 @@ class RobotInput:
 
     @property
     def is_driven(self) -> bool:
-        """Whether it is what an actuator is told."""
+        """Whether it is the command of an actuator."""
         return self.quantity not in (_UNLIMITED, PAYLOAD)
 
 
 def inputs_of(simulator: Simulator, description: Description) -> dict[str, RobotInput]:
-    """What acts on a robot, by name; beside it, an external force may."""
-    found = {}
-    for energy in (each for each in simulator.body.energies if isinstance(each, Energy)):
-        for quantity in (each for each in energy.inputs if each != PAYLOAD):
+    """Returns the inputs of a robot by name, except the external force."""
+    inputs = {}
+    for energy in [energy for energy in simulator.body.energies if isinstance(energy, Energy)]:
+        for quantity in [quantity for quantity in energy.inputs if quantity != PAYLOAD]:
             low, high = description.seen.get(quantity.name, (None, None))
-            found[quantity.name] = RobotInput(quantity.name, quantity.unit, energy.names, low, high, quantity)
+            inputs[quantity.name] = RobotInput(quantity.name, quantity.unit, energy.names, low, high, quantity)
     if description.payload_at is not None:
-        found[PAYLOAD.name] = RobotInput(PAYLOAD.name, PAYLOAD.unit, ("payload",), quantity=PAYLOAD)
+        inputs[PAYLOAD.name] = RobotInput(PAYLOAD.name, PAYLOAD.unit, ("payload",), quantity=PAYLOAD)
     if len(simulator.fixed):
-        found[BASE] = RobotInput(BASE, "m, rad", _POSE)
-    return found
+        inputs[BASE] = RobotInput(BASE, "m, rad", _POSE)
+    return inputs
 
 
 class InputReader:
-    """Brings what is given for a robot's inputs into shape.
+    """Converts values of a robot's inputs to tensors, and checks them.
 
     Args:
-        known: the inputs, by name.
-        simulator: on whose device and in whose type they are to be.
+        inputs: by name.
+        simulator: whose device and type the tensors get.
     """
 
-    def __init__(self, known: Mapping[str, RobotInput], simulator: Simulator) -> None:
-        self._known, self._simulator = known, simulator
+    def __init__(self, inputs: Mapping[str, RobotInput], simulator: Simulator) -> None:
+        self._inputs, self._simulator = inputs, simulator
 
     def read(self, name: str, value: Given, batch: int) -> torch.Tensor:
-        """(B, C) values of an input during a step, or (B, N, 3) of the external force.
+        """Returns the values (B, C) of an input during a step, or (B, N, 3) of the external force.
 
         Raises:
             InputError: an unknown input or part, values of another shape, or out of range.
         """
         if name == FORCE:
             return self.field(value, FORCE).expand(batch, -1, -1)
-        if name not in self._known:
-            raise InputError(f"there is no input {name!r}: the robot has {listed([*self._known, FORCE])}.")
-        known = self._known[name]
-        parts = known.parts
+        if name not in self._inputs:
+            raise InputError(f"there is no input {name!r}: the robot has {listed([*self._inputs, FORCE])}.")
+        declared = self._inputs[name]
+        parts = declared.parts
         if isinstance(value, Mapping):
-            odd = [part for part in value if part not in parts]
-            if odd:
-                raise InputError(f"{name} has no part {odd[0]!r}: it has {listed(parts)}.")
+            unknown = [part for part in value if part not in parts]
+            if unknown:
+                raise InputError(f"{name} has no part {unknown[0]!r}: it has {listed(parts)}.")
             value = [float(value.get(part, 0.0)) for part in parts]
-        found = self._tensor(value, name)
-        found = found[..., None] if len(parts) == 1 and (found.ndim == 0 or found.shape[-1] != 1) else found
-        found = found[None] if found.ndim == 1 else found
-        if found.ndim != 2 or found.shape[1] != len(parts) or len(found) not in (1, batch):
+        values = self._tensor(value, name)
+        values = values[..., None] if len(parts) == 1 and (values.ndim == 0 or values.shape[-1] != 1) else values
+        values = values[None] if values.ndim == 1 else values
+        if values.ndim != 2 or values.shape[1] != len(parts) or len(values) not in (1, batch):
             raise InputError(
-                f"{name} has shape {tuple(found.shape)}: give ({len(parts)},) values in {known.unit}, one for each of "
-                f"{listed(parts)}, or as many for each of the {batch} environments."
+                f"{name} has shape {tuple(values.shape)}: give ({len(parts)},) values in {declared.unit}, one for each "
+                f"of {listed(parts)}, or ({batch}, {len(parts)}) for the {batch} environments."
             )
-        if math.isfinite(known.quantity.lower) or math.isfinite(known.quantity.upper):
-            known.quantity.check(found)
-        if not bool(torch.isfinite(found).all()):
-            raise InputError(f"{name} is not finite: check what computes it.")
-        return found.expand(batch, -1)
+        if math.isfinite(declared.quantity.lower) or math.isfinite(declared.quantity.upper):
+            declared.quantity.check(values)
+        if not bool(torch.isfinite(values).all()):
+            raise InputError(f"{name} has values that are not finite: check how they are computed.")
+        return values.expand(batch, -1)
 
     def is_series(self, name: str, value: Given) -> bool:
-        """Whether there is a value for each step."""
+        """Whether the input has a value for each step."""
         if isinstance(value, Mapping):
             return False
         return self._tensor(value, name).ndim >= (3 if name == FORCE else 2)
 
     def series(self, name: str, value: Given, batch: int) -> torch.Tensor:
-        """(1 or T, B, C) values of an input; see `read`."""
+        """Returns the values (1, B, C) of a constant input or (T, B, C) of a series; raises the errors of `read`."""
         if isinstance(value, Mapping) or not self.is_series(name, value):
             return self.read(name, value, batch)[None]
-        return torch.stack([self.read(name, each, batch) for each in self._tensor(value, name)])
+        return torch.stack([self.read(name, now, batch) for now in self._tensor(value, name)])
 
     def field(self, values: Any, name: str) -> torch.Tensor:
-        """(B, N, 3) of (N, 3) or (B, N, 3).
+        """Returns vectors of the vertices (B, N, 3), given as (N, 3) or (B, N, 3).
 
         Raises:
             InputError: another shape.
         """
-        found = self._tensor(values, name)
-        found = found[None] if found.ndim == 2 else found
+        field = self._tensor(values, name)
+        field = field[None] if field.ndim == 2 else field
         wanted = (self._simulator.body.n_vertices, 3)
-        if found.ndim != 3 or tuple(found.shape[1:]) != wanted:
-            raise InputError(f"{name} has shape {tuple(found.shape)}: give {wanted}, or as many for each environment.")
-        return found
+        if field.ndim != 3 or tuple(field.shape[1:]) != wanted:
+            raise InputError(f"{name} has shape {tuple(field.shape)}: give {wanted}, or one such array an environment.")
+        return field
 
     def _tensor(self, value: Any, name: str) -> torch.Tensor:
         try:
             return self._simulator.tensor(value)
         except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"{name} is {value!r}: it must be numbers, or an array or a tensor of them.") from None
+            raise InputError(f"{name} is {value!r}: give numbers, or an array or a tensor of numbers.") from None

@@ -1,4 +1,4 @@
-"""`load`: a robot of a finished run, or of a file; and the trials of the run, to be driven again."""
+"""Loads a robot from a finished run or a file, and the trials of the run, to replay them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,29 +22,28 @@ from .state import RobotState
 
 
 def load(path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise") -> Robot:
-    """The robot of a finished run, or of a file that `Robot.save` wrote.
+    """Loads the robot of a finished run, or of a file that `Robot.save` wrote.
 
     Args:
         path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the file.
-        model: which of the experiment's: ``resphys``, the identified simulator with its learned force, if left out;
-            ``sysid``, that simulator alone; ``simulation``, the uncorrected one; ``simfree``, a network alone. A file
-            has one.
+        model: ``resphys`` (default), the identified simulator with its learned force; ``sysid``, the identified
+            simulator; ``simulation``, the uncorrected one; ``simfree``, a network alone. A file contains one model.
         device: of the simulation: ``cpu``, ``cuda`` or ``auto``.
         on_failure: ``raise``, or ``count``, see `Robot`.
 
     Raises:
         DataFileError: there is no such run, it is unfinished, of another version, or a file of it has changed.
-        InputError: the experiment has no such model, or an unknown device.
+        InputError: the experiment has no such model, or the device is unknown.
     """
     place = Path(path).expanduser()
     where = choose_device(device)
     if place.is_file():
-        found = Description.read(place)
-        if model not in (None, found.model):
+        description = Description.read(place)
+        if model not in (None, description.model):
             raise InputError(
-                f"the model is {model!r}, but {place} holds {found.model!r}: load that, or the run folder."
+                f"the model is {model!r}, but {place} contains {description.model!r}: load that, or the run folder."
             )
-        return Robot(found, where, on_failure)
+        return Robot(description, where, on_failure)
     if not place.is_dir():
         raise DataFileError(f"{place} does not exist: name a run folder, or a file that `Robot.save` wrote.")
     return Robot(describe(place, model or "resphys"), where, on_failure, folder=place)
@@ -52,16 +51,16 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
 
 @dataclass(frozen=True)
 class RecordedTrial:
-    """A trial of a run, for a robot that was loaded from it.
+    """A trial of a run, for a robot loaded from the run.
 
     Attributes:
         name: of the trial.
-        start: the state that it begins with, as the robot has it.
-        steps: that reach past its last frame; none of a pose.
-        inputs: by name, as `Robot.rollout` takes them.
-        times: (F,) of its frames since then [s].
-        markers: (F, M, 3) what was observed [m], NaN where nothing was seen.
-        shift: (M, 3) by which markers sit beside where they are bound, where a release tells [m].
+        start: initial state.
+        steps: number of steps, past the last frame; zero for a pose.
+        inputs: by name, in the form of `Robot.rollout`.
+        times: (F,) of the frames since the initial state [s].
+        markers: (F, M, 3) observed positions [m], NaN where a marker was not seen.
+        shift: (M, 3) offset of the markers from where they are bound, estimated from a release [m].
     """
 
     name: str
@@ -73,39 +72,39 @@ class RecordedTrial:
     shift: NDArray[np.float64] | None = None
 
     def play(self, robot: Robot) -> Motion:
-        """What a robot does in this trial."""
+        """Simulates the trial with a robot."""
         return robot.rollout(self.start, self.steps, **self.inputs)
 
     def shown(self, motion: Motion) -> NDArray[np.float64]:
-        """(F, M, 3) the markers of a motion at the frames [m]."""
-        found = motion.at(self.times)[:, 0].detach().cpu().numpy()
-        return np.asarray(found if self.shift is None else found + self.shift)
+        """Markers (F, M, 3) of a motion at the times of the frames [m]."""
+        markers = motion.at(self.times)[:, 0].detach().cpu().numpy()
+        return np.asarray(markers if self.shift is None else markers + self.shift)
 
     def errors_mm(self, motion: Motion) -> NDArray[np.float64]:
-        """(F, M) distances of a motion's markers from those observed [mm], NaN where nothing was seen."""
+        """Distances (F, M) of a motion's markers from the observed ones [mm], NaN where a marker was not seen."""
         return np.asarray(1e3 * np.linalg.norm(self.shown(motion) - self.markers, axis=-1))
 
 
 def trial_names(robot: Robot) -> tuple[str, ...]:
-    """The trials of the run that a robot was loaded from.
+    """Returns the names of the trials of a robot's run.
 
     Raises:
-        InputError: it was loaded from a file.
+        InputError: the robot was loaded from a file.
     """
     return _experiment(robot).dataset.names
 
 
 def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
-    """A trial of the run that a robot was loaded from, as it begins by the robot's simulator.
+    """Returns a trial of a robot's run, with its initial state computed by the robot's simulator.
 
     Raises:
         InputError: there is no such trial, or the robot was loaded from a file.
-        ConvergenceError: the body cannot be brought where the trial begins.
+        ConvergenceError: the simulator cannot reach the initial state.
     """
     experiment = _experiment(robot)
-    known = experiment.dataset.names
-    if name not in known:
-        raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(known)}.")
+    names = experiment.dataset.names
+    if name not in names:
+        raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(names)}.")
     simulator, model = experiment.model_simulator(robot.description.model), robot.description.model
     with torch.no_grad():
         replay = experiment.replay(simulator, [name], model)
@@ -133,5 +132,5 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
 
 def _experiment(robot: Robot) -> Experiment:
     if robot.folder is None:
-        raise InputError("the robot was loaded from a file, which has no trials: load its run folder for these.")
+        raise InputError("the robot was loaded from a file, which has no trials: load its run folder instead.")
     return finished_experiment(robot.folder)

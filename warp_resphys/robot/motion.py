@@ -1,4 +1,4 @@
-"""What a robot does over time, and the files that it goes to."""
+"""The motion of a robot over time, and its export to files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ class Motion:
         times: (T + 1,) [s].
         q: (T + 1, B, N, 3) positions of the vertices [m].
         v: (T + 1, B, N, 3) velocities [m/s].
-        markers: (T + 1, B, M, 3) as `Robot.observe` has them [m].
-        half_widths: (T + 1, B, M) of the prediction intervals of their coordinates [m]; None where the experiment has
+        markers: (T + 1, B, M, 3) as `Robot.observe` returns them [m].
+        half_widths: (T + 1, B, M) of the prediction intervals of their coordinates [m]; None if the experiment has
             none.
-        left: (T + 1, B) bool, whether the learned force had been asked outside of the range of its training.
-        lost: (T + 1, B) bool, whether the simulation had diverged.
-        inputs: (T, B, C) what was commanded, by name.
-        known_inputs: of the robot, by name.
-        final: the last state, from which a further roll-out goes on.
+        left: (T + 1, B) bool, whether the learned force has been evaluated outside its training range.
+        lost: (T + 1, B) bool, whether the simulation has diverged.
+        inputs: (T, B, C) commands, by name.
+        known_inputs: declarations of the robot's inputs, by name.
+        final: the last state, from which another roll-out can continue.
     """
 
     robot: Description
@@ -50,36 +50,38 @@ class Motion:
     final: RobotState
 
     def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:
-        """(F, B, M, 3) markers at other times [s], by cubic interpolation [m]."""
+        """Interpolates the markers at other times (F,) [s]; returns (F, B, M, 3), by cubic interpolation [m]."""
         wanted = torch.as_tensor(times).to(self.markers)
         if len(self.times) == 1:
             return self.markers.expand(len(wanted), -1, -1, -1)
         step = float(self.times[1] - self.times[0])
-        found = sample(self.markers.transpose(0, 1), wanted.expand(self.markers.shape[1], -1), step)
-        return found.transpose(0, 1)
+        return sample(self.markers.transpose(0, 1), wanted.expand(self.markers.shape[1], -1), step).transpose(0, 1)
 
     def write_csv(self, path: str | Path, environment: int = 0, half_widths: bool = False) -> Path:
-        """Writes a table: times, markers, and what actuators were told during the step that led there, in SI units.
+        """Writes a table of times, markers, and the commands of the step that led there, in SI units.
 
-        Its headers have names and units; `read_recording` reads it, unless half-widths are in it.
+        Its headers have names and units. `read_recording` reads tables without half-widths.
 
         Args:
             path: of the file.
-            environment: which of the B robots.
-            half_widths: whether those of the markers' prediction intervals follow these.
+            environment: number of the robot in the batch.
+            half_widths: whether columns with the half-widths of the markers' prediction intervals are added.
 
         Raises:
             InputError: there is no such environment.
-            DataFileError: it cannot be written.
+            DataFileError: the file cannot be written.
         """
         self._check(environment)
         columns: dict[str, FloatArray] = {}
         if half_widths and self.half_widths is not None:
             widths = self.half_widths[:, environment].T
-            columns |= {f"{name} half-width [m]": each for name, each in zip(self.robot.labels, widths, strict=True)}
-        for known in (each for name, each in self.known_inputs.items() if name in self.inputs and each.is_driven):
-            values = _array(self.inputs[known.name], environment)
-            columns |= input_columns(known.name, known.parts, known.unit, values)
+            columns |= {
+                f"{label} half-width [m]": width for label, width in zip(self.robot.labels, widths, strict=True)
+            }
+        for name, declared in self.known_inputs.items():
+            if name in self.inputs and declared.is_driven:
+                values = _array(self.inputs[name], environment)
+                columns |= input_columns(name, declared.parts, declared.unit, values)
         return write_csv(Path(path), self.times, self.robot.labels, _array(self.markers, environment), columns)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
@@ -89,34 +91,34 @@ class Motion:
 
         Args:
             path: of the ``.pvd`` file.
-            environment: which of the B robots.
+            environment: number of the robot in the batch.
 
         Raises:
             InputError: there is no such environment, or another extension.
-            DataFileError: it cannot be written.
+            DataFileError: the files cannot be written.
         """
         self._check(environment)
-        series = (_array(each, environment) for each in (self.q, self.v, self._labelled))
+        series = (_array(values, environment) for values in (self.q, self.v, self._labelled))
         return write_vtk(Path(path), self.robot.mesh, self.times, *series)
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
-        """Writes the body's surface and its markers with their motion to a USD file; needs the extra ``usd``.
+        """Writes the moving surface and markers of the body to a USD file; needs the extra ``usd``.
 
         Args:
             path: of the ``.usd``, ``.usda`` or ``.usdc`` file.
-            environment: which of the B robots.
+            environment: number of the robot in the batch.
 
         Raises:
             InputError: there is no such environment, another extension, or the extra is missing.
-            DataFileError: it cannot be written.
+            DataFileError: the file cannot be written.
         """
         self._check(environment)
-        series = (_array(each, environment) for each in (self.q, self._labelled))
+        series = (_array(values, environment) for values in (self.q, self._labelled))
         return write_usd(Path(path), self.robot.mesh, self.times, *series)
 
     @property
     def _labelled(self) -> torch.Tensor:
-        """(T + 1, B, M, 3) the markers; none where every vertex is observed."""
+        """Markers (T + 1, B, M, 3); M = 0 if every vertex is observed."""
         return self.markers if self.robot.labels else self.markers[:, :, :0]
 
     def _check(self, environment: int) -> None:

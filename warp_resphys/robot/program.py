@@ -1,7 +1,8 @@
-"""Learned forces as programs of torch.export: for other simulators, and for runtimes without this package."""
+"""Exports learned forces with torch.export, for other simulators and for runtimes without this package."""
 
 import io
 from collections.abc import Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Final
 
@@ -16,52 +17,56 @@ from ..learning.predictors import Range
 from .robot import Robot
 
 SUFFIX: Final = ".pt2"
-_EXAMPLES: Final = 2  # environments with which the program is traced; it takes any number
+_EXAMPLES: Final = 2  # batch size with which the program is traced; it accepts any
 _MOVEMENT: Final = (*(f"velocity {a} [m/s]" for a in "xyz"), *(f"rate of rotation {a} [rad/s]" for a in "xyz"))
 
 
 class _Program(nn.Module):
-    """What `LearnedPredictor` does in a step, as one function of tensors."""
+    """One step of `LearnedPredictor` as a function of tensors."""
 
     def __init__(self, network: StateMap, range_: Range | None, frames: VertexFrames | None) -> None:
         super().__init__()
         self.network, self._range, self._frames = network, range_, frames
 
     def forward(
-        self, q: torch.Tensor, v: torch.Tensor, told: torch.Tensor | None = None, hidden: torch.Tensor | None = None
+        self,
+        q: torch.Tensor,
+        v: torch.Tensor,
+        conditions: torch.Tensor | None = None,
+        hidden: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, ...]:
-        """Force, or the next state, and the next hidden state; the arguments are those that `export_network` names."""
-        inputs = self.network.encode(q, v, told)
+        """Returns force, or next state, and next hidden state, with the arguments of `export_network`'s program."""
+        inputs = self.network.encode(q, v, conditions)
         if self._range is not None:
             inputs = self._range.hold(inputs)
         fields, later = self.network.decode(inputs, hidden)
-        found = [field.to(q.dtype) for field in fields]
+        outputs = [field.to(q.dtype) for field in fields]
         if self._frames is not None:
-            found = [self._frames.to_world(q, v, found[0])]
-        return (*found, *(() if later is None else (later,)))
+            outputs = [self._frames.to_world(q, v, outputs[0])]
+        return (*outputs, *(() if later is None else (later,)))
 
 
 def export_network(robot: Robot, path: str | Path) -> Path:
-    """Writes what a robot has learned as a program that `torch.export.load` opens, for any number of environments.
+    """Writes a robot's network as a program that `torch.export.load` opens, for any batch size.
 
-    It takes q (B, N, 3) [m] and v (B, N, 3) [m/s]; if the network is told of inputs, these (B, A) as `told_names` lists
-    them; and if it is recurrent, its hidden state (B, H), zero at the start. It gives the residual force (B, N, 3) [N]
-    in the world (of the data-driven model the next q and v), and the next hidden state. What leaves the range of the
-    training is held at its edge, as in `Robot.step`. A base that moves is not in it: give states in the base's frame.
+    Its arguments are q (B, N, 3) [m] and v (B, N, 3) [m/s]; the conditions (B, A) that `condition_names` lists, if the
+    network takes any; and the hidden state (B, H), zero at the start, if it is recurrent. It returns the residual force
+    (B, N, 3) [N] in the world frame (the data-driven model: the next q and v), and the next hidden state. Inputs are
+    clipped to the training range, as in `Robot.step`. A moving base is not included: give states in the base's frame.
 
     Args:
         robot: with a learned force.
         path: of the ``.pt2`` file.
 
     Raises:
-        InputError: the robot has learned nothing, or another extension.
-        DataFileError: it cannot be written.
+        InputError: the robot has no network, or the path another extension.
+        DataFileError: the file cannot be written.
     """
     place, learned = Path(path).expanduser(), robot.description.learned
     if place.suffix != SUFFIX:
         raise InputError(f"{place} does not end in {SUFFIX}: give such a name.")
     if learned is None:
-        raise InputError(f"the model {robot.description.model!r} is a simulator alone: it has learned nothing.")
+        raise InputError(f"the model {robot.description.model!r} has no network to export: choose a learned model.")
     network, q = learned.network, robot.simulator.rest_positions.repeat(_EXAMPLES, 1, 1)
     arguments: list[torch.Tensor | None] = [q, torch.zeros_like(q), None, None]
     if network.actuation is not None:
@@ -70,7 +75,7 @@ def export_network(robot: Robot, path: str | Path) -> Path:
         assert network.recurrent is not None
         arguments[3] = torch.zeros(_EXAMPLES, network.recurrent).to(network.linear)
     batch = torch.export.Dim("batch")
-    shapes = tuple(None if each is None else {0: batch} for each in arguments)
+    shapes = tuple(None if argument is None else {0: batch} for argument in arguments)
     with torch.no_grad():
         program = _Program(network, learned.range_, robot.frames).eval()
         exported = torch.export.export(program, tuple(arguments), dynamic_shapes=shapes)
@@ -81,16 +86,16 @@ def export_network(robot: Robot, path: str | Path) -> Path:
     return place
 
 
-def told_names(robot: Robot) -> Sequence[str]:
-    """The A numbers that a robot's network is told beside the state, in their order."""
-    known, found = robot.description, list[str]()
-    if known.payload_at is not None and known.sees_payload:
-        found.append("payload [kg]")
-    for each in (robot.inputs[name] for name in robot.driven if name in known.seen):
-        own = [f"{each.name} {part} [{each.unit}]" for part in each.parts]
-        found += own + [f"mean of {name} over {seconds:g} s" for seconds in known.filters for name in own]
-    if known.told_of_base is not None:
-        parts = [f"{when} {what}" for when in ("during", "before") for what in _MOVEMENT]
-        parts += [f"gravity {axis}" for axis in "xyz"]
-        found += [name for name, told in zip(parts, known.told_of_base, strict=True) if told]
-    return found
+def condition_names(robot: Robot) -> Sequence[str]:
+    """Returns the names of the A inputs that a robot's network takes beside the state, in order."""
+    description, names = robot.description, list[str]()
+    if description.payload_at is not None and description.sees_payload:
+        names.append("payload [kg]")
+    for driven in [robot.inputs[name] for name in robot.driven if name in description.seen]:
+        parts = [f"{driven.name} {part} [{driven.unit}]" for part in driven.parts]
+        names += parts + [f"mean of {part} over {seconds:g} s" for seconds in description.filters for part in parts]
+    if description.told_of_base is not None:
+        base = [f"{when} {what}" for when in ("during", "before") for what in _MOVEMENT]
+        base += [f"gravity {axis}" for axis in "xyz"]
+        names += compress(base, description.told_of_base)
+    return names

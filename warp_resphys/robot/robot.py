@@ -1,4 +1,4 @@
-"""A robot: its identified simulator and its learned force, stepped by the names of its inputs."""
+"""A robot: an identified simulator with a learned force, stepped with its inputs by name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -34,25 +34,25 @@ SUFFIX: Final = ".safetensors"
 
 
 class Robot:
-    """An experiment's simulator with what was identified and learned; `loading.load` makes one.
+    """The simulator of an experiment with identified parameters and learned force; `loading.load` makes one.
 
-    It is constant; states go in and come out. Whatever requires a gradient (states, inputs, parameters) gets one.
+    A robot is constant: `step` returns a new state. States, inputs and parameters are differentiable.
 
     Args:
-        description: of what it is.
+        description: definition of the robot.
         device: of the simulation.
         on_failure: ``raise``, or ``count``: environments that diverge stand at rest and are ``lost``.
-        parameters: (1,) or (B,) values in place of the identified ones.
-        folder: of its run, with the trials; None for one from a file.
+        parameters: (1,) or (B,) values that replace the identified ones.
+        folder: of its run, with the trials; None for a robot from a file.
 
     Attributes:
         simulator: of its body.
-        inputs: what acts on it, by name.
-        time_step: of a step [s].
-        labels: of its markers; none where every vertex is observed.
-        frames: with which its learned force turns; None if it does not.
+        inputs: declarations of its inputs, by name.
+        time_step: h [s].
+        labels: of its markers; empty if every vertex is observed.
+        frames: corotated frames of its learned force; None for a force in the world frame.
         parameters: identified values, by name.
-        constants: what these come to.
+        constants: of the simulator, computed from the parameters.
     """
 
     def __init__(
@@ -83,9 +83,9 @@ class Robot:
         given = {**self.description.parameters, **parameters}
         values = {name: self.simulator.tensor(value).reshape(-1) for name, value in given.items()}
         count = max((len(value) for value in values.values()), default=1)
-        odd = [name for name, value in values.items() if len(value) not in (1, count)]
-        if odd:
-            raise InputError(f"{odd[0]} has {len(values[odd[0]])} values, others {count}: give one, or one each.")
+        for name, value in values.items():
+            if len(value) not in (1, count):
+                raise InputError(f"{name} has {len(value)} values, others {count}: give 1 or {count}.")
         self.parameters = values
         spread = {name: value.expand(count) for name, value in values.items()}
         self.constants = self.simulator.prepare(constants_of(self.simulator, spread))
@@ -95,10 +95,10 @@ class Robot:
         }
 
     def with_parameters(self, **parameters: torch.Tensor | float) -> "Robot":
-        """The same robot with other values of what was, or could have been, identified; on the same memory.
+        """Returns a robot with other parameters, which shares all other data with this one.
 
         Args:
-            parameters: numbers, or (B,) tensors with one for each environment; differentiable.
+            parameters: by name, numbers or (B,) tensors with a value for each environment; differentiable.
 
         Raises:
             InputError: an unknown name, or a value out of range.
@@ -110,34 +110,33 @@ class Robot:
 
     @property
     def driven(self) -> tuple[str, ...]:
-        """The inputs of its actuators, by name."""
-        return tuple(name for name, each in self.inputs.items() if each.is_driven)
+        """Names of the inputs that command its actuators."""
+        return tuple(name for name, declared in self.inputs.items() if declared.is_driven)
 
     @property
     def is_data_driven(self) -> bool:
-        """Whether a network takes the simulator's place."""
+        """Whether a network replaces the simulator."""
         return self._learned is not None and isinstance(self._learned.network, NextState)
 
     def __repr__(self) -> str:
-        """What it is, in some lines."""
-        body, known = self.simulator.body, self.description
+        """Returns a short description: vertices, markers, time step, inputs, parameters, error."""
+        body, description = self.simulator.body, self.description
         lines = [
-            f"Robot {known.name}, {known.model}: {body.n_vertices} vertices, "
+            f"Robot {description.name}, {description.model}: {body.n_vertices} vertices, "
             f"{len(self.labels) or 'no'} markers, steps of {1e3 * self.time_step:g} ms"
         ]
-        for each in self.inputs.values():
-            lines.append(f"  input {each.name} [{each.unit}]: {', '.join(each.parts)}")
-        lines += [f"  identified {name}: {value:.6g}" for name, value in known.parameters.items()]
-        if known.errors_mm.get("mean") is not None:
-            lines.append(f"  mean error in the trials that tested it: {known.errors_mm['mean']:.3g} mm")
+        lines += [f"  input {name} [{given.unit}]: {', '.join(given.parts)}" for name, given in self.inputs.items()]
+        lines += [f"  identified {name}: {value:.6g}" for name, value in description.parameters.items()]
+        if description.errors_mm.get("mean") is not None:
+            lines.append(f"  mean error in the test trials: {description.errors_mm['mean']:.3g} mm")
         return "\n".join(lines)
 
     def save(self, path: str | Path) -> Path:
-        """Writes it, as it was described, into one safe file (safetensors and JSON) that `loading.load` opens anywhere.
+        """Writes its description to one safe file (safetensors and JSON) that `loading.load` opens on any machine.
 
         Raises:
             InputError: the name has another extension.
-            DataFileError: it cannot be written.
+            DataFileError: the file cannot be written.
         """
         place = Path(path).expanduser()
         if place.suffix != SUFFIX:
@@ -145,62 +144,64 @@ class Robot:
         self.description.write(place)
         return place
 
-    # What it shows
+    # Observation
 
     def observe(self, state: RobotState) -> torch.Tensor:
-        """(B, M, 3) its markers, as recordings show them, or (B, N, 3) all vertices where these are observed [m]."""
+        """Markers (B, M, 3) in a state, as recordings have them; vertices (B, N, 3) if these are observed [m]."""
         return state.q if self._observe is None else self._observe(state.q)
 
     def half_widths(self, markers: torch.Tensor) -> NDArray[np.float64] | None:
-        """(..., M) half-widths of the prediction intervals of the coordinates of (..., M, 3) markers [m].
+        """Half-widths (..., M) of the prediction intervals of markers' coordinates (..., M, 3) [m].
 
-        They are those of the experiment's report (`learning.intervals`); None where it has none.
+        They are those of the experiment's report (`learning.intervals`); None if it has none.
         """
-        known = self.description
-        if known.intervals is None or known.bound is None:
+        description = self.description
+        if description.intervals is None or description.bound is None:
             return None
-        return known.intervals.half_widths(markers.detach().cpu().numpy(), known.bound.numpy())
+        return description.intervals.half_widths(markers.detach().cpu().numpy(), description.bound.numpy())
 
-    # Where it begins
+    # Initial states
 
     def state(self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None) -> RobotState:
-        """A state of given positions, before which no input has come.
+        """Returns a state of given positions, with a history of zero inputs.
 
         Args:
             q: (N, 3) or (B, N, 3) [m].
-            v: the same [m/s]; at rest, if left out.
+            v: velocities of the same shape [m/s]; zero if omitted.
         """
         at = self._reader.field(q, "q")
         return self._new(State(at, torch.zeros_like(at) if v is None else self._reader.field(v, "v")))
 
     def begin(self, batch: int = 1, **inputs: Given) -> RobotState:
-        """The simulator at rest under its weight and constant inputs, as trials begin; without the learned force.
+        """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
+
+        Trials begin with it. A body without fixed vertices keeps its rest shape.
 
         Args:
             batch: B.
-            inputs: see `step`.
+            inputs: by name, as for `step`.
 
         Raises:
-            InputError: see `step`.
+            InputError: an invalid input, as for `step`.
             ConvergenceError: there is no equilibrium.
         """
         given = self._read(inputs, batch)
-        if not len(self.simulator.fixed):
-            return self._new(self.simulator.rest_state(batch), given)
         state = self._new(self.simulator.rest_state(batch), given)
-        acting, _, _, _ = self._acting(state, given)
+        if not len(self.simulator.fixed):
+            return state
+        acting = self._acting(state, given)[0]
         return replace(state, body=self.simulator.static_equilibrium(acting, self.constants, batch=batch))
 
     def settle(self, batch: int = 1, **inputs: Given) -> RobotState:
-        """Where the robot comes to rest under constant inputs, with its learned force.
+        """Returns the equilibrium of the robot under constant inputs, with its learned force.
 
         Args:
             batch: B.
-            inputs: see `step`.
+            inputs: by name, as for `step`.
 
         Raises:
-            InputError: see `step`.
-            ConvergenceError: it does not come to rest.
+            InputError: an invalid input, as for `step`.
+            ConvergenceError: there is no equilibrium.
         """
         start = self.begin(batch, **inputs)
         if self._learned is None:
@@ -209,53 +210,53 @@ class Robot:
             for _ in range(POSE_STEPS):
                 start = self.step(start, **inputs)
             return start
-        acting, told, memory, base = self._acting(start, self._read(inputs, batch))
-        predictor = self._predictor(told, self._frame(base))
+        acting, conditions, memory, base = self._acting(start, self._read(inputs, batch))
+        predictor = self._predictor(conditions, base)
 
         def force(state: State) -> torch.Tensor:
-            found = predictor(state, 0)
-            assert isinstance(found, torch.Tensor)
-            return found
+            predicted = predictor(state, 0)
+            assert isinstance(predicted, torch.Tensor)
+            return predicted
 
         body = settled(self.simulator, acting, self.constants, start.body, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return replace(start, body=body, memory={**start.memory, **memory}, left=left)
 
     def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, N, 3) where `settle` comes to rest [m], and (B,) bool, which of them do; elsewhere it is no equilibrium.
+        """Returns positions (B, N, 3) of `settle` [m], and (B,) bool, which environments are in equilibrium.
 
         Raises:
-            InputError: see `step`.
-            ConvergenceError: the simulator itself has no equilibrium.
+            InputError: an invalid input, as for `step`.
+            ConvergenceError: the simulator has no equilibrium even without the learned force.
         """
         try:
-            found = self.settle(batch, **inputs).q
+            q = self.settle(batch, **inputs).q
         except ConvergenceError as error:
             if not isinstance(error.report, torch.Tensor):
                 raise
             return error.positions.detach(), error.report
-        return found, torch.ones(batch, dtype=torch.bool, device=found.device)
+        return q, torch.ones(batch, dtype=torch.bool, device=q.device)
 
-    # How it moves
+    # Motion
 
     def step(self, state: RobotState, **inputs: Given) -> RobotState:
-        """The state one time step on; differentiable.
+        """Returns the state after one time step; differentiable.
 
         Args:
-            state: where it is.
-            inputs: by name, what is commanded during the step: (C,) or (B, C) values, a number where there is one part,
-                or numbers by the names of parts, the others zero. Those that are left out are zero, and the base stays.
+            state: before the step.
+            inputs: commands during the step by name: (C,) or (B, C) values, a number for an input of one part, or a
+                mapping from parts to numbers (other parts are zero). Omitted inputs are zero, an omitted base stays.
                 ``payload`` is a mass in kg, ``base`` the pose at the end of the step (x, y, z in m, rotation vector in
                 rad), ``external_force`` (N, 3) or (B, N, 3) in N.
 
         Raises:
-            InputError: an unknown input, a part that there is not, or values of another shape or out of range.
-            ConvergenceError: the step failed; unless failures are counted.
+            InputError: an unknown input or part, or values of another shape or out of range.
+            ConvergenceError: the step failed, and ``on_failure`` is ``raise``.
         """
-        acting, told, memory, base = self._acting(state, self._read(inputs, state.batch))
+        acting, conditions, memory, base = self._acting(state, self._read(inputs, state.batch))
         predictor = None
         if self._learned is not None:
-            predictor = self._predictor(told, self._frame(base))
+            predictor = self._predictor(conditions, base)
             predictor.hidden = state.hidden
         rollout = Rollout(self.simulator, predictor, acting, self.constants)
         rollout.resume(state.lost, 0)
@@ -263,7 +264,7 @@ class Robot:
         now = rollout.lost(body)
         if self.simulator.settings.on_failure == "raise" and bool((now & ~state.lost).any()):
             raise ConvergenceError(
-                f"the robot has diverged: a vertex went further than {FURTHEST:g} of its lengths; take shorter steps, "
+                f"the robot has diverged: a vertex moved further than {FURTHEST:g} body lengths; use shorter steps, "
                 "lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
@@ -281,23 +282,23 @@ class Robot:
         on_step: Callable[[int], None] = lambda number: None,
         **inputs: Given,
     ) -> Motion:
-        """Steps many times.
+        """Simulates many steps.
 
         Args:
-            state: the start.
-            steps: T; as many as the longest input has, if left out.
-            on_step: called with the number of steps that are done.
-            inputs: as `step` takes them, (C,) throughout, or (T, C) or (T, B, C) during each step; past the end of a
-                series, its last.
+            state: initial state.
+            steps: T; the length of the longest input if omitted.
+            on_step: called with the number of steps done.
+            inputs: by name as for `step`, either constant (C,), or a series (T, C) or (T, B, C) with values for each
+                step; the last value of a shorter series is held.
 
         Raises:
-            InputError: see `step`; or no number of steps.
-            ConvergenceError: see `step`.
+            InputError: an invalid input, as for `step`, or no number of steps.
+            ConvergenceError: a step failed, and ``on_failure`` is ``raise``.
         """
         series = {name: self._reader.series(name, value, state.batch) for name, value in inputs.items()}
         lengths = [len(value) for name, value in series.items() if self._reader.is_series(name, inputs[name])]
         if steps is None and not lengths:
-            raise InputError("no number of steps: give `steps`, or an input with a value for each step.")
+            raise InputError("the number of steps is unknown: give `steps`, or an input with a value for each step.")
         count = max(lengths, default=0) if steps is None else steps
         states, acting = [state], list[dict[str, torch.Tensor]]()
         for number in range(count):
@@ -306,43 +307,43 @@ class Robot:
             states.append(state)
             acting.append(now)
             on_step(number + 1)
-        markers = torch.stack([self.observe(each) for each in states])
+        markers = torch.stack([self.observe(state) for state in states])
         return Motion(
             robot=self.description,
             times=self.time_step * np.arange(count + 1, dtype=np.float64),
-            q=torch.stack([each.q for each in states]),
-            v=torch.stack([each.v for each in states]),
+            q=torch.stack([state.q for state in states]),
+            v=torch.stack([state.v for state in states]),
             markers=markers,
             half_widths=self.half_widths(markers),
-            left=torch.stack([each.left for each in states]),
-            lost=torch.stack([each.lost for each in states]),
-            inputs={name: torch.stack([each[name] for each in acting]) for name in series if acting},
+            left=torch.stack([state.left for state in states]),
+            lost=torch.stack([state.lost for state in states]),
+            inputs={name: torch.stack([now[name] for now in acting]) for name in series if acting},
             known_inputs=self.inputs,
             final=state,
         )
 
-    # What it consists of, at a state
+    # Linearisation and the network's inputs in a state
 
     def begin_memory(self, inputs: Mapping[str, Given], batch: int = 1) -> dict[str, torch.Tensor]:
-        """What is remembered where constant inputs have lasted; see `RobotState.memory`."""
+        """Returns `RobotState.memory` after constant inputs have acted for a long time."""
         return dict(self._new(self.simulator.rest_state(batch), self._read(inputs, batch)).memory)
 
-    def told(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
-        """(B, A) what the network is told beside the state during a step; see `program.told_names`."""
+    def conditions(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
+        """Inputs (B, A) of the network beside the state in a step, as `program.condition_names` lists them."""
         return self._acting(state, self._read(inputs, state.batch))[1]
 
     def linearised(
         self, state: RobotState, **inputs: Given
     ) -> tuple[csc_array, NDArray[np.float64], NDArray[np.int64]]:
-        """The simulator's Hessian of a step from a state, at that state, without the learned force.
+        """Linearises a step of the simulator about a state, without the learned force.
 
         Returns:
-            The (3 F, 3 F) Hessian and the (3 F,) inertia in it [N/m], and the numbers of the F free vertices.
+            The (3 F, 3 F) Hessian and its inertial part (3 F,) [N/m], and the numbers of the F free vertices.
         """
         acting = self._acting(state, self._read(inputs, state.batch))[0]
-        found = self.simulator.linearise(state.body, acting, self.constants)
-        hessian, inertia = found.matrix(state.q)
-        return hessian, inertia, found.free.cpu().numpy()
+        linearised = self.simulator.linearise(state.body, acting, self.constants)
+        hessian, inertia = linearised.matrix(state.q)
+        return hessian, inertia, linearised.free.cpu().numpy()
 
     # Inputs
 
@@ -350,13 +351,13 @@ class Robot:
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
 
     def _new(self, body: State, given: Mapping[str, torch.Tensor] | None = None) -> RobotState:
-        """A state before which constant inputs (B, C) have acted for long; none, if left out."""
+        """State after constant inputs (B, C), zero if omitted, have acted for a long time."""
         memory: dict[str, torch.Tensor] = {}
         for name, response in self._responses.items():
             value = (given or {}).get(name)
-            nothing = body.q.new_zeros(body.batch, len(self.inputs[name].parts))
-            still = response.still(nothing if value is None else value)
-            memory |= {f"{name}.{key}": each for key, each in still.items()}
+            zeros = body.q.new_zeros(body.batch, len(self.inputs[name].parts))
+            still = response.still(zeros if value is None else value)
+            memory |= {f"{name}.{key}": values for key, values in still.items()}
         base = (given or {}).get(BASE)
         moved = self.description.told_of_base is not None or base is not None
         at = body.q.new_zeros(body.batch, len(self.inputs[BASE].parts)) if base is None else base
@@ -364,27 +365,27 @@ class Robot:
 
     @cached_property
     def _payload_share(self) -> torch.Tensor:
-        """(1, N) the share of a payload that hangs on each vertex."""
+        """Share (1, N) of a payload that hangs on each vertex."""
         share = payload_inputs(self.simulator.body, self.description.payload_at, np.ones(1))["attached_mass"]
         return self.simulator.tensor(share)
 
     def _acting(
         self, state: RobotState, given: Mapping[str, torch.Tensor]
     ) -> tuple[Inputs, torch.Tensor | None, dict[str, torch.Tensor], torch.Tensor | None]:
-        """What acts during a step, what a network is told, the next memory, and (3, B, 6) the base from a step ago."""
+        """Simulator inputs, conditions of the network, next memory, and the base (3, B, 6) from a step ago on."""
         fields: dict[str, torch.Tensor | None] = {FORCE: given.get(FORCE)}
-        told, memory = list[torch.Tensor](), dict[str, torch.Tensor]()
+        conditions, memory = list[torch.Tensor](), dict[str, torch.Tensor]()
         payload = given.get(PAYLOAD.name)
         if self.description.payload_at is not None and self.description.sees_payload:
-            told.append(state.q.new_zeros(state.batch, 1) if payload is None else payload)
+            conditions.append(state.q.new_zeros(state.batch, 1) if payload is None else payload)
         for name, response in self._responses.items():
             value, own = given.get(name), f"{name}."
-            nothing = state.q.new_zeros(state.batch, len(self.inputs[name].parts))
-            remembered = {key.removeprefix(own): each for key, each in state.memory.items() if key.startswith(own)}
-            acting, means, later = response(remembered, (nothing if value is None else value)[None])
+            zeros = state.q.new_zeros(state.batch, len(self.inputs[name].parts))
+            remembered = {key.removeprefix(own): x for key, x in state.memory.items() if key.startswith(own)}
+            acting, means, later = response(remembered, (zeros if value is None else value)[None])
             fields[name] = acting[0]
-            told += [told_of(acting[0], means[:, 0])] if name in self.description.seen else []
-            memory |= {f"{own}{key}": each for key, each in later.items()}
+            conditions += [told_of(acting[0], means[:, 0])] if name in self.description.seen else []
+            memory |= {f"{own}{key}": values for key, values in later.items()}
         if payload is not None:
             fields |= self._hung(payload)
         base = state.base
@@ -395,11 +396,11 @@ class Robot:
             if self.description.told_of_base is not None:
                 gravity = self.simulator.tensor(self.simulator.gravity)
                 moved = base_movement(base, self.time_step, gravity)[1]
-                told.append(moved[:, torch.tensor(self.description.told_of_base, device=moved.device)])
-        return Inputs(**fields), torch.cat(told, -1) if told else None, memory, base
+                conditions.append(moved[:, torch.tensor(self.description.told_of_base, device=moved.device)])
+        return Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base
 
     def _hung(self, payload: torch.Tensor) -> dict[str, torch.Tensor]:
-        """What a payload (B, 1) [kg] is for the simulator."""
+        """Inputs of the simulator for a payload (B, 1) [kg]."""
         factor = self.parameters.get(MASS_FACTOR)
         mass = payload if factor is None else payload * factor[:, None]
         if any(isinstance(energy, Strings) for energy in self.simulator.body.energies):
@@ -407,15 +408,13 @@ class Robot:
         return {"attached_mass": mass * self._payload_share}
 
     def _fixed(self, pose: torch.Tensor) -> torch.Tensor:
-        """(B, D, 3) where poses (B, 6) of the base have the fixed vertices [m]."""
+        """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""
         rest = self.simulator.rest_positions[self.simulator.fixed]
         return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]
 
-    def _frame(self, base: torch.Tensor | None) -> BaseFrame | None:
-        return None if base is None else BaseFrame(base, self.time_step, first=1)
-
-    def _predictor(self, told: torch.Tensor | None, base: BaseFrame | None) -> LearnedPredictor:
+    def _predictor(self, conditions: torch.Tensor | None, base: torch.Tensor | None) -> LearnedPredictor:
         learned = self._learned
         assert learned is not None
-        given = None if learned.network.actuation is None else told
-        return LearnedPredictor(learned.network, given, learned.range_, self.frames, base)
+        given = None if learned.network.actuation is None else conditions
+        frame = None if base is None else BaseFrame(base, self.time_step, first=1)
+        return LearnedPredictor(learned.network, given, learned.range_, self.frames, frame)

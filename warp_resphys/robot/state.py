@@ -1,4 +1,4 @@
-"""States of a robot: they go into a step and come out of it, and can be chosen and joined by environment."""
+"""States of a robot, which can be selected and joined by environment."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,14 +11,14 @@ from ..stepping.state import State
 
 @dataclass(frozen=True)
 class RobotState:
-    """The state of B environments of a robot: all that their next step depends on.
+    """The state of B environments of a robot: everything that their next step depends on.
 
     Attributes:
         body: positions (B, N, 3) [m] and velocities [m/s] of the vertices, and the memory of the material.
         memory: of the inputs, such as ``pressure.queue``, see `InputResponse`.
         hidden: (B, H) of a recurrent network; None for others, and at the start.
-        base: (2, B, 6) displacement of the base one step ago and now [m, rad]; None where it never moved.
-        left: (B,) bool, whether the learned force was ever evaluated outside the range of its training.
+        base: (2, B, 6) displacement of the base one step ago and now [m, rad]; None if it never moved.
+        left: (B,) bool, whether the learned force was ever evaluated outside its training range.
         lost: (B,) bool, whether the simulation diverged; the body stands at rest then.
     """
 
@@ -46,11 +46,11 @@ class RobotState:
 
     @property
     def batch(self) -> int:
-        """B."""
+        """Number B of environments."""
         return self.body.batch
 
-    def each(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "RobotState":
-        """The state with every tensor changed by a function of it and of the number of its axis of environments."""
+    def map(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "RobotState":
+        """Applies a function of a tensor and the number of its environment axis to every tensor."""
         memory = {name: change(value, value.ndim - 2) for name, value in self.memory.items()}
         body = self.body.map(lambda value: change(value, 0))
         hidden = None if self.hidden is None else change(self.hidden, 0)
@@ -58,35 +58,35 @@ class RobotState:
         return RobotState(body, memory, hidden, base, change(self.left, 0), change(self.lost, 0))
 
     def detach(self) -> "RobotState":
-        """The same, cut off from the autograd graph."""
-        return self.each(lambda value, _: value.detach())
+        """Returns the state without its autograd graph."""
+        return self.map(lambda value, _: value.detach())
 
     def select(self, environments: Sequence[int]) -> "RobotState":
-        """The state of some environments, by number."""
-        return self.each(
+        """Returns the state of some environments, by number."""
+        return self.map(
             lambda value, axis: value.index_select(axis, torch.as_tensor(environments, device=value.device))
         )
 
     def repeat(self, times: int) -> "RobotState":
-        """All environments, several times over."""
-        return self.each(lambda value, axis: torch.cat([value] * times, axis))
+        """Repeats all environments several times."""
+        return self.map(lambda value, axis: torch.cat([value] * times, axis))
 
     def where(self, chosen: torch.Tensor, other: "RobotState") -> "RobotState":
-        """These environments where chosen (B,) bool, those of another state of the same robot elsewhere."""
+        """Joins two states of a robot: this one where chosen (B,) bool, the other one elsewhere."""
         if bool(chosen.all()):
             return self
         theirs = list[torch.Tensor]()
-        other._like(self).each(lambda value, _: theirs.append(value) or value)  # type: ignore[func-returns-value]
+        other._like(self).map(lambda value, _: theirs.append(value) or value)  # type: ignore[func-returns-value]
         remaining = iter(theirs)
 
         def pick(value: torch.Tensor, axis: int) -> torch.Tensor:
             shape = [len(chosen) if at == axis else 1 for at in range(value.ndim)]
             return torch.where(chosen.view(shape), value, next(remaining))
 
-        return self._like(other).each(pick)
+        return self._like(other).map(pick)
 
     def _like(self, other: "RobotState") -> "RobotState":
-        """With what the other state has and this one does not, as it is before anything has happened."""
+        """Adds the tensors that only the other state has, with their initial values."""
         own, more = self.body.tensors(), other.body.tensors()
         rest = {"previous_q": self.q, "previous_v": self.v}
         own |= {name: rest.get(name, torch.zeros_like(x)) for name, x in more.items() if name not in own}

@@ -100,7 +100,7 @@ def _policies(
 ) -> tuple[dict[str, _Policy], dict[str, list[float]]]:
     """Scripted and trained policies by name, and actions a second of the training by model."""
     from ..environments.making import make_vector
-    from ..environments.policies import ScriptedPolicy, acting, learn, learned_before
+    from ..environments.policies import ScriptedPolicy, acting, learn, load_model
 
     task, models = settings.skill, settings.models
     origin = {"run": finished_record(run, "evaluate")["fingerprint"], "last": models[-1]}
@@ -127,7 +127,7 @@ def _policies(
                 write_json(about, record)
             speeds[model].append(record["actions_s"])
             name = f"PPO, {model}"
-            policies[f"{name}, seed {seed}"] = _Policy(name, acting(learned_before(saved)), asked)
+            policies[f"{name}, seed {seed}"] = _Policy(name, acting(load_model(saved)), asked)
     return policies, speeds
 
 

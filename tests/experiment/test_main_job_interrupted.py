@@ -68,7 +68,7 @@ class TestInterruption:
             code, err = run(*arguments, IN_RUN)
             assert code == 130
             assert f"interrupted in stage '{stage}'" in err
-            assert "the same command goes on from there" in err
+            assert "the same command resumes there" in err
             assert "Traceback" not in err
             assert not Path("run/metrics.json").exists()
             assert not list(Path("run").rglob("*.partial"))

@@ -140,10 +140,10 @@ def test_foreign_files_are_refused(tmp_path):
     for name, content in {"text.npz": b"not an archive", "empty.npz": b"", "truncated.npz": good[:-200]}.items():
         (tmp_path / name).write_bytes(content)
         ended = verify(tmp_path / name)
-        assert (ended.code, f"{name} is no NumPy archive" in ended.err) == (2, True)
+        assert (ended.code, f"{name} is not a NumPy file" in ended.err) == (2, True)
     assert "does not exist" in verify(tmp_path / "missing.npz").err
     objects = verify(write(tmp_path, gravity=np.array([0.0, "x", None], dtype=object)))  # would need a pickle
-    assert "is no NumPy archive of plain arrays" in objects.err
+    assert "is not a NumPy file of plain arrays" in objects.err
     np.save(tmp_path / "array.npy", np.ones(3))
     assert "is a single array" in verify(tmp_path / "array.npy").err
 

@@ -1,4 +1,1 @@
-"""Files, stages and workers: safe files, resumable work, progress, work for several processes or a cluster.
-
-From outside: `errors`, `files`, `resumable.ResumableHDF5`, `stages.run_stages`, `progress.Progress`.
-"""
+"""Files, stages and workers: safe files, resumable work, progress, and worker processes here or on a cluster."""

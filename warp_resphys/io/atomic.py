@@ -1,7 +1,7 @@
-"""Files that appear whole or not at all, and show when they were damaged later.
+"""Atomic writes, and checksums that reveal later damage.
 
-A file is written under another name, brought to the disk and then renamed. `write_sealed` puts a checksum of the whole
-file into the place that its head keeps for it, which `is_as_written` compares.
+A file is written under a temporary name, synchronised to the disk and then renamed. `write_sealed` stores a checksum of
+the whole file in its head, and `is_as_written` verifies it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from pathlib import Path
 from .errors import DataFileError
 
 _SEAL = b"warp_resphys CRC-32 "
-SEAL = (_SEAL + b"0" * 8).decode()  # what the head of a file to be sealed holds
+SEAL = (_SEAL + b"0" * 8).decode()  # placeholder for the checksum in the head of a file
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Gives a temporary path; what is written there takes the place of `path` when the block ends without an error.
+    """Yields a temporary path, which is renamed to `path` when the block ends without an error.
 
     Raises:
-        DataFileError: the disk is full, or the place cannot be written to.
+        DataFileError: the disk is full, or the folder is not writable.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -45,7 +45,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         places = (str(partial), *(str(folder) for folder in path.parents))
         if isinstance(error, OSError) and str(error.filename) in places:
             raise DataFileError(
-                f"cannot write {path} ({error.strerror}): make the place writable or choose another one"
+                f"cannot write {path} ({error.strerror}): make its folder writable or choose another path"
             ) from error
         raise
 
@@ -60,7 +60,7 @@ def _sync(path: Path) -> None:
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error says, by number or text, that a disk, a quota or a file-size limit is exhausted."""
+    """Whether an error means, by number or text, that a disk, a quota or a file-size limit is exhausted."""
     message = str(error).lower()
     return getattr(error, "errno", None) in _DISK_FULL or any(
         os.strerror(code).lower() in message for code in _DISK_FULL
@@ -68,7 +68,7 @@ def is_disk_full(error: BaseException) -> bool:
 
 
 def disk_full_error(path: str | Path) -> DataFileError:
-    """The error to raise when there was no space for a file."""
+    """Returns the error to raise when there is no space for a file."""
     return DataFileError(f"disk is full while writing {path}: free some space and run the same command again")
 
 
@@ -79,7 +79,7 @@ def digest(path: str | Path) -> str:
 
 
 def write_sealed(path: Path, head: bytes, content: bytes = b"") -> None:
-    """Writes a file whose head contains `SEAL`, which receives the checksum of head and content."""
+    """Writes a file and replaces `SEAL` in its head by the checksum of head and content."""
     before, _, after = head.partition(SEAL.encode())
     with path.open("wb") as file:
         file.write(before + _SEAL + b"%08x" % zlib.crc32(content, zlib.crc32(head)) + after)
@@ -87,11 +87,7 @@ def write_sealed(path: Path, head: bytes, content: bytes = b"") -> None:
 
 
 def is_as_written(path: str | Path, head_bytes: int) -> bool:
-    """Whether a file of `write_sealed` still has the content of its checksum; true for files without one.
-
-    Args:
-        path: of the file.
-        head_bytes: length of the head.
+    """Whether a file matches the checksum in its first bytes; true for files without a checksum.
 
     Raises:
         OSError: the file cannot be read.
@@ -107,9 +103,9 @@ def is_as_written(path: str | Path, head_bytes: int) -> bool:
 
 
 def read_error(path: str | Path, error: OSError) -> DataFileError:
-    """The error to raise for one of the operating system when a file was read."""
+    """Returns the error to raise when the operating system failed to read a file."""
     if isinstance(error, FileNotFoundError):
         return DataFileError(f"{path} does not exist: check the path, or run the stage that writes it")
     if isinstance(error, (PermissionError, IsADirectoryError)):
         return DataFileError(f"cannot read {path} ({error.strerror}): check the path and its permissions")
-    return DataFileError(f"cannot read {path} ({error}): make or fetch it again")
+    return DataFileError(f"cannot read {path} ({error}): write or download it again")

@@ -1,8 +1,8 @@
-"""Files of other programs, decoded by the libraries for them in a process of little memory and time.
+"""Decodes files of other programs in a subprocess with limits on memory and time.
 
-A damaged file makes ezc3d and HDF5, which are C++ and C, crash, loop or claim gigabytes, and meshio loop over what was
-cut off. So this file is also a program: it decodes one file, within limits that its caller sets, and hands
-plain arrays on. It imports nothing of the package, which would take longer than most files do.
+On a damaged file, ezc3d and HDF5 (C++ and C) can crash, loop or allocate gigabytes, and meshio can loop. This module
+is therefore also a program, which decodes one file and returns plain arrays. It imports nothing from the package,
+because that would take longer than decoding most files.
 """
 
 import contextlib
@@ -23,35 +23,35 @@ if TYPE_CHECKING:
 
 Arrays = dict[str, NDArray[Any]]
 
-MEMORY = (2 << 30, 64)  # bytes of address space, and how many more for each byte of the file
-SECONDS = (10.0, 2e-6)  # of a processor, and how many more for each byte of the file
+MEMORY = (2 << 30, 64)  # limit of the address space: bytes, plus bytes per byte of the file
+SECONDS = (10.0, 2e-6)  # limit of processor time: seconds, plus seconds per byte of the file
 _OUT_OF_TIME = -getattr(signal, "SIGXCPU", 0)
-_WAITING = 6  # times as long may pass on a busy machine
+_WAITING = 6  # limit of wall-clock time over that of processor time, for a busy machine
 _SURFACE_CELLS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # number of corners
-_PHYSICAL = "gmsh:physical"  # meshio's name of gmsh's numbers of groups
+_PHYSICAL = "gmsh:physical"  # meshio's key of gmsh's group numbers
 
 
 class DecodingError(Exception):
-    """A file that cannot be decoded; the message is the reason, for a sentence that names the file."""
+    """A file that cannot be decoded; the message is the reason, without the file's name."""
 
 
 def decode(library: str, path: Path, *names: str) -> Arrays:
-    """The arrays of `c3d_arrays`, `mesh_arrays` or `hdf5_arrays`, made in a process of its own.
+    """Runs `c3d_arrays`, `mesh_arrays` or `hdf5_arrays` in a subprocess, and returns the arrays.
 
     Args:
         library: "ezc3d", "meshio" or "h5py".
         path: An existing file.
-        names: Of `hdf5_arrays`.
+        names: Further arguments of `hdf5_arrays`.
 
     Raises:
-        DecodingError: The library refuses the file, crashes, or takes more memory or time than files of that size do.
+        DecodingError: The library refuses the file, crashes, or exceeds the limits for a file of this size.
     """
     size = path.stat().st_size
     memory, seconds = MEMORY[0] + MEMORY[1] * size, SECONDS[0] + SECONDS[1] * size
     limits = str(memory), str(np.ceil(seconds).astype(int))
     command = [sys.executable, "-P", __file__, *limits, library, str(path), *names]
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}  # each claims address space
-    endless = f"decoding it does not end within {seconds:.0f} s"
+    endless = f"decoding takes more than {seconds:.0f} s"
     try:
         done = subprocess.run(
             command, capture_output=True, timeout=_WAITING * seconds, check=False, env={**os.environ, **one_thread}
@@ -67,7 +67,7 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
 
 
 def c3d_arrays(path: str) -> Arrays:
-    """Of a C3D file: points (4, M, T), labels, units and rate."""
+    """Reads points (4, M, T), labels, units and rate of a C3D file."""
     import ezc3d
 
     file = ezc3d.c3d(path)
@@ -81,42 +81,42 @@ def c3d_arrays(path: str) -> Arrays:
 
 
 def hdf5_arrays(path: str, *names: str) -> Arrays:
-    """Of an HDF5 file: what its root has of these names, as datasets or attributes, and the units of datasets.
+    """Reads datasets, with units, and attributes of an HDF5 file's root by name; missing ones are omitted.
 
-    The units of the dataset "positions" are called "positions.units". Other errors are h5py's, of any kind.
+    The units of the dataset "positions" are returned as "positions.units". h5py's own errors are not caught.
 
     Raises:
-        DecodingError: The file refers to data elsewhere, or what was asked for is neither numbers nor text.
+        DecodingError: The file refers to data elsewhere, or a value is neither numbers nor text.
     """
     import h5py
 
-    found = {}
+    arrays = {}
     with h5py.File(path, "r") as file:
         refuse_data_elsewhere(file)
         for name in names:
             item = file.get(name)
             if isinstance(item, h5py.Dataset):
-                found[name] = _plain(item[()], name)
+                arrays[name] = _plain(item[()], name)
                 if "units" in item.attrs:
-                    found[f"{name}.units"] = _plain(item.attrs["units"], f"{name}.units")
+                    arrays[f"{name}.units"] = _plain(item.attrs["units"], f"{name}.units")
             elif name in file.attrs:
-                found[name] = _plain(file.attrs[name], name)
-    return found
+                arrays[name] = _plain(file.attrs[name], name)
+    return arrays
 
 
 def _plain(value: Any, name: str) -> NDArray[Any]:
-    """Numbers as they are, text as such."""
+    """Returns numbers unchanged, and text as an array of `numpy.str_`."""
     array = np.asarray(value)
     if array.dtype == object:
         words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in array.flat]
         return np.array(words, dtype=np.str_).reshape(array.shape)
     if array.dtype.hasobject:
-        raise DecodingError(f"'{name}' holds neither numbers nor text")
+        raise DecodingError(f"'{name}' contains neither numbers nor text")
     return array
 
 
 def refuse_data_elsewhere(file: "h5py.File") -> None:
-    """Visits every link and dataset of an HDF5 file; raises DecodingError for those that lead out of it."""
+    """Raises DecodingError if a link or dataset of an HDF5 file refers to another file."""
     import h5py
 
     groups: list[h5py.Group] = [file]
@@ -136,14 +136,15 @@ def refuse_data_elsewhere(file: "h5py.File") -> None:
 
 
 def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
-    """Of a file that meshio reads: `points` (N, 3), the types of its cells, volume cells, named surfaces and regions.
+    """Reads points, volume cells, named surfaces and named regions with meshio, whose own errors are not caught.
 
-    `types` names the types; `solid/TYPE` are the cells (M, k) of those that fill a volume, `surface/NAME` the corners
-    (F, 3 | 4) of the faces of each named surface, `region/NAME` the numbers (m,) of the volume cells of each named
-    region. Other errors than this one are meshio's, of any kind.
+    Returns:
+        `points` (N, 3); `types`, names of all cell types; `solid/TYPE` (M, k), the volume cells of a type;
+        `surface/NAME` (F, 3 | 4), the corners of the faces of a named surface; and `region/NAME` (m,), the numbers of
+        the volume cells of a named region.
 
     Raises:
-        DecodingError: meshio knows no way to read the file.
+        DecodingError: meshio cannot read the format.
     """
     import meshio
 
@@ -167,7 +168,7 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
 
 
 def _named_surfaces(content: Any) -> dict[str, list[NDArray[np.int64]]]:
-    """Corners (F, 3 | 4) of the faces of each named surface, block by block."""
+    """Corners (F, 3 | 4) of the faces of named surfaces, by block."""
     members: dict[str, list[NDArray[np.int64]]] = {}
     for name, number, cells in _groups(content, 2):
         block = content.cells[number]
@@ -178,7 +179,7 @@ def _named_surfaces(content: Any) -> dict[str, list[NDArray[np.int64]]]:
 
 
 def _named_regions(content: Any) -> dict[str, list[NDArray[np.int64]]]:
-    """Numbers (M,) of the cells of each named region among all cells that fill a volume, block by block."""
+    """Numbers (M,) of the cells of named regions among all volume cells, by block."""
     sizes = [len(block) if block.dim == 3 else 0 for block in content.cells]
     first = np.cumsum([0, *sizes])
     members: dict[str, list[NDArray[np.int64]]] = {}
@@ -188,7 +189,7 @@ def _named_regions(content: Any) -> dict[str, list[NDArray[np.int64]]]:
 
 
 def _groups(content: Any, dimension: int) -> Iterator[tuple[str, int, NDArray[np.int64]]]:
-    """Yields the name, the number of the block and the cells there of gmsh's physical groups, or of cell sets."""
+    """Yields the members of gmsh's physical groups, or of cell sets: group name, block number, cells in the block."""
     groups = {tuple(int(n) for n in tag): name for name, tag in content.field_data.items() if len(tag) == 2}
     for number, block in enumerate(content.cells):
         if block.dim != dimension:
@@ -205,7 +206,7 @@ def _groups(content: Any, dimension: int) -> Iterator[tuple[str, int, NDArray[np
 
 
 def _limit(memory: int, seconds: int) -> None:
-    """Bounds this process, where the system can."""
+    """Limits memory and processor time of this process, if the system supports it."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -216,11 +217,11 @@ def _limit(memory: int, seconds: int) -> None:
 
 
 def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> int:
-    """Decodes a file: its arrays to stdout, or one line with the reason to stderr and 1."""
+    """Decodes a file: writes its arrays to stdout and returns 0, or the reason of a failure to stderr and returns 1."""
     _limit(int(memory), int(seconds))
     answer, reason = (os.fdopen(os.dup(stream), "wb") for stream in (1, 2))
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)  # The libraries print.
+    os.dup2(nowhere, 1)  # discards what the libraries print
     os.dup2(nowhere, 2)
     too_much = f"it takes more than {int(memory) >> 20} MiB of memory"
     try:
@@ -230,14 +231,14 @@ def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> in
         answer.close()
         return 0
     except MemoryError:
-        said = too_much
+        message = too_much
     except ModuleNotFoundError as error:
-        said = f"for that, install the Python package {error.name}"
+        message = f"install the Python package {error.name} to read it"
     except DecodingError as error:
-        said = str(error)
+        message = str(error)
     except Exception as error:
-        said = too_much if "bad_alloc" in str(error) else f"{type(error).__name__}: {error}"
-    reason.write((" ".join(said.split())[:200] or "no reason given").encode(errors="replace"))
+        message = too_much if "bad_alloc" in str(error) else f"{type(error).__name__}: {error}"
+    reason.write((" ".join(message.split())[:200] or "no reason given").encode(errors="replace"))
     reason.close()
     return 1
 

@@ -1,4 +1,4 @@
-"""What can go wrong in a way that the user can mend: one sentence each, exit code 2 on the command line."""
+"""Errors that the user can fix: each is one sentence, and the command line exits with code 2."""
 
 import difflib
 from collections.abc import Sequence
@@ -8,10 +8,9 @@ _LONGEST = 1000
 
 
 class ResphysError(Exception):
-    """Base of every error whose message is written for the user: what was wrong, where, and what to do.
+    """Base of all errors whose message is written for the user: what was wrong, where, and what to do.
 
-    Messages quote files and what libraries say of them; what is left of that is one line, not too long, that no
-    terminal takes for commands.
+    Messages may quote files and libraries; they are reduced to one line of limited length without control characters.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -20,22 +19,22 @@ class ResphysError(Exception):
 
 
 class InputError(ResphysError, ValueError):
-    """An argument or a configured value that cannot be simulated."""
+    """An invalid argument or configuration value."""
 
 
 class MeshError(InputError):
-    """A mesh that cannot be read, or that a finite-element method cannot use."""
+    """A mesh that cannot be read or is not valid for finite elements."""
 
 
 class DataFileError(ResphysError):
-    """A data file that is missing, truncated, foreign or cannot be written."""
+    """A data file that is missing, damaged, of another program, or cannot be written."""
 
 
 class ConvergenceError(ResphysError, RuntimeError):
-    """A solve that stopped short of its tolerance.
+    """A solve that did not reach its tolerance.
 
     Attributes:
-        positions: (B, N, 3) [m] the last iterate, on its device.
+        positions: (B, N, 3) last iterate, on its device [m].
         report: iterations, residual and convergence of each environment.
     """
 
@@ -46,17 +45,17 @@ class ConvergenceError(ResphysError, RuntimeError):
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in quotation marks, separated by commas, for a message."""
+    """Returns names in quotation marks, separated by commas, for a message."""
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
 def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
-    """The end of a sentence on an unknown name that offers the nearest known ones; empty where none is near.
+    """Returns ", did you mean ...?" with the names most similar to an unknown one; empty if none is similar.
 
     Args:
         wanted: the unknown name.
-        known: names that exist.
-        preferred: those that are offered whatever they look like.
+        known: existing names.
+        preferred: existing names that are offered in any case.
     """
     offered = [name for name in dict.fromkeys(preferred) if name != wanted][:3]
     matches = offered or difflib.get_close_matches(wanted, [name for name in known if name != wanted], n=3, cutoff=0.6)

@@ -1,8 +1,8 @@
-"""Independent tasks in worker processes of this machine, or of a Ray or Dask cluster, through joblib.
+"""Runs independent tasks in worker processes of this machine, or of a Ray or Dask cluster, with joblib.
 
-A worker works on one thread. Progress goes through one small file per task in a folder that all workers see, so that
-the backends need to carry nothing but tasks and results. Where a worker is lost, all tasks are handed out again: a
-task is to go on from what it has written, and to return at once where it was finished.
+Workers are single-threaded. Progress is reported through a small file for each task in a shared folder, so that the
+backends transfer only tasks and results. When a worker is lost, all tasks are submitted again: a task must resume from
+its own files, and return at once if it was finished.
 """
 
 import json
@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -32,25 +33,25 @@ from .progress import be_quiet
 log = logging.getLogger(__name__)
 
 Advance = Callable[..., None]
-_Status = tuple[int, dict[str, object]]  # units that a task has counted, and the named values that it gave last
+_Status = tuple[int, dict[str, object]]  # units that a task has counted, and its latest named values
 
 _ATTEMPTS = 3
-_IDLE_SECONDS = 60.0  # after which a worker of this machine ends
-_PROGRESS_SECONDS = 0.1  # between two writes, and two reads, of the progress
-_PARENT_SECONDS = 0.02  # between a worker's looks at whether the process that started it is still there
-_ANSWER_SECONDS = 10.0  # in which a cluster has to answer
-_LOST = {  # names of the errors that say that a worker is gone
+_IDLE_SECONDS = 60.0  # after which an idle local worker ends
+_PROGRESS_SECONDS = 0.1  # interval of writing and of reading the progress
+_PARENT_SECONDS = 0.02  # interval at which a worker checks that its parent process lives
+_ANSWER_SECONDS = 10.0  # timeout of the connection to a cluster
+_LOST = {  # names of the errors that mean that a worker is lost
     *("BrokenProcessPool", "KilledWorker", "CommClosedError", "RayActorError"),
     *("WorkerCrashedError", "NodeDiedError", "OwnerDiedError", "ObjectLostError"),
 }
 
 
 class WorkerError(ResphysError, RuntimeError):
-    """A task that a worker process could not do."""
+    """A task that failed in a worker process for a reason that the user can fix."""
 
 
 class WorkerFaultError(RuntimeError):
-    """A fault of the program in a worker process, with its traceback."""
+    """An unexpected error in a worker process, with its traceback."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Workers:
     Attributes:
         count: number of tasks at once.
         backend: ``local`` processes, or those of a ``ray`` or ``dask`` cluster.
-        address: of the cluster; where left out, one is started on this machine for as long as the work takes.
+        address: of the cluster; if omitted, a temporary one is started on this machine.
     """
 
     count: int = 1
@@ -73,7 +74,7 @@ class Workers:
         return self.count == 1 and self.backend == "local"
 
     def at_most(self, count: int) -> "Workers":
-        """The same workers, but at most so many, and at least one."""
+        """Returns the same workers, limited to a number of tasks at once."""
         return replace(self, count=max(min(self.count, count), 1))
 
 
@@ -91,32 +92,32 @@ def fan_out(
     """Calls a function for every task in worker processes; returns the results in the order of the tasks.
 
     Args:
-        function: of a task and of `advance`; defined at the top of a module, as it is sent to the workers.
+        function: of a task and of `advance`; a module-level function, as it is pickled for the workers.
         tasks: started in this order.
-        workers: in other processes even if there is only one.
+        workers: always other processes, even a single one.
         advance: called in a thread of this process with the number of units that workers have counted since the last
-            call (negative after a worker was lost), and the named values that the function gave last.
-        folder: that every worker can write to.
+            call (negative after a worker was lost), and the latest named values of a task.
+        folder: writable by all workers.
         memory: counts the memory of the workers.
 
     Raises:
-        InputError: a backend that is not installed, or a cluster that does not answer.
-        WorkerError: a task raised a ResphysError, whose sentence it has, or workers were lost again and again.
-        WorkerFaultError: a task failed in another way.
+        InputError: the backend is not installed, or the cluster does not answer.
+        WorkerError: a task raised a ResphysError, whose message is kept, or workers were lost repeatedly.
+        WorkerFaultError: a task raised another error.
     """
     if not tasks:
         return []
     folder.mkdir(parents=True, exist_ok=True)
     for attempt in range(1, _ATTEMPTS + 1):
-        known: dict[str, _Status] = {}
+        reported: dict[str, _Status] = {}
         try:
             with (
                 TemporaryDirectory(prefix=".progress_", dir=folder, ignore_cleanup_errors=True) as place,
                 _BACKENDS[workers.backend](workers),
-                _followed(Path(place), known, advance),
+                _followed(Path(place), reported, advance),
             ):
                 calls = [delayed(_work)(function, task, Path(place, str(at))) for at, task in enumerate(tasks)]
-                # One job alone would be done in this process.
+                # With n_jobs=1, joblib would work in this process.
                 outcomes = Parallel(n_jobs=max(workers.count, 2), pre_dispatch=workers.count, batch_size=1)(calls)
             break
         except Exception as error:
@@ -124,12 +125,12 @@ def fan_out(
                 raise
             if attempt == _ATTEMPTS:
                 raise WorkerError(
-                    f"worker processes were ended from outside {attempt} times in a row, perhaps for want of memory "
+                    f"worker processes were killed {attempt} times in a row, perhaps because memory ran out "
                     f"({type(error).__name__}): run the same command again, with fewer processes."
                 ) from error
             workers = workers.at_most(workers.count // 2) if workers.backend == "local" else workers
-            log.warning("a worker process was lost: its work is done again, %d at once", workers.count)
-            advance(-sum(total for total, _ in known.values()))
+            log.warning("a worker process was lost: its work is repeated, %d tasks at once", workers.count)
+            advance(-sum(total for total, _ in reported.values()))
     if memory is not None:
         peaks: dict[tuple[str, int], float] = {}
         for _, worker, peak in outcomes:
@@ -139,15 +140,15 @@ def fan_out(
 
 
 def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
-    """Does a task in a worker process; returns the result, machine and process, and the peak of its memory [GiB]."""
+    """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
-    wp.config.log_level = wp.LOG_WARNING  # Every worker would greet otherwise.
+    wp.config.log_level = wp.LOG_WARNING  # without Warp's greeting in every worker
     torch.set_num_threads(1)
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
     if not progress.parent.is_dir():
         raise WorkerError(
-            f"the worker on {worker[0]} does not see {progress.parent.parent}: choose a run folder that all workers "
+            f"the worker on {worker[0]} cannot access {progress.parent.parent}: choose a run folder that all workers "
             "share."
         )
     try:
@@ -160,9 +161,9 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
 
 
 class _ProgressFile:
-    """Writes how far a task is: what it has counted, and the named values that it gave last.
+    """Writes the progress of a task: the units that it has counted, and its latest named values.
 
-    Where the folder is gone, the work was given up or handed out again: the write fails, which ends the task.
+    If the folder is gone, the work was cancelled or submitted again: the write fails, which ends the task.
     """
 
     def __init__(self, path: Path) -> None:
@@ -188,17 +189,17 @@ class _ProgressFile:
 
 
 @contextmanager
-def _followed(folder: Path, known: dict[str, _Status], advance: Advance) -> Iterator[None]:
-    """Hands on what the progress files of tasks say; `known` has what was handed on, by name of the file."""
+def _followed(folder: Path, reported: dict[str, _Status], advance: Advance) -> Iterator[None]:
+    """Reports the progress files of tasks to `advance`; `reported` has the last status by file name."""
     ended = threading.Event()
 
     def look() -> None:
         for path in folder.iterdir():
-            with suppress(ValueError):  # A file that is just being written.
+            with suppress(ValueError):  # a file that is being written
                 total, shown = json.loads(path.read_text(encoding="utf-8"))
-                before = known.get(path.name, (0, {}))
+                before = reported.get(path.name, (0, {}))
                 if (total, shown) != before:
-                    known[path.name] = total, shown
+                    reported[path.name] = total, shown
                     advance(total - before[0], **shown)
 
     def follow() -> None:
@@ -218,8 +219,10 @@ def _followed(folder: Path, known: dict[str, _Status], advance: Advance) -> Iter
 @contextmanager
 def _local(workers: Workers) -> Iterator[None]:
     ends = {"initializer": _end_with, "initargs": (os.getpid(),)}
-    with parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
-        with _interrupts_blocked():  # Workers that are started here leave Ctrl-C to this process.
+    with warnings.catch_warnings(), parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
+        # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
+        with _interrupts_blocked():  # Workers started here leave Ctrl-C to this process.
             Parallel(n_jobs=max(workers.count, 2))(delayed(int)() for _ in range(2))
         yield
 
@@ -234,7 +237,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _end_with(parent: int) -> None:
-    """Ends this process once the one that started it has ended, whatever it does or waits for then."""
+    """Ends this process as soon as its parent has ended, whatever it is doing."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -246,7 +249,7 @@ def _end_with(parent: int) -> None:
 
 @contextmanager
 def _dask(workers: Workers) -> Iterator[None]:
-    """Dask itself hands out lost work again, up to three times."""
+    """Connects to a Dask cluster, which resubmits lost work itself, up to three times."""
     try:
         from distributed import Client
     except ModuleNotFoundError:
@@ -275,7 +278,7 @@ def _ray(workers: Workers) -> Iterator[None]:
         local: dict[str, Any] = {"num_cpus": workers.count, "include_dashboard": False}
         where = local if workers.address is None else {"address": workers.address}
         try:
-            if workers.address not in (None, "auto"):  # Ray would try for minutes.
+            if workers.address not in (None, "auto"):  # Ray itself would wait for minutes.
                 host, _, port = str(workers.address).removeprefix("ray://").rpartition(":")
                 socket.create_connection((host, int(port)), _ANSWER_SECONDS).close()
             with _interrupts_blocked():
@@ -302,5 +305,5 @@ def _missing(backend: str) -> str:
 def _unreachable(workers: Workers) -> str:
     return (
         f"no {workers.backend} cluster answers at parallel.address={workers.address}: start it, correct the address, "
-        "or leave it out for one on this machine."
+        "or omit it to start a cluster on this machine."
     )

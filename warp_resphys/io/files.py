@@ -1,8 +1,8 @@
-"""Reading and writing JSON, HDF5, NumPy and safetensors files, none of which can run code when it is opened.
+"""Reads and writes JSON, HDF5, NumPy and safetensors files, none of which can run code when it is opened.
 
-All are written by `atomic.atomic_path`. HDF5 files are built in memory first: an HDF5 library that meets a full disk
-cannot close its file any more and crashes the interpreter at exit. A file should therefore fit into memory two or
-three times. Long computations write as they go on: see `resumable`.
+All are written atomically. HDF5 files are built in memory first, because the HDF5 library cannot close a file on a full
+disk and crashes the interpreter at exit; a file should fit into memory two or three times. `resumable` writes the
+results of long computations while they run.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
 CHUNK_STEPS = 64
-USER_BLOCK = 512  # bytes before an HDF5 file's own, which hold its checksum
+USER_BLOCK = 512  # bytes before the content of an HDF5 file, which contain its checksum
 LARGEST_ARRAYS = 4 << 30  # bytes in one file
-# What numpy.load raises for a file that is damaged or made up.
+# Errors of numpy.load for a file that is damaged or malicious.
 _ARRAY_FAULTS = (
     *(EOFError, LookupError, MemoryError, OverflowError, RuntimeError, SyntaxError, TypeError, ValueError),
     *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
@@ -41,7 +41,7 @@ _ARRAY_FAULTS = (
 
 
 def to_plain(data: Any) -> Any:
-    """Turns mappings, sequences, NumPy values, paths and settings into what JSON knows; others raise TypeError."""
+    """Converts mappings, sequences, NumPy values, paths and settings to JSON types; others raise TypeError."""
     if isinstance(data, Mapping):
         return {str(key): to_plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
@@ -52,13 +52,13 @@ def to_plain(data: Any) -> Any:
         return str(data)
     if data is None or isinstance(data, (str, bool, int, float)):
         return data
-    if hasattr(data, "plain"):  # Settings, without importing pydantic for them
+    if hasattr(data, "plain"):  # Settings, without importing pydantic
         return data.plain()
     raise TypeError(f"{type(data).__name__} cannot be written as JSON")
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Writes standard JSON as `write_text` does; a number that is NaN or infinite becomes null, as JSON has none."""
+    """Writes standard JSON atomically; NaN and infinite numbers become null."""
     plain = json.loads(json.dumps(to_plain(data)), parse_constant=lambda _: None)
     write_text(path, json.dumps(plain, indent=2) + "\n")
 
@@ -76,16 +76,16 @@ def read_json(path: str | Path) -> Any:
     except OSError as error:
         raise read_error(path, error) from error
     except ValueError as error:
-        raise DataFileError(f"{path} is not a JSON file ({error}): delete it or write it again") from error
+        raise DataFileError(f"{path} is not a JSON file ({error}): delete or rewrite it") from error
 
 
 @contextlib.contextmanager
 def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | None = None) -> Iterator[h5py.File]:
-    """Gives an HDF5 file to fill in memory; it appears at `path` as by `atomic_path`.
+    """Yields an HDF5 file in memory, which is written to `path` atomically when the block ends.
 
     Args:
-        path: Where the file is to appear; missing folders are made.
-        kind: What the file holds, such as "trajectories"; `read_hdf5` asks for it.
+        path: Path of the file; missing folders are created.
+        kind: Kind of content, such as "trajectories"; `read_hdf5` checks it.
         attributes: Further attributes of the file's root (numbers, strings, small arrays).
     """
     in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
@@ -105,21 +105,20 @@ def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1",
     """Stores an array as a dataset, in chunks of 64 steps along `time_axis`.
 
     Args:
-        group: Where to store it.
-        name: The dataset's name; a path makes the groups in between.
+        group: Group of the dataset.
+        name: Name of the dataset; a path creates the groups in between.
         array: Numbers of any shape.
         units: SI units of the values, stored as an attribute; "1" for numbers without a unit.
-        time_axis: The axis that counts steps; see `chunk_shape`.
+        time_axis: The axis of the steps.
     """
     values = np.asarray(array)
-    chunks = chunk_shape(values.shape, time_axis)
-    dataset = group.create_dataset(name, data=values, chunks=chunks)
+    dataset = group.create_dataset(name, data=values, chunks=chunk_shape(values.shape, time_axis))
     dataset.attrs["units"] = units
     return dataset
 
 
 def chunk_shape(shape: tuple[int, ...], time_axis: int = 0) -> tuple[int, ...] | None:
-    """One index of the axes before the one of time, all of those after it; no chunks for scalars and empty arrays."""
+    """Returns chunks of one index before the time axis, up to 64 steps, and all indices after it; None without data."""
     if not shape or 0 in shape:
         return None
     return (*(1,) * time_axis, min(CHUNK_STEPS, shape[time_axis]), *shape[time_axis + 1 :])
@@ -127,16 +126,16 @@ def chunk_shape(shape: tuple[int, ...], time_axis: int = 0) -> tuple[int, ...] |
 
 @contextlib.contextmanager
 def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
-    """Opens an HDF5 file of any origin for reading; it may not point to data outside of itself.
+    """Opens an HDF5 file of any origin for reading.
 
     Raises:
-        DataFileError: the file is missing, unreadable, truncated, damaged or no HDF5 file, or it refers to
-            other files (external links, external storage, virtual datasets).
+        DataFileError: the file is missing, unreadable, damaged or not HDF5, or it refers to other files (external
+            links, external storage, virtual datasets).
     """
     path = Path(path)
     with contextlib.ExitStack() as stack:
         try:
-            if not is_as_written(path, USER_BLOCK):  # Reading damaged texts might not end.
+            if not is_as_written(path, USER_BLOCK):  # HDF5 can loop on damaged text.
                 raise ValueError("it does not match its checksum")
             file = stack.enter_context(h5py.File(path, "r"))
             refuse_data_elsewhere(file)
@@ -151,29 +150,28 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
 
 
 def hdf5_error(path: Path, error: Exception) -> DataFileError:
-    """The error to raise for one of h5py, or of decoding with it, in this file."""
+    """Returns the error to raise for an error of h5py, or of decoding with it, in a file."""
     message = str(error)
     if "data elsewhere" in message:
-        return DataFileError(f"{path}: {message}: use a file that holds its own data")
+        return DataFileError(f"{path}: {message}: use a file that contains its own data")
     if "signature not found" in message:
         return DataFileError(f"{path} is not an HDF5 file: check the path")
     if "truncated" in message:
-        return DataFileError(f"{path} is truncated: delete it and make or fetch it again")
+        return DataFileError(f"{path} is truncated: delete it, then write or download it again")
     if "unable to lock" in message:
         return DataFileError(f"{path} is being written by another process: wait until that has ended")
     if isinstance(error, OSError) and error.filename is not None:
         return read_error(path, error)
     detail = message.splitlines()[0] if message else type(error).__name__
-    return DataFileError(f"{path} is damaged ({detail}): delete it and make or fetch it again")
+    return DataFileError(f"{path} is damaged ({detail}): delete it, then write or download it again")
 
 
 @contextlib.contextmanager
 def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
-    """Opens a file that `atomic_hdf5` wrote.
+    """Opens a file of `atomic_hdf5`.
 
     Raises:
-        DataFileError: as `open_hdf5`; also a file of another program, kind or newer version, or an unfinished
-            one.
+        DataFileError: the file is missing, unreadable or damaged, of another program, kind or version, or unfinished.
     """
     with open_hdf5(path) as file:
         origin, version, kind, complete = (
@@ -183,25 +181,25 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
             raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
         if version != str(FORMAT_VERSION):
             raise DataFileError(
-                f"{path} has format version {version}, this program reads version {FORMAT_VERSION}: make the "
-                f"file again or use the program that wrote it"
+                f"{path} has format version {version}, this program reads version {FORMAT_VERSION}: write it again or "
+                "use the program that wrote it"
             )
         if kind != expected_kind:
-            raise DataFileError(f"{path} holds '{kind}' where '{expected_kind}' is needed: check the path")
+            raise DataFileError(f"{path} contains '{kind}' where '{expected_kind}' is needed: check the path")
         if complete != "True":
             raise DataFileError(f"{path} is unfinished: delete it and run the stage that writes it again")
         yield file
 
 
 def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a .npz file by name, or that of a .npy file by no name; nothing in it is run.
+    """Reads the arrays of a .npz file by name, or the array of a .npy file under the name ""; no pickled objects.
 
     Args:
         path: the file.
-        names: those to read, where there are more; all of them by default.
+        names: the arrays to read; all by default.
 
     Raises:
-        DataFileError: the file is missing, damaged or no such file, holds Python objects, or is too large.
+        DataFileError: the file is missing, damaged or not of NumPy, contains Python objects, or is too large.
     """
     try:
         with open(path, "rb") as file:
@@ -209,14 +207,14 @@ def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[st
             if isinstance(content, np.ndarray):
                 return {"": content}
             if sum(member.file_size for member in content.zip.infolist()) > LARGEST_ARRAYS:
-                raise ValueError(f"its arrays take more than {LARGEST_ARRAYS >> 30} GiB")
+                raise ValueError(f"its arrays are larger than {LARGEST_ARRAYS >> 30} GiB")
             return {name: content[name] for name in content.files if names is None or name in names}
     except OSError as error:
         raise read_error(path, error) from error
     except _ARRAY_FAULTS as error:
-        reason = "it holds Python objects, which can run code" if "allow_pickle" in str(error) else str(error)
+        reason = "it contains Python objects, which can run code" if "allow_pickle" in str(error) else str(error)
         raise DataFileError(
-            f"{path} is no NumPy archive of plain arrays, or a damaged one ({reason}): save or fetch it again"
+            f"{path} is not a NumPy file of plain arrays, or is damaged ({reason}): save or download it again"
         ) from error
 
 
@@ -226,10 +224,10 @@ def read_array(
     """Reads a dataset, or the part of it that `index` selects.
 
     Args:
-        group: Where the dataset is.
-        name: Its name.
-        shape: The shape that the whole dataset must have; None for an axis of any length.
-        index: What to read, as for a NumPy array.
+        group: Group of the dataset.
+        name: Name of the dataset.
+        shape: Required shape of the whole dataset; None for an axis of any length.
+        index: The part to read, as for a NumPy array.
 
     Raises:
         DataFileError: the dataset is missing, damaged or has another shape.
@@ -238,13 +236,13 @@ def read_array(
     try:
         dataset = group.get(name)
         if not isinstance(dataset, h5py.Dataset):
-            raise DataFileError(f"{path} has no dataset '{name}': it is not the file that is needed here")
-        found = dataset.shape
+            raise DataFileError(f"{path} has no dataset '{name}': check the path")
+        given = dataset.shape
         if shape is not None and (
-            len(found) != len(shape) or any(b not in (a, None) for a, b in zip(found, shape, strict=True))
+            len(given) != len(shape) or any(b not in (a, None) for a, b in zip(given, shape, strict=True))
         ):
             wanted = " x ".join("any" if length is None else str(length) for length in shape)
-            raise DataFileError(f"'{name}' of {path} has the shape {found} where {wanted} is needed: check the path")
+            raise DataFileError(f"'{name}' of {path} has the shape {given} where {wanted} is needed: check the path")
         return np.asarray(dataset[index])
     except OSError as error:
         raise hdf5_error(Path(path), error) from error
@@ -268,10 +266,10 @@ def write_checkpoint(
 
 
 def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Reads what `write_checkpoint` wrote: the tensors, on the CPU, and the metadata.
+    """Reads the tensors, on the CPU, and the metadata of a file of `write_checkpoint`.
 
     Raises:
-        DataFileError: the file is missing, unreadable, truncated, damaged, of another program, kind or version.
+        DataFileError: the file is missing, unreadable, damaged, or of another program, kind or version.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -284,10 +282,10 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
             header = file.metadata() or {}
             if header.get("format") != FORMAT:
                 raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
-            found = (header.get("kind"), header.get("version"))
-            if found != (expected_kind, str(FORMAT_VERSION)):
+            kind, version = header.get("kind"), header.get("version")
+            if (kind, version) != (expected_kind, str(FORMAT_VERSION)):
                 raise DataFileError(
-                    f"{path} holds '{found[0]}', version {found[1]}, where '{expected_kind}', version "
+                    f"{path} contains '{kind}', version {version}, where '{expected_kind}', version "
                     f"{FORMAT_VERSION}, is needed: check the path"
                 )
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
@@ -296,5 +294,5 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
         raise read_error(path, error) from error
     except (SafetensorError, ValueError, KeyError) as error:
         raise DataFileError(
-            f"{path} is no complete safetensors file ({error}): delete it and run the same command again"
+            f"{path} is not a complete safetensors file ({error}): delete it and run the same command again"
         ) from error

@@ -1,4 +1,4 @@
-"""Where Warp keeps compiled kernels: a temporary folder where its own cannot be written, as in many containers."""
+"""Warp's cache of compiled kernels: a temporary folder if Warp's own is not writable, as in many containers."""
 
 import atexit
 import os
@@ -13,12 +13,12 @@ from .errors import InputError
 
 
 def ensure_kernel_cache() -> None:
-    """Points Warp, here and in processes started from here, to a temporary cache if its own cannot be written.
+    """Sets a temporary cache for this process and its children if Warp's own is not writable.
 
-    To be called before Warp is initialised, which fails then. Kernels in a cache that can only be read are copied.
+    Call it before Warp is initialised, which would fail. Kernels in a read-only cache are copied.
 
     Raises:
-        InputError: no place for temporary files can be written either.
+        InputError: temporary files cannot be written either.
     """
     cache = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
     if cache is None:
@@ -33,18 +33,18 @@ def ensure_kernel_cache() -> None:
         with tempfile.TemporaryFile(dir=folder):
             return
     except OSError as error:
-        reason = f"Warp's cache {folder} cannot be written ({error.strerror})"
+        reason = f"Warp's cache {folder} is not writable ({error.strerror})"
     try:
         temporary = tempfile.mkdtemp(prefix="warp_resphys-")
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         for kernels in folder.glob("wp_warp_resphys*"):
             shutil.copytree(kernels, Path(temporary, wp.config.version, kernels.name))
     except OSError:
-        raise InputError(f"{reason}, nor can a temporary one: set WARP_CACHE_PATH to a folder that can.") from None
+        raise InputError(f"{reason}, nor is a temporary one: set WARP_CACHE_PATH to a writable folder.") from None
     wp.config.kernel_cache_dir = os.environ["WARP_CACHE_PATH"] = temporary
     print(
-        f"warning: {reason}: kernels are compiled into a temporary folder, anew in every run; set WARP_CACHE_PATH to a "
-        "folder that can be written.",
+        f"warning: {reason}: kernels are compiled into a temporary folder in every run; set WARP_CACHE_PATH to a "
+        "writable folder.",
         file=sys.stderr,
         flush=True,
     )

@@ -1,4 +1,4 @@
-"""Names of folders: those of runs, and that of the user's own options."""
+"""Names of run folders, and of the folder with the user's own configuration options."""
 
 import hashlib
 import re
@@ -9,18 +9,17 @@ _LABEL_LENGTH = 100
 
 
 def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
-    """Names a run folder after the overrides that tell it from the default run; an OmegaConf resolver.
+    """Names a run folder after its overrides; an OmegaConf resolver.
 
-    The same overrides give the same name in any order, so that a repeated command finds its own files.
+    The order of the overrides does not matter, so that a repeated command finds its own files.
 
     Args:
         overrides: Hydra's task overrides, such as "material.density=900".
-        excluded: Keys that do not change the results, or that the folder is named after elsewhere, with all that
-            is below them.
+        excluded: Keys that do not change the results, or that are part of the path already, with all keys below them.
 
     Returns:
-        "key=value,key=value" sorted by key, "default" where nothing is left. Long names, and names with
-        characters that a folder should not have, are made fit and end in a hash of the whole.
+        "key=value,key=value" sorted by key, or "default" without overrides. Long names, and names with unsuitable
+        characters, are shortened or replaced and end in a hash of the whole.
     """
     settings = {}
     for override in overrides:

@@ -1,4 +1,4 @@
-"""What a result was computed on and with, for those who compare its times."""
+"""Hardware and code version of a result, to compare computing times."""
 
 import os
 import platform
@@ -13,12 +13,12 @@ _CPU_INFO = Path("/proc/cpuinfo")
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def hardware() -> dict[str, str]:
-    """Processor, cores that this process may use, GPU and operating system, in words."""
+    """Describes processor, usable cores, GPU and operating system."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return {
         "processor": _processor(),
@@ -39,12 +39,12 @@ def _processor() -> str:
 
 @lru_cache
 def made_on() -> dict[str, str]:
-    """`hardware` and `commit`, as this process began with them."""
+    """Describes hardware and commit, as they were at the first call."""
     return {**hardware(), "commit": commit() or "not known"}
 
 
 def commit() -> str | None:
-    """The commit of the code that runs, with "and changes" where files differ; None outside a git repository."""
+    """Commit of the running code, with "and changes" if files differ; None outside a git repository."""
     folder = Path(__file__).parent
     if shutil.which("git") is None or _git(folder, "ls-files", "--error-unmatch", Path(__file__).name) is None:
         return None

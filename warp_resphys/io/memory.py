@@ -1,4 +1,4 @@
-"""The most memory that a process and its workers have taken."""
+"""Peak memory of a process and its workers, and available memory."""
 
 import re
 import resource
@@ -11,38 +11,39 @@ from pathlib import Path
 
 @dataclass
 class WorkersMemory:
-    """What the workers of a piece of work took."""
+    """Peak memory of worker processes."""
 
-    gib: float = 0.0  # the peaks of those that ran at once, added up [GiB]; 0 without any
+    gib: float = 0.0  # sum over the workers that ran at once [GiB]
 
     def count(self, peaks: Iterable[float]) -> None:
-        """Keeps what workers that run at once say of their own `peak_memory_gib`, if it is more than before."""
+        """Adds the peaks of workers that ran at once, and keeps the largest sum so far."""
         self.gib = max(self.gib, sum(peaks))
 
 
 def peak_memory_gib() -> float:
-    """The most resident memory that this process has had [GiB]."""
-    status = Path("/proc/self/status")  # Without what the parent had before, which getrusage includes.
-    known = re.search(r"^VmHWM:\s+(\d+) kB$", status.read_text(), re.MULTILINE) if status.is_file() else None
-    if known:
-        return int(known[1]) / 2**20
+    """Peak resident memory of this process [GiB]."""
+    # Unlike getrusage, without the memory of the parent process.
+    if peaks := _kibibytes("/proc/self/status", "VmHWM"):
+        return peaks[0] / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 def forget_peak_memory() -> None:
-    """From now on `peak_memory_gib` tells what comes, where the system can do that."""
+    """Resets the peak of `peak_memory_gib`, if the system supports it."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def available_memory_gib() -> float:
-    """Memory that this process may still take [GiB]: what is free, within a container's limit; else infinite."""
-    found = []
-    meminfo = Path("/proc/meminfo")
-    known = re.search(r"^MemAvailable:\s+(\d+) kB$", meminfo.read_text(), re.MULTILINE) if meminfo.is_file() else None
-    if known:
-        found.append(int(known[1]) / 2**20)
+    """Memory that this process may still use [GiB]: free memory within a container's limit; infinite if unknown."""
+    limits = [kibibytes / 2**20 for kibibytes in _kibibytes("/proc/meminfo", "MemAvailable")]
     limit = Path("/sys/fs/cgroup/memory.max")
     if limit.is_file() and (text := limit.read_text().strip()).isdigit():
-        found.append(int(text) / 2**30)
-    return min(found, default=float("inf"))
+        limits.append(int(text) / 2**30)
+    return min(limits, default=float("inf"))
+
+
+def _kibibytes(path: str, key: str) -> list[int]:
+    """The value of a key in a file of /proc; empty if it is missing."""
+    text = Path(path).read_text() if Path(path).is_file() else ""
+    return [int(value) for value in re.findall(rf"^{key}:\s+(\d+) kB$", text, re.MULTILINE)]

@@ -1,4 +1,4 @@
-"""Output into a pipe whose reader leaves early, as `head` does."""
+"""Output to a pipe that its reader closes early, as `head` does."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-NOBODY_READS = 141  # 128 + SIGPIPE: the exit code then
+NOBODY_READS = 141  # the exit code, 128 + SIGPIPE
 
 
 @contextmanager
 def ends_where_nobody_reads() -> Iterator[None]:
-    """Ends the process without a word when its output breaks for want of a reader."""
+    """Ends the process silently when the reader of its output has closed the pipe."""
     try:
         try:
             yield
@@ -25,12 +25,12 @@ def ends_where_nobody_reads() -> Iterator[None]:
         if not unread:
             raise
         for descriptor in unread:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # Python flushes once more at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # Python flushes again at exit.
         raise SystemExit(NOBODY_READS) from None
 
 
 def _is_unread(stream: TextIO) -> bool:
-    """Whether the stream is a pipe that nobody has open to read any more."""
+    """Whether the stream is a pipe without a reader."""
     poll = select.poll()
     poll.register(stream, 0)
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))

@@ -1,4 +1,4 @@
-"""How far a computation is: a bar in a terminal, an occasional line in a log."""
+"""Progress of a computation: a bar in a terminal, an occasional line in a log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _shown = True
 
 
 def be_quiet() -> None:
-    """Shows nothing in this process from now on, as in a worker whose parent tells how far all of them are."""
+    """Disables progress output in this process, such as a worker whose parent shows the progress of all."""
     global _shown
     _shown = False
 
@@ -24,16 +24,15 @@ def be_quiet() -> None:
 class Progress:
     """Shows count, rate, remaining time and the latest values of a loop.
 
-    Use it as a context manager and call `advance` in the loop; most calls only count, in about a microsecond. Where
-    there is no terminal (log files, continuous integration), it prints a line every ten seconds at most, and one at the
-    end.
+    Use it as a context manager and call `advance` in the loop; most calls only count, in about a microsecond. Without
+    a terminal (log files, continuous integration), it prints a line at most every ten seconds, and one at the end.
 
     Args:
-        description: What is being done.
-        total: Number of units that make the whole.
-        unit: What is counted, in the plural.
-        start_at: How many of them an interrupted run has done already; they do not count for the rate.
-        console: Where to show it; stderr by default.
+        description: Name of the computation.
+        total: Total number of units.
+        unit: Name of the units, in the plural.
+        start_at: Number of units done by an interrupted run; they do not count for the rate.
+        console: Output; stderr by default.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class Progress:
         self._task = TaskID(0)
 
     def __enter__(self) -> Progress:
-        """Starts the clock and shows the bar, if there is a terminal to show it in."""
+        """Starts the clock, and shows the bar in a terminal."""
         self._start = self._next = time.perf_counter()
         if not self._console.is_terminal:
             self._next += _LINE_SECONDS
@@ -62,14 +61,14 @@ class Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Shows where the loop ended."""
+        """Shows the final state."""
         if self._bars is not None or self.done != self._shown:
             self._show(time.perf_counter())
         if self._bars is not None:
             self._bars.stop()
 
     def advance(self, count: int = 1, **fields: object) -> None:
-        """Counts `count` units more; `fields` are named values to show, such as a loss."""
+        """Counts further units; `fields` are named values to show, such as a loss."""
         self.done += count
         if fields:
             self._fields = fields
@@ -83,8 +82,8 @@ class Progress:
         parts = [f"{self.done}/{self.total} {self.unit}"]
         if new > 0 and elapsed > 0:
             rate = new / elapsed
-            each = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
-            parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{each} each")
+            duration = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
+            parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{duration} each")
             left = (self.total - self.done) / rate
             parts.append(f"{clock(left)} left" if left > 0 else f"in {clock(elapsed)}")
         for name, value in self._fields.items():
@@ -102,7 +101,7 @@ class Progress:
 
 
 def clock(seconds: float) -> str:
-    """Writes a duration as minutes:seconds or hours:minutes:seconds."""
+    """Formats a duration as minutes:seconds or hours:minutes:seconds."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

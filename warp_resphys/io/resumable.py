@@ -1,8 +1,8 @@
-"""Work that goes on where it was interrupted, however it ended.
+"""Checkpoints, from which interrupted work resumes.
 
-`keep_checkpoint` is for work that goes on from one state: each checkpoint takes the place of the one before.
-`ResumableHDF5` is for work that goes on frame by frame and keeps all of them: every ten seconds, it adds a checkpoint
-with the frames since the last one and the state after them; the last frame turns all of them into one HDF5 file.
+`keep_checkpoint` is for work with a single state: a new checkpoint replaces the previous one. `ResumableHDF5` is for
+frames that are computed one by one and all kept: every ten seconds it writes a checkpoint with the new frames and the
+state after them, and finally one HDF5 file of all frames.
 """
 
 import glob
@@ -29,21 +29,20 @@ _LAYOUT = 2  # of the content of checkpoints
 
 @dataclass(frozen=True)
 class Field:
-    """One array of every frame."""
+    """An array that every frame has."""
 
     shape: tuple[int, ...]  # of one frame; () for a number
-    units: str  # SI units, stored beside the dataset; "1" for numbers without a unit
-    dtype: str = "float64"  # NumPy's name of its type
-    # Number of its axes that stand before the one of the frames in the file: with 1, frames of (B, N, 3) become
-    # (B, T, N, 3), with 0 they become (T, B, N, 3)
+    units: str  # SI units, stored with the dataset; "1" for numbers without a unit
+    dtype: str = "float64"  # NumPy's name of the type
+    # Number of axes before the time axis in the file: frames (B, N, 3) become (B, T, N, 3) with 1, (T, B, N, 3) with 0
     batch_axes: int = 0
 
 
 class ResumableHDF5:
-    """An HDF5 file that is computed frame by frame, and the state that the next frame goes on from.
+    """An HDF5 file that is computed frame by frame, with the state from which the next frame is computed.
 
-    Use it as a context manager, which keeps on leaving what was appended. `done` is the number of frames that an
-    earlier run left, `state` the state after them::
+    Use it as a context manager, which writes a checkpoint when it is left. `done` is the number of frames from an
+    interrupted run, `state` the state after them::
 
         with ResumableHDF5(path, "forces", fingerprint, frames, fields) as file:
             while file.done < file.frames:
@@ -51,13 +50,13 @@ class ResumableHDF5:
                 file.append(state, force=...)
             file.finish()
 
-    Frames of another fingerprint are discarded. An older file at `path` stays there until `finish` replaces it.
+    Frames of another fingerprint are discarded. An older file at `path` stays until `finish` replaces it.
 
     Args:
         path: of the HDF5 file.
         kind: of the file, see `files.atomic_hdf5`.
-        fingerprint: identifies all that the frames depend on.
-        frames: how many there are.
+        fingerprint: identifies everything that the frames depend on.
+        frames: total number of frames.
         fields: the arrays of one frame by name.
     """
 
@@ -68,31 +67,31 @@ class ResumableHDF5:
             name: np.empty((*f.shape[: f.batch_axes], frames, *f.shape[f.batch_axes :]), f.dtype)
             for name, f in self.fields.items()
         }
-        self._last: tuple[int, Mapping[str, torch.Tensor]] = (0, {})  # frames that are done, state after them
-        self._kept = 0  # frames that are in checkpoints
+        self._last: tuple[int, Mapping[str, torch.Tensor]] = (0, {})  # number of frames, state after them
+        self._kept = 0  # number of frames in checkpoints
         self._next = 0.0  # time of the next checkpoint
 
     @property
     def done(self) -> int:
-        """Number of frames that are done."""
+        """Number of computed frames."""
         return self._last[0]
 
     @property
     def state(self) -> Mapping[str, torch.Tensor]:
-        """The state after these frames; empty before the first one."""
+        """State after the last frame; empty before the first one."""
         return self._last[1]
 
     def __enter__(self) -> "ResumableHDF5":
-        """Reads the checkpoints of an earlier run, up to the first one that is damaged or of another fingerprint."""
+        """Reads the checkpoints of an interrupted run, up to the first one that is damaged or of other settings."""
         for path in self._checkpoints():
             try:
                 tensors, metadata = read_checkpoint(path, "frames")
             except DataFileError as error:
-                log.warning("not going on from a checkpoint: %s", error)
+                log.warning("a checkpoint cannot be used: %s", error)
                 break
             done = metadata.pop("done")
             if metadata != self._metadata(self.done):
-                log.warning("not going on from %s: it belongs to other settings", path)
+                log.warning("%s is not used: it belongs to other settings", path)
                 break
             for name in self.fields:
                 self._arrays[name][self._at(name, slice(self.done, done))] = tensors[f"frames.{name}"].numpy()
@@ -104,11 +103,11 @@ class ResumableHDF5:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Keeps what was computed, whatever the block ended with."""
+        """Writes a checkpoint, also after an error."""
         self._keep()
 
     def append(self, state: Mapping[str, torch.Tensor], **arrays: npt.ArrayLike) -> None:
-        """Adds the arrays of the next frame and the state after it, which is not to be changed in place.
+        """Adds the arrays of the next frame and the state after it, which must not be changed in place later.
 
         Raises:
             DataFileError: a checkpoint cannot be written.
@@ -118,8 +117,8 @@ class ResumableHDF5:
             if values.shape != field.shape:
                 raise ValueError(f"'{name}' has the shape {values.shape} where {field.shape} is needed")
             self._arrays[name][self._at(name, self.done)] = values
-        self._last = self.done + 1, state  # in one assignment, for a Ctrl-C in between
-        if time.monotonic() >= self._next:  # After the first frame, too: a place that cannot be written shows at once.
+        self._last = self.done + 1, state  # one assignment, so that Ctrl-C cannot separate the two
+        if time.monotonic() >= self._next:  # also after the first frame, so that a write error shows early
             self._keep()
             self._next = time.monotonic() + KEEP_SECONDS
 
@@ -127,10 +126,10 @@ class ResumableHDF5:
         """Writes the HDF5 file and removes the checkpoints.
 
         Args:
-            constants: arrays that do not depend on the frame, with their units.
+            constants: arrays without a time axis, with their units.
 
         Raises:
-            DataFileError: the file cannot be written; the frames are kept in checkpoints.
+            DataFileError: the file cannot be written; the frames stay in checkpoints.
         """
         if self.done != self.frames:
             raise ValueError(f"{self.path} cannot be finished: {self.done} of {self.frames} frames are done")
@@ -144,7 +143,7 @@ class ResumableHDF5:
             path.unlink()
 
     def _keep(self) -> None:
-        """Writes a checkpoint of the frames since the last one."""
+        """Writes a checkpoint with the new frames."""
         done, state = self._last
         if done == self._kept:
             return
@@ -163,7 +162,7 @@ class ResumableHDF5:
         return {"fingerprint": self.fingerprint, "frames": self.frames, "fields": layout, "first": first}
 
     def _at(self, name: str, frames: int | slice) -> tuple[int | slice, ...]:
-        """The index of some frames in an array."""
+        """Index of frames in an array."""
         return (*(slice(None),) * self.fields[name].batch_axes, frames)
 
     def _checkpoint(self, first: int) -> Path:
@@ -174,10 +173,10 @@ class ResumableHDF5:
 
 
 def is_final(path: Path, kind: str, fingerprint: str) -> bool:
-    """Whether a file of `ResumableHDF5` is there that was made from the same settings.
+    """Whether a finished file of `ResumableHDF5` with this fingerprint exists.
 
     Raises:
-        DataFileError: the file is damaged, or another program's.
+        DataFileError: the file is damaged, or of another program.
     """
     if not path.is_file():
         return False
@@ -186,7 +185,7 @@ def is_final(path: Path, kind: str, fingerprint: str) -> bool:
 
 
 def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
-    """Writes a checkpoint to go on from; the one before stays beside it, in case this one gets damaged.
+    """Writes a checkpoint; the previous one is kept as well, in case this one gets damaged.
 
     Raises:
         DataFileError: the file cannot be written.
@@ -197,26 +196,26 @@ def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], 
 
 
 def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
-    """The last checkpoint of `keep_checkpoint` that is whole and has this fingerprint; None if there is none."""
+    """Reads the last undamaged checkpoint of `keep_checkpoint` with this fingerprint; None if there is none."""
     for candidate in (path, _before(path)):
         if not candidate.exists():
             continue
         try:
             tensors, metadata = read_checkpoint(candidate, kind)
         except DataFileError as error:
-            log.warning("not going on from a checkpoint: %s", error)
+            log.warning("a checkpoint cannot be used: %s", error)
             continue
         if metadata.get("layout") != _LAYOUT:
-            log.warning("not going on from %s: another version of warp_resphys wrote it", candidate)
+            log.warning("%s is not used: another version of warp_resphys wrote it", candidate)
         elif metadata.get("fingerprint") != fingerprint:
-            log.warning("not going on from %s: it belongs to other settings", candidate)
+            log.warning("%s is not used: it belongs to other settings", candidate)
         else:
             return tensors, metadata
     return None
 
 
 def forget_checkpoint(path: Path) -> None:
-    """Removes the checkpoints that `keep_checkpoint` wrote."""
+    """Removes the checkpoints of `keep_checkpoint`."""
     path.unlink(missing_ok=True)
     _before(path).unlink(missing_ok=True)
 

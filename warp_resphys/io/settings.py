@@ -1,4 +1,4 @@
-"""Settings: a frozen class for each group of a configuration, with type, range, unit, meaning and default of its keys.
+"""Settings: a frozen class for each group of a configuration, with type, range, unit, description and default of keys.
 
     class Swing(Settings):
         '''A harmonic motion.'''
@@ -6,11 +6,11 @@
         frequency: Positive = setting(unit="Hz")
         phase: float = setting(0.0, "at time zero", unit="rad")
 
-A class is the only place where a key is declared. `parse` makes an object of plain nested data, such as YAML gives,
-and raises one sentence where a value cannot be used. Types are strict, as those of YAML are: a truth value is not a
-number, nor is a word, whole numbers may stand for floating-point ones, and lists become tuples. Relations between keys
-are checked where both are visible, in a ``model_validator`` that raises a ValueError; its message begins with a key of
-the class, which `parse` completes to the dotted key.
+A class is the only place where a key is declared. `parse` converts nested plain data, as read from YAML, to an object,
+and raises an error of one sentence for an invalid value. Types are strict: booleans and strings are not numbers, but
+integers are accepted as floating-point numbers, and lists become tuples. Relations between keys are checked in a
+``model_validator`` that raises a ValueError; its message begins with a key of the class, which `parse` completes to the
+dotted key.
 """
 
 import hashlib
@@ -39,60 +39,60 @@ Vector = Annotated[tuple[float, float, float], Strict(False)]
 
 
 class Settings(BaseModel):
-    """Base of all classes of settings. Objects are constant, and equal where their content is."""
+    """Base of all settings classes. Objects are immutable and compared by content."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
     )
 
     def plain(self) -> dict[str, Any]:
-        """Nested data that JSON and YAML know."""
+        """Returns nested data of JSON types."""
         return self.model_dump(mode="json")
 
     def fingerprint(self) -> str:
-        """SHA-256 of the content, in hexadecimal: equal for equal settings, in any order of keys."""
+        """SHA-256 of the content in hexadecimal, independent of the order of keys."""
         text = json.dumps(self.plain(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
     def changed(self, **values: Any) -> Self:
-        """The same settings with other values of some keys.
+        """Returns a copy with other values of some keys.
 
         Raises:
-            InputError: a value that cannot be used.
+            InputError: an invalid value.
         """
         return parse(type(self), {**dict(self), **values})
 
     @classmethod
     def of(cls, source: "Settings", **values: Any) -> Self:
-        """The keys of this class from another object that has them, and ``values`` of those that it has not."""
-        known = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
-        return cls(**{**known, **values})
+        """Returns settings of this class with the keys that another object shares, and ``values`` for the others."""
+        shared = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
+        return cls(**{**shared, **values})
 
 
 def setting(default: Any = PydanticUndefined, description: str = "", unit: str = "", **limits: Any) -> Any:
     """Declares a key of a class of settings.
 
     Args:
-        default: value of a key that is left out; without one, the key is required.
+        default: value of an omitted key; without a default, the key is required.
         description: for the reference page and for editors.
-        unit: such as ``m/s^2``; it stands in error messages, too.
-        limits: other arguments of `pydantic.Field`, such as ``gt`` or ``le``.
+        unit: such as ``m/s^2``; also used in error messages.
+        limits: further arguments of `pydantic.Field`, such as ``gt`` or ``le``.
     """
     more: dict[str, Any] = {"json_schema_extra": {"unit": unit}} if unit else {}
     return Field(default, description=description or None, **more, **limits)
 
 
 def parse(settings: type[S], values: Any, where: str = "") -> S:
-    """Makes an object of nested plain data.
+    """Converts nested plain data to an object of a settings class.
 
     Args:
         settings: class of the object.
-        values: mapping of its keys; what is left out has its default.
+        values: mapping of its keys; omitted keys get their default.
         where: dotted key of the group, for messages; empty for a whole configuration.
 
     Raises:
-        InputError: an unknown or missing key, a value of another type or out of range, or values that do not fit each
-            other. The sentence has the dotted key, the value, and what it must be.
+        InputError: an unknown or missing key, a value of another type or out of range, or values that contradict each
+            other. The message has the dotted key, the value, and what it must be.
     """
     try:
         return settings.model_validate(values)

@@ -24,7 +24,7 @@ _OPTIONS = (
 
 @contextmanager
 def opened() -> Iterator[Any]:
-    """Chromium without a window; skips where it is not installed."""
+    """Headless Chromium; skips the test where it is not installed."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     program, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if program is None or driver is None:
@@ -44,7 +44,7 @@ def opened() -> Iterator[Any]:
 
 
 def until(said: Callable[[], Any], seconds: float = 30.0) -> None:
-    """Waits until something is so."""
+    """Waits until a condition holds."""
     end = time.monotonic() + seconds
     while not said():
         assert time.monotonic() < end

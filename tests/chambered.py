@@ -9,7 +9,7 @@ from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrah
 from warp_resphys.mesh.mesh import quadratic
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
-# The bricks that are left out, as (i, j, k): a chamber of two and one of a single brick.
+# Removed bricks (i, j, k): a chamber of two bricks and one of a single brick.
 HOLLOW = [(1, 1, 1), (2, 1, 1), (4, 1, 1)]
 BRICK = np.prod(SIZE) / np.prod(DIVISIONS)  # m^3
 KINDS = ("hexahedron", "tetrahedron", "tetrahedron10")
@@ -27,7 +27,7 @@ def hollow_box(kind: str) -> Mesh:
 
 
 def chambered(kind: str, fibres: Mapping[str, Any] | None = None) -> Body:
-    """The same as a body that is clamped at x = 0, with fibres of these settings."""
+    """The hollow box as a body clamped at x = 0, with fibres of these settings."""
     mesh = hollow_box(kind)
     chambers = find_chambers(mesh, (1.0, 0.0, 0.0))
     energies = [Pressure(chambers), *([] if fibres is None else [Fibres(chambers, **fibres)])]

@@ -21,10 +21,9 @@ def _composed(*overrides):
 
 
 def composed(*overrides):
-    """Nested plain settings with all defaults, as a user might have written them."""
-    return copy.deepcopy(
-        _composed(*(each for each in overrides if not each.startswith("hydra") or each.startswith("hydra.searchpath")))
-    )
+    """Nested plain settings with all defaults."""
+    own = [word for word in overrides if not word.startswith("hydra") or word.startswith("hydra.searchpath")]
+    return copy.deepcopy(_composed(*own))
 
 
 def settings(*overrides):

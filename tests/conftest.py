@@ -69,13 +69,13 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def no_report(monkeypatch):
-    """The report takes most of a tiny run's time, and has tests of its own."""
+    """Replaces the report, which takes most of a tiny run's time and has tests of its own."""
     monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
-    """A complete run with its report, and one more of the same command."""
+    """A complete run with its report, and its files before and after a second run of the same command."""
     root = tmp_path_factory.mktemp("finished")
     with contextlib.chdir(root):
         assert run(*TINY, IN_RUN)[0] == 0

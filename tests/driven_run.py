@@ -1,4 +1,4 @@
-"""A made-up run of an experiment with pressures: every file that its report reads."""
+"""Synthetic files of a run with pressures: every file that its report reads."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ LABORATORY = {
 
 
 def data(**changes):
-    """The group of that name."""
+    """The settings group ``data``."""
     return {
         "kind": "recorded",
         "folder": None,
@@ -71,7 +71,7 @@ def arm_settings(name="sopra", chambers=6, **changes):
 
 
 def pressures(trials, steps, chambers, factor=1.0):
-    """(K, C) [Pa] by trial: smooth, between zero and the limit."""
+    """Smooth pressures (K, C) between zero and the limit, by trial [Pa]."""
     times = STEP * np.arange(steps)
     rows = {}
     for number, trial in enumerate(trials):
@@ -85,14 +85,14 @@ def pressures(trials, steps, chambers, factor=1.0):
 
 
 def bent(points, pressure, model=None, sag=0.0):
-    """(K + 1, P, 3) [m] where points (P, 3) of a hanging arm are, driven by pressures (K, C)."""
+    """Positions (K + 1, P, 3) of points (P, 3) of a hanging arm under pressures (K, C) [m]."""
     level, lag = _OFF[model]
     angle = 2.0 * np.pi / 3.0 * np.arange(pressure.shape[1])
     push = pressure / LIMIT @ np.stack([np.cos(angle), np.sin(angle)], axis=1)
     tip = np.zeros((len(push) + 1, 2))
     rate = STEP / (0.1 + lag)
-    for k, each in enumerate(push):
-        tip[k + 1] = tip[k] + rate * (0.03 * level * each - tip[k])
+    for k, target in enumerate(push):
+        tip[k + 1] = tip[k] + rate * (0.03 * level * target - tip[k])
     along = (points[:, 2] / points[:, 2].min()) ** 2
     moved = np.repeat(points[None], len(tip), axis=0)
     moved[..., :2] += tip[:, None] * along[:, None]
@@ -115,7 +115,7 @@ def write_run(
     simulated=True,
     sag=0.0,
 ):
-    """All files of a run; bodies hang longer by the sag [m]."""
+    """Writes all files of a run; bodies hang lower by the sag [m]."""
     mesh = build_mesh(settings.mesh)
     labels = list(settings.markers.tracked)
     bound = np.array(list(settings.markers.tracked.values())) + 1e-4
@@ -124,7 +124,7 @@ def write_run(
     for scale in scales:
         driven |= pressures([f"{name}_{scale:g}" for name in nominal], steps, chambers, scale)
     rng = np.random.default_rng(0)
-    markers = np.stack([bent(bound, each, None, sag) for each in driven.values()])
+    markers = np.stack([bent(bound, pressure, None, sag) for pressure in driven.values()])
     markers += rng.normal(0.0, 5e-5, markers.shape)
     markers[:, 30:36, min(1, len(labels) - 1)] = np.nan
     attributes = {
@@ -153,28 +153,28 @@ def write_run(
     with atomic_hdf5(folder / "rollouts.h5", "rollouts", described) as file:
         create(file, "film_steps", film, "1", 0)
         for model in models:
-            each = np.stack([bent(bound, driven[name], model, sag) for name in rolled])
+            observed = np.stack([bent(bound, driven[name], model, sag) for name in rolled])
             body = bent(mesh.vertices, driven[rolled[0]], model, sag)[film]
             if model in diverged:
-                each[0, 60:] = np.nan
+                observed[0, 60:] = np.nan
                 body[film >= 60] = np.nan
-            simulated[model] = each
-            create(file, f"{model}_observed", each.astype(np.float32), "m", 1)
+            simulated[model] = observed
+            create(file, f"{model}_observed", observed.astype(np.float32), "m", 1)
             create(file, f"{model}_film", body.astype(np.float32), "m", 0)
     write_json(folder / "errors.json", _errors(simulated, markers[train:], rolled, test, labels, scales, horizons))
     _write_rest(folder, settings, dict(zip(labels, bound, strict=True)), list(driven)[:2], rng, models, simulated)
 
 
 def _errors(simulated, measured, names, test, labels, scales, horizons):
-    each = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
-    for rows in each.values():
+    distances = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
+    for rows in distances.values():
         rows[np.isinf(rows)] = np.nan
-    nominal = {model: rows[:test] for model, rows in each.items()}
+    nominal = {model: rows[:test] for model, rows in distances.items()}
 
     def part(rows, first=0, last=None):
         return {model: summarise(values[first:last]) for model, values in rows.items()}
 
-    found = {
+    content = {
         "errors_mm": part(nominal),
         "per_trajectory": summarise_each(names[:test], nominal),
         "per_marker": {
@@ -191,39 +191,45 @@ def _errors(simulated, measured, names, test, labels, scales, horizons):
         },
     }
     if horizons:
-        found["horizons"] = {
+        content["horizons"] = {
             f"{w:g}": part({m: rows[:, : round(w / STEP)] for m, rows in nominal.items()}) for w in horizons
         }
-        first, *_, last = found["horizons"].values()
-        found["growth"] = {
+        first, *_, last = content["horizons"].values()
+        content["growth"] = {
             m: None if last[m]["mean"] is None else last[m]["mean"] / first[m]["mean"] - 1.0 for m in first
         }
     if scales:
-        found["scales"] = {"1": found["errors_mm"]} | {
-            f"{scale:g}": part(each, test * (k + 1), test * (k + 2)) for k, scale in enumerate(scales)
+        content["scales"] = {"1": content["errors_mm"]} | {
+            f"{scale:g}": part(distances, test * (k + 1), test * (k + 2)) for k, scale in enumerate(scales)
         }
         late = {"1": {}, f"{scales[0]:g}": {}, f"{scales[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
-        found["scales_range"] = {
+        content["scales_range"] = {
             scale: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
             for scale, first in late.items()
         }
-    return found
+    return content
 
 
 def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
-    """Everything but motions, roll-outs and errors."""
+    """Writes all files except motions, roll-outs and errors."""
     quality, registration = describe_recordings(registered, tracked, settings.markers.reference, rng, None)
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
     if simulated:
         material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
         write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
-    found = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
-    history = [[{"loss": 0.3 * 0.6**k + 0.02, **found} for k in range(9)]]
+    identified_values = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
+    history = [[{"loss": 0.3 * 0.6**k + 0.02, **identified_values} for k in range(9)]]
     moduli, ratios = np.geomspace(100e3, 500e3, 9), np.linspace(0.3, 0.499, 5)
     loss = 0.02 + np.log(moduli / 237e3)[:, None] ** 2 + 3.0 * (ratios - 0.42) ** 2
     if "sysid" in models:
-        identified = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
+        identified = {
+            "parameters": identified_values,
+            "loss": 0.02,
+            "history": history,
+            "at_bounds": [],
+            "uncertainty": None,
+        }
         grid = {"youngs_modulus": moduli, "poissons_ratio": ratios, "loss": loss}
         write_json(folder / "identification.json", {"sysid": identified, "landscape": grid})
     kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.4}
@@ -243,5 +249,5 @@ def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
 
 
 def errors_of(folder):
-    """What errors.json holds."""
+    """Content of errors.json."""
     return read_json(folder / "errors.json")

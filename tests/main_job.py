@@ -1,4 +1,4 @@
-"""A small main job through its command line: its settings, and what it leaves in the run folder."""
+"""A small main job by its command line: its settings, and the files of its run folder."""
 
 import contextlib
 import io
@@ -13,16 +13,7 @@ from warp_resphys import cli, pipeline
 
 REPOSITORY = Path(__file__).parents[1]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
-REFINED = [
-    "simulate",
-    "reconstruct_resphys",
-    "train_resphys",
-    "refine_resphys",
-    "train_simfree",
-    "evaluate",
-    "time",
-    "report",
-]
+REFINED = [*STAGES[:3], "refine_resphys", *STAGES[3:]]
 REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
 LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]
@@ -44,7 +35,7 @@ IN_RUN = "hydra.run.dir=run"
 
 
 def end_of(program, *arguments):
-    """Exit code of a program in this process, and what it wrote to stderr; its name is the first argument."""
+    """Runs a program in this process, with its name as the first argument; returns exit code and stderr."""
     err, argv, code = io.StringIO(), sys.argv, 0
     sys.argv = list(arguments)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
@@ -58,7 +49,7 @@ def end_of(program, *arguments):
 
 
 def run_without_report(place, *arguments):
-    """The folder ``run`` that a command leaves in a place, whose report is no more than a file."""
+    """Runs a command with a stub of the report, and returns its run folder."""
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(place):
         patch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
         code, err = run(*arguments)
@@ -67,7 +58,7 @@ def run_without_report(place, *arguments):
 
 
 def run(*arguments):
-    """Exit code of the command in this process, and what it wrote to stderr."""
+    """Runs the command in this process; returns exit code and stderr."""
     return end_of(cli.main, "warp-resphys", *arguments)
 
 
@@ -76,11 +67,11 @@ def metrics(folder="run"):
 
 
 def errors(folder="run"):
-    """All errors [mm] of a run, flat."""
-    found = metrics(folder)
-    groups = [found["errors_mm"], found["errors_vs_reconstruction_mm"]]
+    """All errors of a run as one list [mm]."""
+    content = metrics(folder)
+    groups = [content["errors_mm"], content["errors_vs_reconstruction_mm"]]
     values = [group[model][key] for group in groups for model in sorted(group) for key in ("mean", "std")]
-    return values + [each["errors_mm"][model] for each in found["per_trajectory"] for model in MODELS]
+    return values + [trial["errors_mm"][model] for trial in content["per_trajectory"] for model in MODELS]
 
 
 def same_errors(a, b):
@@ -88,14 +79,14 @@ def same_errors(a, b):
 
 
 def files(folder="run"):
-    """Content of everything in the run folder but Hydra's own, by name."""
+    """Times and contents of all files in the run folder, except Hydra's, by name."""
     root = Path(folder)
     paths = [p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"]
     return {str(p.relative_to(root)): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}
 
 
 def ran(before):
-    """Stages whose record is another than before."""
+    """Stages whose record has changed."""
     now = files()
     return [
         s for s in REFINED if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")

@@ -1,4 +1,4 @@
-"""What tests of reports share."""
+"""Helpers for tests of reports."""
 
 import base64
 import hashlib
@@ -13,7 +13,7 @@ FAILING = (sys.executable, "-c", "raise SystemExit('no OpenGL here')")
 
 
 class Page(HTMLParser):
-    """What a page refers to, its images' descriptions, and its text."""
+    """A page: its links, images, scripts and text."""
 
     def __init__(self, path):
         super().__init__()
@@ -40,14 +40,14 @@ class Page(HTMLParser):
             self.inside[-1] += data
 
     def allows_its_scripts_alone(self):
-        """Whether the policy of contents names the scripts that run, and nothing else that may."""
-        digests = [base64.b64encode(hashlib.sha256(each.encode()).digest()).decode() for each in self.scripts]
+        """Whether the content security policy allows exactly the page's own scripts."""
+        digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in self.scripts]
         policy = self.source.partition("Content-Security-Policy")[2].partition(">")[0]
         allowed = policy.partition("script-src ")[2].partition(";")[0].rstrip('"').split()
         return "default-src 'none'" in policy and allowed == [f"'sha256-{digest}'" for digest in digests]
 
 
 def report(folder, settings, make=make_report):
-    """The page that is made of a run folder."""
+    """Makes the report of a run folder."""
     make(StageContext("report", folder, "", ReportStage(config=settings)))
     return Page(folder / "report.html")

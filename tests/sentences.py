@@ -1,4 +1,4 @@
-"""What tests of refused settings ask of a sentence: the offending key, not its words."""
+"""The offending key of an error message, for tests of refused settings."""
 
 import re
 
@@ -7,6 +7,6 @@ _SUBJECT = re.compile(r"\w+(?= is )")
 
 
 def offending(sentence: str) -> str:
-    """Returns the key that a sentence names; the sentence itself where it names none."""
-    found = _KEY.search(sentence) or _SUBJECT.search(sentence)
-    return found[0] if found else sentence
+    """Returns the key that a message names, or the whole message if it names none."""
+    match = _KEY.search(sentence) or _SUBJECT.search(sentence)
+    return match[0] if match else sentence

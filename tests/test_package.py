@@ -1,4 +1,4 @@
-"""The wheel, installed where no file of the repository is in reach; dependencies come from the tests' environment."""
+"""The wheel, installed outside of the repository; dependencies come from the tests' environment."""
 
 import json
 import os
@@ -13,23 +13,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from main_job import IN_RUN, TINY
 
 REPOSITORY = Path(__file__).parents[1]
-TINY = [
-    "mesh.divisions=[4,2,2]",
-    "data.steps=12",
-    "data.weights_g.train=[50,90,130]",
-    "data.weights_g.validation=[110]",
-    "data.weights_g.test=[70,150]",
-    "trainer.epochs=40",
-    "trainer.rollout_every=10",
-    "network.width=32",
-    "hydra.run.dir=run",
-]
 
 
 def can_build():
-    """Whether setuptools is there, and new enough for the build of the wheel."""
+    """Whether setuptools is installed, and new enough to build the wheel."""
     try:
         return int(version("setuptools").partition(".")[0]) >= 77
     except PackageNotFoundError:
@@ -43,7 +33,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def call(*command, folder, **environment):
-    """Runs a command without the repository on its path; its output."""
+    """Runs a command without the repository on its path, and returns its output."""
     inherited = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     result = subprocess.run(
         [str(part) for part in command],
@@ -60,7 +50,7 @@ def call(*command, folder, **environment):
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Built from a copy of what is needed, so that no build folder is left in the repository."""
+    """The wheel, built from a copy, so that no build folder is left in the repository."""
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, source)
@@ -102,7 +92,7 @@ def test_the_wheel_holds_every_module_and_configuration(wheel):
 def test_the_main_job_runs_from_an_empty_folder(installed, tmp_path):
     where = call(installed / "python", "-c", "import warp_resphys; print(warp_resphys.__file__)", folder=tmp_path)
     assert Path(where.strip()).is_relative_to(installed.parent)
-    out = call(installed / "warp-resphys", *TINY, folder=tmp_path)
+    out = call(installed / "warp-resphys", *TINY, IN_RUN, folder=tmp_path)
     assert "Report: " in out
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -117,25 +107,25 @@ import contextlib, io, json, sys
 for name in ("torch", "warp", "scipy", "matplotlib", "pyvista", "vtk", "meshio", "trimesh", "ezc3d"):
     sys.modules[name] = None  # importing it fails
 from warp_resphys import cli, commands
-found = {}
-for command, each in commands.COMMANDS.items():
-    found[command] = [each.purpose]
+helps = {}
+for command, entry in commands.COMMANDS.items():
+    helps[command] = [entry.purpose]
     for option in ("--help", "--cfg=job"):
         sys.argv = ["warp-resphys", *command.split(), option]
         with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
             cli.main()
-        found[command].append(out.getvalue())
-print(json.dumps(found))
+        helps[command].append(out.getvalue())
+print(json.dumps(helps))
 """
-    found = json.loads(call(installed / "python", "-c", program, folder=tmp_path))
+    helps = json.loads(call(installed / "python", "-c", program, folder=tmp_path))
     keys = {"run": "seed", "tune": "tune", "inspect": "recording", "verify": "files", "view film": "run"}
-    assert keys.keys() < found.keys()
-    for command, (purpose, text, config) in found.items():
+    assert keys.keys() < helps.keys()
+    for command, (purpose, text, config) in helps.items():
         assert f"warp-resphys {command}: {purpose}\n" in text or command == "run"
-        assert re.search(f"^warp-resphys {command} +{purpose}$", found["run"][1], flags=re.MULTILINE)
+        assert re.search(f"^warp-resphys {command} +{purpose}$", helps["run"][1], flags=re.MULTILINE)
         assert re.search(f"^warp-resphys {command}( |$)", text, flags=re.MULTILINE)
         assert yaml.safe_load(config).keys() >= {keys.get(command)} - {None}
-    assert "budget=quick" in found["run"][1]
+    assert "budget=quick" in helps["run"][1]
     assert not list(tmp_path.iterdir())
 
 
@@ -154,7 +144,7 @@ def test_importing_the_package_imports_nothing_heavy(installed, tmp_path):
 
 
 def test_a_copy_of_the_repository_hides_no_part_of_an_installation(installed):
-    """As Python has it that is started in the folder of the README's first command."""
-    found = "import warp_resphys.conf, warp_resphys.kernels as k; print(k.__file__); warp_resphys.Simulator"
-    where = call(installed / "python", "-c", found, folder=REPOSITORY)
+    """Python, started in the repository, imports the copy, with its kernels."""
+    program = "import warp_resphys.conf, warp_resphys.kernels as k; print(k.__file__); warp_resphys.Simulator"
+    where = call(installed / "python", "-c", program, folder=REPOSITORY)
     assert Path(where.strip()).parent == REPOSITORY / "kernels"

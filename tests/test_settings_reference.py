@@ -32,7 +32,7 @@ def test_the_page_of_all_keys_is_current():
 @pytest.mark.parametrize("path", sorted((ROOT / "conf" / "experiment").glob("*.yaml")), ids=lambda path: path.stem)
 def test_experiments_are_what_editors_expect(path):
     content = OmegaConf.to_container(OmegaConf.load(path))
-    content = {key: each for key, each in content.items() if key not in ("mesh", "data")}  # of a kind that others name
+    content = {key: group for key, group in content.items() if key not in ("mesh", "data")}  # their kind is elsewhere
     jsonschema.validate(content, editor_schema())
 
 
@@ -41,7 +41,7 @@ def test_an_editor_marks_a_wrong_key():
         jsonschema.validate({"trainer": {"epoch": 3}}, editor_schema())
 
 
-def test_words_of_the_settings_are_those_that_the_code_knows():
+def test_choices_in_the_settings_are_those_in_the_code():
     pairs = [
         (SimulatorSettings, "integrator", INTEGRATORS),
         (SimulatorSettings, "coupling", COUPLINGS),

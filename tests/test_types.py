@@ -1,4 +1,4 @@
-"""What type checkers know of the public names."""
+"""The types of the public names, for type checkers."""
 
 import importlib
 import re

@@ -1,4 +1,4 @@
-"""A made-up run in which every vertex is observed: a beam that swings, a wrong simulation of it, a nearly right one."""
+"""Synthetic files of a run with observed vertices: a swinging beam, and models with larger and smaller errors."""
 
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from warp_resphys.learning.metrics import marker_errors, summarise, summarise_ea
 from warp_resphys.settings.run import RunSettings
 
 STEPS, STEP = 40, 0.01
-TRIALS = {"0.05 kg": 0.008, "0.07 kg": 0.01, "0.12 <kg>": 0.02}  # The first one is of the training.
+TRIALS = {"0.05 kg": 0.008, "0.07 kg": 0.01, "0.12 <kg>": 0.02}  # the first one for training
 PERIODS = {"simulation": 0.16, "reconstruction": 0.14, "simfree": 0.143, "resphys": 0.14}
 OFFSETS = {"reconstruction": 1e-9, "resphys": 2e-6}
 
 
 def settings(**changes):
-    """Of an experiment whose simulated trials are known at every vertex."""
+    """Settings of an experiment with observed vertices."""
     return parse(RunSettings, {**composed("mesh.divisions=[4,1,1]"), "time_step": STEP, **changes})
 
 
@@ -32,7 +32,7 @@ def bending(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
 
 
 def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps=STEPS, begins="given", refined=False):
-    """Every file that the report reads; one step more or less makes poses of the roll-outs."""
+    """Writes every file that the report reads."""
     vertices = build_mesh(config.mesh).vertices
     names, test = list(TRIALS), list(TRIALS)[1:]
     target = np.stack([bending(vertices, size, steps=steps) for size in TRIALS.values()])
@@ -60,28 +60,28 @@ def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps
         write_history(folder / "refinement_resphys.json", range(4), 3)
     seconds = {name: {"mean": 0.421, "std": 0.1} for name in ("simulation", "target", "resphys", "inference")}
     write_json(folder / "times.json", {"steps": steps, "seconds": seconds})
-    for name, each in {"acquire": 12.0, "train": 75.4}.items():
-        write_json(folder / "stages" / f"{name}.json", {"seconds": each, "peak_memory_gib": 0.523})
+    for name, duration in {"acquire": 12.0, "train": 75.4}.items():
+        write_json(folder / "stages" / f"{name}.json", {"seconds": duration, "peak_memory_gib": 0.523})
 
 
 def write_errors(folder, test, runs, target):
-    """errors.json."""
+    """Writes errors.json."""
     first = min(1, target.shape[1] - 1)
     pairs = {model: zip(q, target, strict=True) for model, q in runs.items()}
-    errors = {model: [marker_errors(a[first:], b[first:]) for a, b in each] for model, each in pairs.items()}
+    errors = {model: [marker_errors(a[first:], b[first:]) for a, b in rows] for model, rows in pairs.items()}
     summaries = {model: summarise(rows) for model, rows in errors.items()}
     write_json(
         folder / "errors.json",
         {
             "errors_mm": summaries,
-            "errors_vs_reconstruction_mm": {m: each for m, each in summaries.items() if m != "reconstruction"},
+            "errors_vs_reconstruction_mm": {m: rows for m, rows in summaries.items() if m != "reconstruction"},
             "per_trajectory": summarise_each(test, errors),
         },
     )
 
 
 def write_history(path, epochs, kept):
-    """How a training went."""
+    """Writes the history of a training."""
     records = [
         {
             "epoch": epoch,

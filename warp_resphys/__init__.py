@@ -1,7 +1,6 @@
 """Differentiable soft-body simulation on NVIDIA Warp, with learned residual physics.
 
-Public names are imported when they are first used, so that importing the package costs nothing.
-`__init__.pyi` lists them.
+Public names are imported when they are first used, so that importing the package is fast. `__init__.pyi` lists them.
 """
 
 import importlib
@@ -10,11 +9,11 @@ import re
 from pathlib import Path
 from typing import Any
 
-# In a copy of the repository that nobody has installed in place, kernels/ and conf/ lie beside this folder.
+# In a copy of the repository without an editable installation, kernels/ and conf/ are next to this folder.
 if importlib.util.find_spec(f"{__name__}.kernels") is None:
     __path__.append(str(Path(__file__).parents[1]))
 
-# Module of every public name, from the stub that type checkers read: one name a line.
+# The module of each public name, read from the stub for type checkers, which has one name per line.
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _MODULES = {name: module for module, name in re.findall(r"^from \.([\w.]+) import \w+ as (\w+)$", _STUB, re.MULTILINE)}
 

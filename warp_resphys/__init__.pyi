@@ -1,4 +1,4 @@
-# The public names of the package: `__init__.py` imports one from here when it is first used, type checkers all.
+# The public names of the package. Type checkers read this file; `__init__.py` imports a name when it is first used.
 from .data.camera import CameraMarkers as CameraMarkers
 from .data.markers import Markers as Markers
 from .data.markers import bind_markers as bind_markers

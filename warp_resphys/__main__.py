@@ -1,4 +1,4 @@
-"""`python -m warp_resphys` is `warp-resphys`, where the environment's commands are not on the path."""
+"""`python -m warp_resphys` runs `warp-resphys`, also where its script is not on the path."""
 
 from .cli import main
 

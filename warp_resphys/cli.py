@@ -11,14 +11,14 @@ from .io.pipes import ends_where_nobody_reads
 
 
 def main() -> None:
-    """Does what the command line asks for.
+    """Runs the command of the command line.
 
-    The process ends with exit code 2 and one sentence on stderr where the user can mend what is wrong, with
-    130 after Ctrl-C, with 141 when whoever reads its output has left, as `head` does, and with 1 and a traceback for
-    everything else. With HYDRA_FULL_ERROR=1 in the environment, every error keeps its traceback.
+    The exit code is 2, with one sentence on stderr, for an error that the user can fix; 130 after Ctrl-C; 141 when the
+    reader of its output has closed the pipe, as `head` does; and 1, with a traceback, for any other error. With
+    HYDRA_FULL_ERROR=1 in the environment, every error has its traceback.
     """
     with ends_where_nobody_reads():
-        if "--version" in sys.argv[1:]:  # Hydra's own would name Hydra's.
+        if "--version" in sys.argv[1:]:  # Hydra would print its own version.
             print(f"warp-resphys {__version__}")
             return
         try:

@@ -1,6 +1,6 @@
-"""The commands of `warp-resphys`: what a command line asks for, and the help.
+"""The commands of `warp-resphys`: parsing of command lines, and help.
 
-A command is a word, and some have a second one: ``benchmark``, ``benchmark sizes``. Nothing heavy is imported here.
+A command is one word or two: ``benchmark``, ``benchmark sizes``. This module imports only what is fast to import.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .io.errors import InputError, did_you_mean
 from .io.labels import OWN_OPTIONS
 
 CONFIG_PACKAGE: Final = "warp_resphys.conf"
-USER_ERROR: Final = 2  # exit code where the user can mend what is wrong
+USER_ERROR: Final = 2  # exit code of an error that the user can fix
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Command:
     """A command.
 
     Attributes:
-        purpose: what it is for, in a line.
-        function: as in ``studies.sizes:size_study``, below this package. It takes the settings, an object of the class
-            with which this parameter is annotated, and the run folder.
-        word: the key of the configuration that takes one word after the command.
-        words: the key that takes all words after the command, as a list.
+        purpose: one line for the help.
+        function: such as ``studies.sizes:size_study``, below this package. Its arguments are the settings, an object of
+            the class that annotates this parameter, and the run folder.
+        word: the configuration key that is set by one word after the command.
+        words: the configuration key that is set by all words after the command, as a list.
     """
 
     purpose: str
@@ -104,7 +104,7 @@ VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--info", "-i", "--experimental-rerun"),
 )
-_PLAIN: Final = re.compile(r"[\w./-]+")  # a word that means itself to Hydra
+_PLAIN: Final = re.compile(r"[\w./-]+")  # a word without special characters of Hydra's syntax
 _OPTIONS: Final = """\
 --cfg job         show all keys and their values, for these settings
 --multirun, -m    run a sweep
@@ -113,12 +113,12 @@ _OPTIONS: Final = """\
 
 
 def configuration(command: str) -> str:
-    """Name of a command's YAML in conf/."""
+    """Returns the name of a command's YAML file in conf/."""
     return "config" if command == "run" else re.sub("[ -]", "_", command)
 
 
 def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
-    """Splits a command line into the name of a command and arguments for Hydra.
+    """Splits a command line into the name of its command and the arguments for Hydra.
 
     Raises:
         InputError: there is no such command.
@@ -161,12 +161,12 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _is_path(argument: str) -> bool:
-    """Whether an argument names a file or folder, which may have an equals sign: runs/beam_oscillation/seed=1."""
+    """Whether an argument is an existing path, which may contain an equals sign: runs/beam_oscillation/seed=1."""
     return os.sep in argument and Path(argument).exists()
 
 
 def help_text(command: str) -> str:
-    """What a command is for, lines to try, and its keys; of a run, all commands, groups and options."""
+    """Returns the help of a command: purpose, examples and keys; for a run, all commands, groups and options."""
     import yaml
 
     text = resources.files(CONFIG_PACKAGE).joinpath(f"{configuration(command)}.yaml").read_text(encoding="utf-8")
@@ -177,7 +177,10 @@ def help_text(command: str) -> str:
     parts = {name: part for name, part in COMMANDS.items() if name.startswith(f"{command} ")}
     head = [f"warp-resphys {command}: {COMMANDS[command].purpose}", "", *_lines(parts), *[""][: len(parts)], examples]
     groups = [
-        f"{group}={option}" for each in content["defaults"] if isinstance(each, dict) for group, option in each.items()
+        f"{group}={option}"
+        for entry in content["defaults"]
+        if isinstance(entry, dict)
+        for group, option in entry.items()
     ]
     if "config" in content["defaults"]:
         groups.append("all groups and keys of a run, as warp-resphys --help lists them")
@@ -188,13 +191,13 @@ def help_text(command: str) -> str:
 
 
 def _lines(commands: Mapping[str, Command]) -> list[str]:
-    """A line for each command, and one on their help."""
+    """Help lines of commands, and a line on the help of a single command."""
     lines = [f"warp-resphys {name:18}  {command.purpose}" for name, command in commands.items()]
-    return [*lines, f"warp-resphys {'COMMAND --help':18}  more of one of them"] if lines else []
+    return [*lines, f"warp-resphys {'COMMAND --help':18}  help of a command"] if lines else []
 
 
 def _groups() -> list[str]:
-    """A line for each group of the configuration: its options, the user's own ones too."""
+    """Help lines of the configuration groups: their options, including the user's own ones."""
     places = [Path(str(resources.files(CONFIG_PACKAGE))), Path.cwd() / OWN_OPTIONS]
     options: dict[str, set[str]] = {}
     for path in [path for place in places for path in place.glob("*/*.yaml")]:

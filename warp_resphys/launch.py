@@ -1,4 +1,4 @@
-"""Runs a command with the configuration that Hydra composes, and turns errors into one sentence."""
+"""Runs a command with a configuration composed by Hydra, and reports errors in one sentence."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ from .io.settings import parse
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
 TYPED: Final = ("run", "tune", "benchmark", "verify gradients", "verify device")
-_FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that take another configuration than ours
-# Options of Hydra for a job that only prints.
+_FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that replace the package's configuration
+# Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
-_PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # A value that means nothing but itself.
+_PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # a value without quotes, brackets or interpolations
 
 
 def launch(command: str, function: str, arguments: Sequence[str]) -> None:
-    """Runs a command, as `cli.main` says.
+    """Runs a command, with the exit codes of `cli.main`.
 
     Args:
-        command: its name.
-        function: its module below this package and its function, as in "studies.sizes:size_study". The configuration
-            is parsed into the class with which its first parameter is annotated.
+        command: name of the command.
+        function: its module below this package and its function, such as "studies.sizes:size_study". The configuration
+            is parsed into the class that annotates its first parameter.
         arguments: for Hydra.
     """
     reported: list[BaseException] = []
@@ -82,12 +82,12 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     before = sys.argv
     raise_exceptions = logging.raiseExceptions
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on instead of printing them and leaving
-    logging.raiseExceptions = False  # a log file on a full disk must not fill the screen with tracebacks
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
+    logging.raiseExceptions = False  # no traceback for each log line if the disk is full
     OmegaConf.register_new_resolver("run_label", run_label, replace=True)
     try:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
-            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides")
+            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
         rest, shown = [*_own_options(), *map(_quoted, arguments)], None
         if command in TYPED and not _FOREIGN & {*rest}:
             rest, shown = _without_shown(rest)
@@ -103,7 +103,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         sentence = _explain(error, started)
         if sentence is None or full_error:
             raise
-        if not any(error is known for known in reported):
+        if not any(error is earlier for earlier in reported):
             print(f"error: {sentence}", file=sys.stderr, flush=True)
         raise SystemExit(USER_ERROR) from None
     finally:
@@ -114,7 +114,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
 
 def _own_options() -> list[str]:
-    """The arguments that add the user's own options, if there are any; they give way to a --config-dir that follows."""
+    """Arguments that add the folder of the user's own options, if it exists; a later --config-dir replaces it."""
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():
         return []
@@ -122,12 +122,12 @@ def _own_options() -> list[str]:
     for path in sorted(folder.glob("*/*.yaml")):
         if packaged.joinpath(path.parent.name, path.name).is_file():
             name = path.relative_to(Path.cwd())
-            print(f"warning: {name} is not used: the package has an option of that name", file=sys.stderr)
+            print(f"warning: {name} is ignored: the package has an option of that name", file=sys.stderr)
     return ["--config-dir", str(folder)]
 
 
 def _groups(arguments: Sequence[str]) -> set[str]:
-    """Names of the groups that have options, in the package and in the folders of the user."""
+    """Names of the configuration groups, in the package and in the user's folders."""
     pairs = pairwise(arguments)
     added = [Path(value) for option, value in pairs if option in ("--config-dir", "-cd")]
     places = [resources.files(CONFIG_PACKAGE), *(folder for folder in added if folder.is_dir())]
@@ -135,11 +135,11 @@ def _groups(arguments: Sequence[str]) -> set[str]:
 
 
 def freed(arguments: Sequence[str], typed: bool = True) -> list[str]:
-    """Arguments for Hydra that may set keys which no option mentions: the classes of the settings have all keys.
+    """Changes overrides so that they may set keys that no YAML file mentions; the settings classes check the keys.
 
     Args:
-        arguments: as a user writes them.
-        typed: whether the classes have all keys of the command, or those in groups alone.
+        arguments: written by the user.
+        typed: whether settings classes check all keys of the command, or only those in groups.
     """
     groups = _groups(arguments)
     return [_free(argument, groups, typed) for argument in arguments]
@@ -155,7 +155,7 @@ def _free(argument: str, groups: Container[str], typed: bool) -> str:
 
 
 def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
-    """Arguments without ``--cfg job``, and the key whose settings it asks for: empty for all, None without it."""
+    """Removes ``--cfg job``; returns the key whose settings are to be shown as well: empty for all, None without it."""
     rest, asked = list(arguments), dict[str, str]()
     for short, long in (("-c", "--cfg"), ("-p", "--package")):
         for at, argument in enumerate(rest):
@@ -170,7 +170,7 @@ def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
 
 
 def _show(config: DictConfig, key: str) -> None:
-    """Prints the settings of a run, with the defaults of all keys that no option mentions."""
+    """Prints the settings of a run, with the defaults of all keys that are not in a YAML file."""
     from .io.setting_errors import completed
     from .settings.run import RunSettings, with_baseline
 
@@ -181,16 +181,16 @@ def _show(config: DictConfig, key: str) -> None:
 
 
 def _quoted(argument: str) -> str:
-    """The same argument; a value with an equals sign, as run folders are called, in the quotes that Hydra wants."""
+    """Quotes the value of an argument for Hydra if it has an equals sign, as names of run folders do."""
     key, _, value = argument.partition("=")
     plain = _PLAIN.fullmatch(value) is not None and "=" in value
     return f'{key}="{value}"' if plain and not key.startswith("-") else argument
 
 
 def _explain(error: BaseException, started: bool) -> str | None:
-    """The sentence to print for an error that the user can mend; None for a fault of the program.
+    """Message for an error that the user can fix; None for a fault of the program.
 
-    Before the job has started, it is the command line that is wrong.
+    Before the job has started, errors are those of the command line.
     """
     cause = error.__cause__
     if isinstance(error, ResphysError):
@@ -201,8 +201,7 @@ def _explain(error: BaseException, started: bool) -> str | None:
         return _explain(cause, started)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        known = ", ".join(error.options)
-        return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {known}"
+        return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {', '.join(error.options)}"
     if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
         return _explain_key(error, cause)
     if isinstance(error, OverrideParseException):
@@ -218,19 +217,19 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, MarkedYAMLError):
         mark = error.problem_mark
         place = "a configuration" if mark is None else f"{mark.name}, line {mark.line + 1}"
-        return f"{place} cannot be read as YAML ({error.problem}): mend it there or in the lines before"
+        return f"{place} cannot be read as YAML ({error.problem}): correct this line or the lines before"
     if isinstance(error, OSError):
         return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
     return _sentence(error) if isinstance(error, ValueError) else None
 
 
 def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
-    """Names the closest keys where one was set that does not exist."""
+    """Message for a key that does not exist, with the most similar keys."""
     named = re.search(r"'([^']+)'", str(error))
     wanted = named.group(1) if named else str(cause.full_key)
     root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
     known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
-    if wanted in known:  # The value has a key of its own that does not exist.
+    if wanted in known:  # a key inside the value does not exist
         wanted = str(cause.full_key)
     same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
     hint = did_you_mean(wanted, known, preferred=same_name)
@@ -238,7 +237,7 @@ def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
 
 
 def _keys(config: Any, prefix: str = "") -> Iterator[str]:
-    """The dotted names of all entries of a configuration."""
+    """Yields the dotted names of all entries of a configuration."""
     if isinstance(config, dict):
         for key, value in config.items():
             yield f"{prefix}{key}"
@@ -246,7 +245,7 @@ def _keys(config: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _sentence(error: BaseException) -> str:
-    """The message of a library in one line, without the parts that do not help."""
+    """Message of a library error in one line, without lists of search paths and types."""
     text = re.split(r"\n\s*(?:Config search|Search path|full_key|object_type|reference_type|See )", str(error))[0]
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if isinstance(error, OmegaConfBaseException) and error.full_key and error.full_key not in lines[0]:

@@ -1,6 +1,6 @@
-"""An experiment: its stages in order, from a configuration, for one split or for every fold of a cross-validation.
+"""An experiment: its stages in order, for one split or for every fold of a cross-validation.
 
-A stage is there because the configuration asks for what it makes; its settings are all that its files depend on.
+The configuration determines the stages. The settings of a stage are exactly what its files depend on.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,26 +85,26 @@ from .settings.stages import (
 )
 from .settings.trials import Split, Trial
 
-_MOST_COLUMNS = 5  # folds that stand beside each other in a terminal
+_MOST_COLUMNS = 5  # largest number of folds that are shown as columns in a terminal
 
 Work = Callable[[StageContext], None]
 
 
 def files_read(run: RunSettings, mesh: MeshSettings) -> dict[str, str]:
-    """SHA-256 of the files that bodies and the motions of their bases are read from, by path.
+    """Returns the SHA-256 of the files of bodies and base motions, by path.
 
     Args:
-        run: its settings.
+        run: settings of the run.
         mesh: of the simulator, or of the laboratory.
 
     Raises:
-        DataFileError: a file that is not there.
+        DataFileError: a file cannot be read.
     """
     folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
     moved = {motion.file for motion in run.motions().values() if motion.file is not None}
-    found = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
-    paths = [getattr(each, "path", None) for each in (mesh, *(part.mesh for part in run.parts.values()))]
-    return found | {path: digest(path) for path in paths if path is not None}
+    motions = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
+    paths = [getattr(source, "path", None) for source in (mesh, *(part.mesh for part in run.parts.values()))]
+    return motions | {path: digest(path) for path in paths if path is not None}
 
 
 def _digest(path: Path, key: str) -> str:
@@ -115,13 +115,13 @@ def _digest(path: Path, key: str) -> str:
 
 
 def acquisition_stages(run: RunSettings) -> list[Stage]:
-    """The stages that lead to dataset.h5: a simulation of the trials, or their import, perhaps from a laboratory.
+    """Returns the stages that write dataset.h5: simulation of the trials, or import of (simulated) recordings.
 
     Args:
-        run: that `check_run` accepts.
+        run: settings that `check_run` accepts.
 
     Raises:
-        DataFileError: a recording that is not there.
+        DataFileError: a recording cannot be read.
     """
     files, trials, data = files_read(run, run.mesh), trials_of(run), run.recorded
     if data is None:
@@ -133,7 +133,9 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
         stages.append(_laboratory_stage("laboratory", run, trials))
         upstream = ("laboratory",)
     else:
-        recordings = {str(each.file): _digest(Path(str(each.file)), f"data.trials.{each.name}.file") for each in trials}
+        recordings = {
+            str(trial.file): _digest(Path(str(trial.file)), f"data.trials.{trial.name}.file") for trial in trials
+        }
         imported = imported.model_copy(update={"files": {**files, **recordings}})
     stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, upstream))
     scaled = scaled_trials_of(run)
@@ -145,7 +147,7 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
 
 
 def _played(run: RunSettings) -> PlayedSettings:
-    """What the recordings of a simulated laboratory depend on, but for the trials."""
+    """Settings that the recordings of a simulated laboratory depend on, without the trials."""
     assert run.laboratory is not None
     return PlayedSettings.of(run, files=files_read(run, run.laboratory.mesh))
 
@@ -158,21 +160,21 @@ def _laboratory_stage(name: str, run: RunSettings, trials: Sequence[Trial], *ups
 
 
 def workers_of(run: RunSettings) -> Workers:
-    """The workers that share a run."""
+    """Returns the workers of a run."""
     return workers_for(run.parallel, run.parallel.processes, run.device)
 
 
 def learning_stages(
     run: RunSettings, split: Split, shared: str, acquired: str, workers: Workers | None = None
 ) -> list[Stage]:
-    """The stages of one split, from the identification to the report.
+    """Returns the stages of one split, from identification to report.
 
     Args:
-        run: that `check_run` accepts.
+        run: settings that `check_run` accepts.
         split: names of trials.
         shared: the folder of dataset.h5, relative to that of the split.
-        acquired: fingerprint of the stage that wrote it.
-        workers: that share the work; as the configuration says, if left out.
+        acquired: fingerprint of the stage that wrote dataset.h5.
+        workers: of the stages; those of the configuration if omitted.
     """
     workers = workers_of(run) if workers is None else workers
     needs = () if run.identify is None else ("identify",)
@@ -186,7 +188,7 @@ def learning_stages(
         stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
     reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
     learned = []
-    for model in (each for each in run.models if each in LEARNED and each != SIMFREE):
+    for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:
         first, second = f"reconstruct_{model}", f"train_{model}"
         forces = ReconstructStage.of(run, **common, model=model, reconstructed=reconstructed)
         add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), forces)
@@ -197,9 +199,8 @@ def learning_stages(
             add(f"refine_{model}", refine, outputs, RefineStage.of(run, **common, model=model), first, second)
         learned.append(stages[-1].name)
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
-    if (
-        run.markers is None and run.target is not None
-    ):  # What replaces a simulator depends on none, where states are known without.
+    if run.markers is None and run.target is not None:
+        # With observed states, a network that replaces the simulator does not depend on it.
         trained = trained.model_copy(update={"simulation": run.target})
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
@@ -221,24 +222,24 @@ def learning_stages(
 
 
 def shown_of(run: RunSettings) -> RunSettings:
-    """The settings without what has no bearing on a run."""
+    """Returns the settings without those that do not affect a run."""
     return run.model_copy(update={"tune": {}})
 
 
 def control_stages(
     run: RunSettings, control: ControlSettings, common: Mapping[str, Any], workers: Workers
 ) -> list[Stage]:
-    """The stages of a run that plan on its models, and where a simulation plays the robot, drive it.
+    """Returns the stages of control: plans on the models, and with a simulated laboratory, driven motions.
 
     Args:
-        run: that `check_run` accepts.
-        control: its group.
-        common: what all stages of the split depend on beside its settings.
-        workers: that share the motions.
+        run: settings that `check_run` accepts.
+        control: its group ``control``.
+        common: settings that all stages of the split share.
+        workers: of the driven motions.
     """
     stages, last = list[Stage](), control.models[-1]
     figures = FigureSettings.of(control)
-    for model in reversed(control.models):  # The last is to reach the paths, which is seen first.
+    for model in reversed(control.models):  # The last model must reach the paths, so it is checked first.
         first = f"reduce_{model}"
         reduced = ReduceStage.of(run, **common, model=model, reduction=control.reduction)
         stages.append(Stage(first, reduce_robot, (reduced_file(model),), reduced, ("evaluate",)))
@@ -248,10 +249,9 @@ def control_stages(
     if run.laboratory is None:
         return stages
     played, needs = _played(run), tuple(stage.name for stage in stages)
-    known = {"model": last, "figures": figures, "feedback": control.feedback, "played": played}
-    stages.append(
-        Stage("baselines", fit_baselines, (BASELINES,), BaselinesStage.of(run, **common, **known), ("evaluate",))
-    )
+    own = {"model": last, "figures": figures, "feedback": control.feedback, "played": played}
+    settings = BaselinesStage.of(run, **common, **own)
+    stages.append(Stage("baselines", fit_baselines, (BASELINES,), settings, ("evaluate",)))
     driven = DriveStage.of(run, **common, played=played)
     work = partial(drive, workers=workers)
     stages.append(Stage("drive", work, (DRIVEN, CONTROL), driven, (*needs, "baselines")))
@@ -259,19 +259,19 @@ def control_stages(
 
 
 def prepare(run: RunSettings) -> None:
-    """Checks a run, and sets up libraries for it.
+    """Checks a run, and configures Warp and torch for it.
 
     Raises:
-        InputError: values that do not fit the mesh or the trials.
+        InputError: values that do not match the mesh or the trials.
     """
     wp.config.log_level = wp.LOG_WARNING
     if run.device == "cpu" or not torch.cuda.is_available():
-        torch.set_num_threads(1)  # The networks are small: see threads.py.
+        torch.set_num_threads(1)  # The networks are too small for several threads (linalg/threads.py).
     check_run(run)
 
 
 def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
-    """Runs the stages that lead to the trials; returns them, and the fingerprint of the one that writes dataset.h5."""
+    """Runs the stages that write dataset.h5; returns them, and the fingerprint of the last."""
     stages = acquisition_stages(run)
     run_stages(stages, folder, wait)
     (written,) = (stage.name for stage in stages if DATASET in stage.outputs)
@@ -279,10 +279,10 @@ def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[St
 
 
 def run_experiment(run: RunSettings, folder: Path) -> None:
-    """Runs what has changed, writes metrics.json into the run folder and prints the errors.
+    """Runs the stages that have changed, writes metrics.json to the run folder and prints the errors.
 
     Raises:
-        InputError: a value that cannot be used.
+        InputError: an invalid setting.
     """
     prepare(run)
     if run.ablation is not None:
@@ -308,19 +308,19 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
 def _run_folds(
     run: RunSettings, folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
 ) -> dict[str, Any]:
-    """What metrics.json says of a cross-validation, each fold of which has a folder of its own."""
+    """Runs a cross-validation, each fold in its own folder; returns the content of metrics.json."""
     folds = {
         name: Fold(name, folder / fold_folder(name), partial(learning_stages, run, split, "..", acquired))
         for name, split in splits.items()
     }
     run_folds(folds, workers_of(run))
-    found = {}
+    metrics = {}
     for name, fold in folds.items():
-        found[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
-        write_json(fold.folder / METRICS, found[name])
+        metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
+        write_json(fold.folder / METRICS, metrics[name])
     return {
-        "errors_mm": summarise_folds([each["errors_mm"] for each in found.values()]),
-        "folds": found,
+        "errors_mm": summarise_folds([of_fold["errors_mm"] for of_fold in metrics.values()]),
+        "folds": metrics,
         **intervals_of_folds(folder / DATASET, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
@@ -329,20 +329,20 @@ def _run_folds(
 
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
-    """Errors as a table, a column for every fold, horizon and pressure scale that tells more, and what they say."""
+    """Prints a table of errors, with columns for folds, horizons and input scales, and the conclusions."""
     whole = metrics["errors_mm"]
     folds = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
     columns = folds if len(folds) <= _MOST_COLUMNS else {}
-    columns |= {f"first {seconds} s": found for seconds, found in metrics.get("horizons", {}).items()}
-    columns |= {f"{scale} x": found for scale, found in metrics.get("scales", {}).items()}
-    columns = {name: found for name, found in columns.items() if found != whole}
+    columns |= {f"first {seconds} s": errors for seconds, errors in metrics.get("horizons", {}).items()}
+    columns |= {f"{scale} x": errors for scale, errors in metrics.get("scales", {}).items()}
+    columns = {name: errors for name, errors in columns.items() if errors != whole}
     what = "vertices" if run.markers is None else "markers"
-    title = f"Error of the {what} in what no training saw" + "; x: times the inputs" * ("scales" in metrics)
+    title = f"Error of the {what} in the test trials" + "; x: times the inputs" * ("scales" in metrics)
     table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
     for model, summary in whole.items():
-        each = [number_text(found[model]["mean"]) if model in found else "" for found in columns.values()]
+        means = [number_text(errors[model]["mean"]) if model in errors else "" for errors in columns.values()]
         std = "" if summary["std"] is None else number_text(summary["std"])
-        table.add_row(model, number_text(summary["mean"]), std, *each, str(summary["diverged"]))
+        table.add_row(model, number_text(summary["mean"]), std, *means, str(summary["diverged"]))
     console = Console()
     console.print(table)
     if folds and not columns:
@@ -350,25 +350,23 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
         for trial, errors in folds.items():
             by_trial.add_row(trial, *(number_text(errors[model]["mean"]) for model in whole))
         console.print(by_trial)
-    for model, found in metrics.get("range", {}).items():
-        if found["left"]:
-            first = min(found["first_s"].values())
-            console.print(
-                f"{model}: {found['left']} test trials leave the states of the training, from {first:.2f} s on."
-            )
+    for model, outside in metrics.get("range", {}).items():
+        if outside["left"]:
+            first = min(outside["first_s"].values())
+            console.print(f"{model}: {outside['left']} test trials leave the training range, from {first:.2f} s on.")
     if metrics.get("control"):
         console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
-    for said in conclusions(metrics, run):
-        console.print(said, soft_wrap=True)
+    for sentence in conclusions(metrics, run):
+        console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 
 
 def _driven(tracking: Mapping[str, Mapping[str, Any]]) -> Table:
-    """How well each controller followed paths, by the seconds that these took."""
+    """Table of the controllers' errors, by the duration of the paths."""
     columns = [f"in {float(seconds):g} s [mm]" for seconds in tracking]
-    table = Table("controller", *columns, title="Mean distance from the paths that were driven")
+    table = Table("controller", *columns, title="Mean distance from the paths")
     for name in next(iter(tracking.values())):
-        table.add_row(controller_name(name), *(number_text(each[name]["mean_mm"]) for each in tracking.values()))
+        table.add_row(controller_name(name), *(number_text(errors[name]["mean_mm"]) for errors in tracking.values()))
     return table

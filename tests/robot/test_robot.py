@@ -278,7 +278,7 @@ class TestBadInput:
             (lambda r, s: r.step(s, pressure="high"), "pressure is 'high'"),
             (lambda r, s: r.step(s, pressure={"3": 1.0}), "'3': it has 'chamber_1', 'chamber_2'"),
             (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\): give \(2,\)"),
-            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure is nan"),
+            (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure has values that are not finite"),
             (lambda r, s: r.step(s, external_force=[0.0, 0.0, 1.0]), r"external_force has shape \(3,\)"),
             (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "steps"),
             (lambda r, s: r.with_parameters(youngs=1.0), "'youngs'.*youngs_modulus"),

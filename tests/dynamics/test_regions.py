@@ -181,3 +181,21 @@ def test_modes_and_stiffness_of_a_body_with_a_rigid_part():
     moved, wanted = (RestStiffness(s).displacements(force) for s in (simulator, other))
     np.testing.assert_allclose(moved, wanted, atol=1e-3 * np.abs(wanted).max())
     assert vibration_modes(simulator, 4).shape == (3 * body.n_vertices, 4)
+
+
+def test_an_insert_that_many_vertices_surround_does_not_widen_the_band():
+    box = box_hexahedra((0.1, 0.03, 0.03), (12, 5, 5))
+    centres = box.vertices[box.cells].mean(1) - [0.05, 0.015, 0.015]
+    core = (np.abs(centres) < [0.03, 0.006, 0.006]).all(1)
+    mesh = Mesh(box.vertices, box.cells, {"core": np.flatnonzero(core), "soft": np.flatnonzero(~core)})
+    body = Body(mesh, select_vertices(mesh, x=0.0), rigid={"core": Rigid()})
+    ends = {}
+    for solver in ("auto", "banded"):
+        settings = SolverSettings(relative_tolerance=1e-11, linear_solver=solver)
+        simulator = Simulator(body, {"soft": Corotated(2e5, 0.45)}, time_step=0.01, integrator="bdf2", solver=settings)
+        modulus = torch.tensor([2e5], dtype=torch.float64, requires_grad=True)
+        q = simulator.rollout(simulator.rest_state(), 4, parameters={"soft_youngs_modulus": modulus}).q
+        (slope,) = torch.autograd.grad(q[-1, 0, -1, 2], modulus)
+        ends[solver] = q[-1].detach(), slope
+    torch.testing.assert_close(ends["auto"][0], ends["banded"][0], rtol=0.0, atol=1e-11)
+    torch.testing.assert_close(ends["auto"][1], ends["banded"][1], rtol=1e-7, atol=0.0)

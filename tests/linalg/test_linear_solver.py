@@ -6,15 +6,18 @@ import scipy.linalg
 import torch
 
 from warp_resphys.linalg import sparse
+from warp_resphys.linalg.banded import BandedSolver
+from warp_resphys.linalg.bordered import BorderedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
 
-NODES, BATCH = 12, 3
+NODES, BATCH, HUB = 16, 3, 5
 
 
 def pattern():
-    """A ring with a few chords: its given order has full bandwidth."""
+    """A ring with a few chords and a node that couples to all: its given order has full bandwidth."""
     pairs = {(i, i) for i in range(NODES)} | {(max(i, (i + 1) % NODES), min(i, (i + 1) % NODES)) for i in range(NODES)}
+    pairs |= {(max(i, HUB), min(i, HUB)) for i in range(NODES)}
     rows, cols = np.array(sorted(pairs | {(7, 2), (9, 4)})).T
     return rows, cols
 
@@ -49,7 +52,7 @@ def make(kind, block, device="cpu", dtype=torch.float64):
 
 
 def layouts(device):
-    return ["dense", "sparse", "tiled", "multigrid"] + (["banded"] if device == "cpu" else [])
+    return ["dense", "sparse", "tiled", "multigrid"] + (["banded", "bordered"] if device == "cpu" else [])
 
 
 @pytest.fixture(params=[True, False], ids=["cholespy", "scipy"])
@@ -215,3 +218,14 @@ def test_band_storage_is_lapacks():
     for matrix, band in zip(dense, bands, strict=True):
         reference = np.linalg.solve(matrix[np.ix_(order, order)], right)
         np.testing.assert_allclose(scipy.linalg.solveh_banded(band.T, right, lower=True), reference, rtol=1e-9)
+
+
+def test_a_matrix_like_an_arrow_is_solved_as_one():
+    """The nodes of a chain of 200 couple to their neighbours, and all of them to the first."""
+    n = 200
+    pairs = {(i, i) for i in range(n)} | {(i, i - 1) for i in range(1, n)} | {(i, 0) for i in range(n)}
+    rows, cols = np.array(sorted(pairs)).T
+    cpu = torch.device("cpu")
+    assert isinstance(make_linear_solver("auto", rows, cols, n, 3, cpu, torch.float64), BorderedSolver)
+    chain = rows - cols < 2
+    assert isinstance(make_linear_solver("auto", rows[chain], cols[chain], n, 3, cpu, torch.float64), BandedSolver)

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from ..io.errors import InputError
 from ..kernels.tiled_cholesky import TILE
 from .banded import BandedSolver
+from .bordered import BorderedSolver, banded_rest, hubs
 from .dense import DenseSolver
-from .linear_solver import Indices, LinearSolver, bandwidth_reducing_order
+from .linear_solver import Indices, LinearSolver, bandwidth
 from .multigrid import MultigridSolver
 from .sparse import SparseSolver
 from .tiled import TiledSolver
 
-LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "multigrid"]
+LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
 MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
 MAX_TILED_BANDWIDTH = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
@@ -45,12 +46,13 @@ def make_linear_solver(
     """
     if name not in LINEAR_SOLVERS:
         raise InputError(f"linear_solver is {name!r}: choose one of {', '.join(LINEAR_SOLVERS)}.")
-    if name == "banded" and device.type != "cpu":
-        raise InputError("linear_solver=banded runs on the CPU alone: choose tiled, dense, sparse or auto on a GPU.")
+    if name in ("banded", "bordered") and device.type != "cpu":
+        raise InputError(f"linear_solver={name} runs on the CPU alone: choose tiled, dense, sparse or auto on a GPU.")
     if name == "auto":
         name = _cheapest(rows, cols, n_nodes, block, device)
     solvers: dict[str, Callable[..., LinearSolver]] = {
         "banded": BandedSolver,
+        "bordered": BorderedSolver,
         "tiled": TiledSolver,
         "dense": DenseSolver,
         "sparse": SparseSolver,
@@ -62,16 +64,19 @@ def make_linear_solver(
 def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
     """By what a factor takes of memory, and by the operations that a wide band costs.
 
-    A band of width w takes n w numbers and n w^2 operations, dense n^2 and n^3 / 3; where the band is wide, a sparse
+    A band of width w takes n w numbers and n w^2 operations, one with a border of m unknowns 4 n w m more,
+    dense n^2 and n^3 / 3; where the band is wide, a sparse
     factor fills in less. The limit on a CPU was measured (``warp-resphys benchmark sizes``); those on a GPU are
     arithmetic.
     """
-    order = bandwidth_reducing_order(rows, cols, n_nodes)
-    place = np.argsort(order)
-    bandwidth = block * int(np.abs(place[rows] - place[cols]).max(initial=0) + 1)
-    unknowns = n_nodes * block
+    unknowns, width = n_nodes * block, block * bandwidth(rows, cols, n_nodes)
     if device.type == "cpu":
-        return "banded" if unknowns * bandwidth**2 <= MAX_BANDED_FLOPS else "multigrid"
-    if bandwidth + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):
+        costs = {"banded": unknowns * width**2}
+        if len(border := hubs(rows, cols, n_nodes)):
+            rest = block * bandwidth(*banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border))
+            costs["bordered"] = unknowns * rest * (rest + 4 * block * len(border))
+        name = min(costs, key=lambda solver: costs[solver])
+        return name if costs[name] <= MAX_BANDED_FLOPS else "multigrid"
+    if width + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):
         return "tiled"
     return "dense" if unknowns <= MAX_DENSE_UNKNOWNS else "sparse"

@@ -236,6 +236,12 @@ class LinearSolver(ABC):
         return rows[:, None] * self.block + r, cols[:, None] * self.block + c
 
 
+def bandwidth(rows: Indices, cols: Indices, n_nodes: int) -> int:
+    """Returns the number of nodes in the band, the diagonal included, in `bandwidth_reducing_order`."""
+    place = np.argsort(bandwidth_reducing_order(rows, cols, n_nodes))
+    return int(np.abs(place[rows] - place[cols]).max(initial=0)) + 1
+
+
 def bandwidth_reducing_order(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
     """(n_nodes,) node at each place, in the given order or reverse Cuthill-McKee's: whichever band is smaller."""
     i, j = np.concatenate([rows, cols]), np.concatenate([cols, rows])

@@ -352,8 +352,8 @@ class SolveSettings(Settings):
     refactor_after: Natural = setting(
         4, "iterations of a step above which quasi_newton factorises an environment anew before its next"
     )
-    linear_solver: Literal["auto", "banded", "tiled", "dense", "sparse", "multigrid"] = setting(
-        "auto", "of Newton's equation; banded runs on the CPU alone"
+    linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"] = setting(
+        "auto", "of Newton's equation; banded and bordered run on the CPU alone"
     )
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; residuals, states and gradients stay accurate"

@@ -35,7 +35,7 @@ GRADIENT_BOUND: Final = 1e-6  # relative
 RATIOS: Final = (0.45, 0.499)
 _TOLERANCE: Final = {torch.float64: 1e-9, torch.float32: 1e-5}  # of the solvers that are compared
 _MATERIAL: Final = {"youngs_modulus": 2.64e5, "density": 1070.0, "mass_damping": 0.5, "stiffness_damping": 0.002}
-_CPU_ONLY: Final = {"banded"}
+_CPU_ONLY: Final = {"banded", "bordered"}
 
 
 class CheckSettings(Settings):

@@ -1,0 +1,149 @@
+r"""Banded Cholesky, with the few nodes that couple to many others last: a matrix in the shape of an arrow.
+
+The control vertices of a rigid part couple to every vertex around it, and would widen the band to the part's size. Of
+
+    [A  B^T] [x]   [f]
+    [B  C  ] [y] = [g],
+
+with A the banded rest, A^-1 B^T is solved once a factor, and S = C - B A^-1 B^T is a small dense matrix:
+
+    y = S^-1 (g - B A^-1 f),   x = A^-1 f - A^-1 B^T y.
+
+The whole is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares it with dense
+factorisations.
+"""
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from .banded import BandedSolver
+from .linear_solver import Factor, Indices, LinearSolver
+
+_HUB = 4.0  # times as many neighbours as half of the nodes have at most
+_MOST_HUBS = 64  # nodes
+
+
+def hubs(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
+    """Returns the nodes that couple to many times as many others as most nodes do, ascending; none if too many."""
+    apart = rows != cols
+    neighbours = np.bincount(np.concatenate([rows[apart], cols[apart]]), minlength=n_nodes)
+    found = np.flatnonzero(neighbours > _HUB * max(float(np.median(neighbours)), 1.0))
+    return found if len(found) <= _MOST_HUBS else found[:0]
+
+
+def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> tuple[Indices, Indices, Indices]:
+    """Returns rows and columns of the blocks between nodes that are not in the border, and the number of each there."""
+    inside = np.ones(n_nodes, dtype=bool)
+    inside[border] = False
+    number = np.where(inside, np.cumsum(inside) - 1, -1)
+    kept = inside[rows] & inside[cols]
+    return number[rows[kept]], number[cols[kept]], number
+
+
+class BorderedSolver(LinearSolver):
+    """Banded Cholesky of all nodes but `hubs`, which a dense matrix of their own takes; on the CPU."""
+
+    @override
+    def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
+        border = hubs(rows, cols, n_nodes)
+        own_rows, own_cols, number = banded_rest(rows, cols, n_nodes, border)
+        self.band = BandedSolver(
+            own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype, self.positions
+        )
+        k, n = self.block, self.n
+        place = np.full(n_nodes, -1)
+        place[border] = np.arange(len(border))
+        inside = np.flatnonzero(number >= 0)
+        self.address = np.empty((len(rows), k * k), dtype=np.int32)
+        kept = (number[rows] >= 0) & (number[cols] >= 0)
+        self.address[kept] = self.band.address
+        r, c = self._entries(rows[~kept], cols[~kept])
+        below = (place[rows[~kept]] >= 0)[:, None]
+        hub = np.where(below, place[rows[~kept]][:, None], place[cols[~kept]][:, None]) * k + np.where(below, r, c) % k
+        self.address[~kept] = self.band.n_values + hub * n + np.where(below, c, r)
+        self.n_values = self.band.n_values + len(border) * k * n
+        self.order = np.concatenate([inside[self.band.order], border])
+        unknowns = (np.concatenate([inside, border])[:, None] * k + np.arange(k)).ravel()
+        self._unknowns = torch.as_tensor(unknowns, device=self.device)
+        self.band_size = n - len(border) * k
+
+    @override
+    def _factorise(
+        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
+    ) -> Factor:
+        banded, border = values.split([self.band.n_values, self.n_values - self.band.n_values], -1)
+        arrow = border.reshape(len(values), -1, self.n)[..., self._unknowns]  # (B, m, n) B and C
+        cross, corner = arrow[..., : self.band_size].mT, arrow[..., self.band_size :].tril()
+        corner = corner + corner.tril(-1).mT
+        kept = before if isinstance(before, _Bordered) else None
+        inner = self.band.factor(banded.clone(), definite, idle=idle, before=None if kept is None else kept.inner)
+        return _Bordered(self, inner, cross, corner, definite, idle, kept)
+
+
+class _Bordered(Factor):
+    """Factors of A and S, and what joins them.
+
+    Args:
+        solver: whose layout this is.
+        inner: factor of A.
+        cross: (B, n - m, m) B^T.
+        corner: (B, m, m) C.
+        definite: whether S is to be positive definite.
+        idle: (B,) matrices that keep the factor they have, if any.
+        before: the factors they have.
+    """
+
+    cross: torch.Tensor
+    corner: torch.Tensor
+
+    def __init__(
+        self,
+        solver: BorderedSolver,
+        inner: Factor,
+        cross: torch.Tensor,
+        corner: torch.Tensor,
+        definite: bool,
+        idle: torch.Tensor | None,
+        before: "_Bordered | None",
+    ) -> None:
+        if idle is not None and before is not None:
+            cross = torch.where(idle[:, None, None], before.cross, cross)
+            corner = torch.where(idle[:, None, None], before.corner, corner)
+        self.solver, self.inner, self.cross, self.corner = solver, inner, cross, corner
+        self.solved = inner.solve(cross)  # (B, n - m, m) A^-1 B^T
+        schur = corner - cross.mT @ self.solved
+        failed = torch.zeros(len(corner), dtype=torch.bool)
+        if definite:
+            factor, info = torch.linalg.cholesky_ex(schur.nan_to_num(posinf=0.0, neginf=0.0))
+            failed, self._small = info > 0, (factor,)
+        else:
+            self._small = torch.linalg.lu_factor_ex(schur)[:2]
+        if idle is not None and before is None:
+            failed &= ~idle
+        self.failed = inner.failed | failed.numpy()
+        order = solver.band.dofs
+        self._cross_in_order, self._solved_in_order = self.cross[:, order], self.solved[:, order]
+
+    def _corner_solve(self, right: torch.Tensor) -> torch.Tensor:
+        if len(self._small) == 1:
+            return torch.cholesky_solve(right, self._small[0])
+        return torch.linalg.lu_solve(*self._small, right)
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        f, g = rhs[:, self.solver._unknowns].split([self.solver.band_size, self.cross.shape[2]], 1)
+        x = self.inner.solve(f)
+        y = self._corner_solve(g - self.cross.mT @ x)
+        out = torch.empty_like(rhs)
+        out[:, self.solver._unknowns] = torch.cat([x - self.solved @ y, y], 1)
+        return out
+
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        size = self.solver.band_size
+        x, g = columns[:, :size].contiguous(), columns[:, size:, None]
+        self.inner.solve_in_place(x)
+        y = self._corner_solve(g - self._cross_in_order.mT @ x[:, :, None])
+        columns[:, :size] = x - (self._solved_in_order @ y)[:, :, 0]
+        columns[:, size:] = y[:, :, 0]

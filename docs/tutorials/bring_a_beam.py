@@ -8,15 +8,14 @@
 # %% [markdown]
 # # Bring your robot: a beam
 #
-# From CSV files of measured markers to a simulator that is corrected by them. The robot is a silicone beam that is
-# clamped at one end, held straight by hand, and let go, with a weight at its tip or without.
-# [The guide](../bring_your_robot.md) has every option and what each error means; this page does the whole of it once.
+# From CSV files of measured markers to a corrected simulator. The robot is a silicone beam that is
+# clamped at one end, held straight by hand, and released, with or without a weight at its tip.
+# [The guide](../bring_your_robot.md) explains all options and errors; this page shows one complete example.
 #
 # ## Recordings
 #
-# Yours come from cameras. Here a finer simulation of another material is filmed: in the cameras' own frame, in
-# millimetres, with noise, and with markers that sit some tenths of a millimetre (0.3 in each coordinate) from where
-# they should.
+# Real recordings come from cameras. Here a finer simulation of another material replaces them: in the cameras' frame,
+# in millimetres, with noise, and with markers that are misplaced by 0.3 mm in each coordinate.
 
 # %%
 import json
@@ -49,7 +48,7 @@ mass[:, carries] = torch.tensor(list(weights.values()), dtype=torch.float64)[:, 
 motion = robot.rollout(robot.rest_state(len(weights)), 200, inputs=Inputs(attached_mass=mass)).q[::2].numpy()
 
 seen = [int(np.argmin(np.linalg.norm(mesh.vertices - at, axis=1))) for at in (tracked | reference).values()]
-stems = 3e-4 * random.standard_normal((len(seen), 3))  # m: where markers really sit
+stems = 3e-4 * random.standard_normal((len(seen), 3))  # m: offsets of the real marker positions
 cameras, origin = Rotation.from_euler("xyz", (90, 10, 35), degrees=True), np.array([0.4, -0.2, 0.9])
 Path("recordings").mkdir()
 for number, name in enumerate(weights):
@@ -65,9 +64,9 @@ for number, name in enumerate(weights):
 print(header)
 
 # %% [markdown]
-# ## Look at them first
+# ## Inspect the recordings
 #
-# `warp-resphys inspect` shows whether markers are seen and still, how noisy they are, and when the body is let go.
+# `warp-resphys inspect` shows occlusions, drift and noise of the markers, and the time of the release.
 
 
 # %%
@@ -86,9 +85,9 @@ print(
 # %% [markdown]
 # ## The configuration
 #
-# A file in `configs/experiment` says what is yours: the body, its data sheet, the trials, and where the markers are on
-# the undeformed body. Everything else comes from what the package knows of bodies that are let go (`/recordings:
-# released`). `budget=quick` on the command line is for a first look; the numbers below it only make this page short.
+# A file in `configs/experiment` describes your robot: the body, its data sheet, the trials, and the nominal marker
+# positions. Everything else comes from the package's defaults for released bodies (`/recordings: released`).
+# `budget=quick` on the command line is for a first look; the numbers below it only make this page short.
 
 # %%
 Path("configs/experiment").mkdir(parents=True)
@@ -138,8 +137,8 @@ print(command("experiment=my_robot"))
 # %% [markdown]
 # ## Read the report
 #
-# `runs/my_robot/default/report.html` begins with a verdict, and lets you turn the robot and its markers in space. Its
-# numbers are in `metrics.json`, what was identified in `identification.json`.
+# `runs/my_robot/default/report.html` begins with a verdict, and has an interactive view of the robot and its markers.
+# Its numbers are in `metrics.json`, the identified parameters in `identification.json`.
 
 
 # %%
@@ -147,7 +146,7 @@ def results(run):
     """Mean errors [mm] on the trial that no training saw, and the identified parameters."""
     errors = json.loads((run / "metrics.json").read_text())["errors_mm"]
     identified = json.loads((run / "identification.json").read_text())["sysid"]["parameters"]
-    return {name: each["mean"] for name, each in errors.items()}, identified
+    return {name: error["mean"] for name, error in errors.items()}, identified
 
 
 errors, identified = results(Path("runs/my_robot/default"))
@@ -156,15 +155,14 @@ for name, error in errors.items():
 print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 
 # %% [markdown]
-# Identification leaves a millimetre and a half, five times what the markers' placement explains, and the learned force
-# does not help: from two motions it learns those motions. That is the moment to ask what the simulator lacks. Silicone
-# creeps, and nothing in this material remembers anything.
+# The error after identification is 1.5 mm, five times the error of the markers' placement, and the learned force does
+# not help: with two motions it overfits. This indicates that the simulator lacks physics. Silicone creeps, and this
+# material has no memory.
 #
 # ## Better physics
 #
-# A Prony branch is memory: its share of the shear modulus relaxes within its time
-# ([materials](../tendons.md#a-body-that-creeps)). A configuration that builds on the first one says that both are to be
-# identified.
+# A Prony branch adds memory: a share of the shear modulus relaxes with a time constant
+# ([materials](../tendons.md#a-body-that-creeps)). A configuration based on the first one identifies both.
 
 # %%
 Path("configs/experiment/my_creeping_robot.yaml").write_text("""# @package _global_
@@ -189,13 +187,13 @@ share, within = identified["prony_ratio_1"], identified["prony_time_1"]
 print(f"a share of {share:.2f} within {within:.2f} s (true: 0.15 within 0.10 s)")
 
 # %% [markdown]
-# Now the error is that of the markers' own placement, 0.3 mm, which no physics mends, and nothing is left for a force
-# to learn. Where physics is not known, as in the walls of a pneumatic arm, the learned force is what remains, and
-# more recordings are what it needs ([residual forces](residual_forces.py), [a pneumatic arm](pneumatic_arm.py)).
+# Now the error is that of the markers' placement, 0.3 mm, which physics cannot reduce, and a learned force is not
+# needed. If the physics is unknown, as in the walls of a pneumatic arm, use a learned force, with
+# more recordings ([residual forces](residual_forces.py), [a pneumatic arm](pneumatic_arm.py)).
 #
-# ## Take it home
+# ## Use the result
 #
-# The run is a robot now, in Python and in one file.
+# The run is a robot, which can be loaded in Python and saved to one file.
 
 # %%
 robot = warp_resphys.load(run, model="sysid")

@@ -8,14 +8,14 @@
 # %% [markdown]
 # # Bring your robot: a tentacle
 #
-# A tapered rod of silicone hangs from its base, and two tendons pull it. It was filmed at rest, in one pose after
-# another, and the cameras gave its markers no names. There is no mesh: its measures are enough. What of this differs on
-# your robot is said in [the guide](../bring_your_robot.md#a-second-robot-tendons-poses-and-markers-without-names).
+# A tapered silicone rod hangs from its base, pulled by two tendons. It was recorded at rest, in one pose after
+# another, with markers without names. The mesh is generated from the rod's dimensions.
+# [The guide](../bring_your_robot.md#a-second-robot-tendons-poses-and-markers-without-names) explains how to adapt this.
 #
 # ## Poses
 #
-# Again a simulation is filmed in the robot's place. It is stiffer than the data sheet says, finer, and its first tendon
-# lies a millimetre from where the drawing has it, which is the kind of thing that nobody knows of a real one.
+# Again a simulation replaces the robot. It is stiffer than the data sheet's rod, has a finer mesh, and its first tendon
+# is displaced by a millimetre from the drawing, which is typical of a real robot.
 
 # %%
 import json
@@ -52,7 +52,7 @@ reference = {"Base": [0.03, 0.0, 0.005]}
 mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], radii, layers=14)
 along = np.linspace(0.0, 1.0, 21)[:, None]
 paths = [(1 - along) * np.array(start) + along * np.array(end) for start, end in routes.values()]
-paths[0] += [0.001, 0.0, 0.0]  # nobody knows of this
+paths[0] += [0.001, 0.0, 0.0]  # unknown to the simulator
 body = Body(mesh, select_vertices(mesh, z=0.0), energies=[Tendons(paths, labels=tuple(routes))])
 laboratory = Simulator(body, StableNeoHookean(310e3, 0.48, density=1120.0))
 pulled = torch.tensor(list(tensions.values()), dtype=torch.float64)  # (B, 2) N
@@ -63,7 +63,7 @@ seen = clips(poses).numpy()  # (B, 3, 3) m
 Path("poses").mkdir()
 for name, markers in zip(tensions, seen, strict=True):
     places = np.concatenate([markers, np.array(list(reference.values()))])
-    places = places[random.permutation(len(places))]  # cameras give them in any order
+    places = places[random.permutation(len(places))]  # in random order
     frames = np.broadcast_to(places[:, [0, 2, 1]] * [1.0, -1.0, 1.0], (10, len(places), 3))  # y of the cameras is down
     frames = frames + 2e-4 * random.standard_normal(frames.shape)
     table = np.column_stack([0.01 * np.arange(10), frames.reshape(10, -1)])
@@ -85,12 +85,11 @@ plt.show()
 # %% [markdown]
 # ## The configuration
 #
-# - **mesh** is made of the rod's measures.
-# - **table** names the columns of files without a header; any names do for markers that are **assigned**, which are
-#   told apart by where they are. **axes** says how the rod lies in the frame of the cameras, so that one marker that
-#   stands still is enough.
-# - Where tendons run is **identified** with Young's modulus: each may be off across the axis, by a millimetre or so.
-# - **placement**: nobody measured to better than two millimetres where the clips are.
+# - **mesh** is generated from the rod's dimensions.
+# - **table** names the columns of files without a header; markers that are **assigned** by position may have any names.
+#   **axes** gives the orientation of the rod in the frame of the cameras, so that one fixed marker is enough.
+# - The tendons' offsets across the axis, about a millimetre, are **identified** with Young's modulus.
+# - **placement**: the positions of the clips are known to two millimetres.
 
 # %%
 Path("configs/experiment").mkdir(parents=True)
@@ -121,7 +120,7 @@ data:
   table: {{columns: ["time [s]", a.x, a.y, a.z, b.x, b.y, b.z, c.x, c.y, c.z, d.x, d.y, d.z]}}
   axes: [x, z, -y]
   input_limit: 2.0  # N
-  trials: {json.dumps({name: {"file": f"{name}.csv", "inputs": each} for name, each in tensions.items()})}
+  trials: {json.dumps({name: {"file": f"{name}.csv", "inputs": pull} for name, pull in tensions.items()})}
   train: {json.dumps([name for name in tensions if name not in test])}
   test: {json.dumps(test)}
 markers:
@@ -151,25 +150,25 @@ def command(*arguments):
 print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))
 
 # %% [markdown]
-# ## What came of it
+# ## Results
 
 # %%
 run = Path(next(Path("runs/my_tentacle").iterdir()))
 errors = json.loads((run / "metrics.json").read_text())["errors_mm"]
 identified = json.loads((run / "identification.json").read_text())["sysid"]
-for name, each in errors.items():
-    print(f"{name:14s} {each['mean']:6.2f} mm")
+for name, error in errors.items():
+    print(f"{name:14s} {error['mean']:6.2f} mm")
 for name, value in identified["parameters"].items():
     print(f"{name:24s} {value:10.4g}")
 
 # %% [markdown]
-# From six poses of three markers: how stiff the robot is, and where its tendons run, the first one a millimetre off,
-# which is true. What is left is little more than the noise; the learned force had nothing to do, and the training kept
-# none of it. `simfree`, a network in the place of the simulator, has no physics to lean on.
+# Six poses of three markers determine the stiffness and the tendons' offsets, with the true millimetre for the first
+# one. The remaining error is little more than the noise, so that no learned force was kept.
+# `simfree`, a network that replaces the simulator, has no physics to rely on.
 #
-# ## What it is good for
+# ## Application
 #
-# The identified tentacle, loaded in one line, tells where the tip can go: a batch of thirty-six poses at once.
+# The identified tentacle, loaded in one line, computes the reachable positions of the tip: thirty-six poses in a batch.
 
 # %%
 robot = warp_resphys.load(run, model="sysid")
@@ -185,7 +184,7 @@ figure.colorbar(points, label="z of the tip [mm]")
 plt.show()
 
 # %% [markdown]
-# As the robot is a simulation here, it can be asked whether that is so.
+# Here the robot is a simulation, so that this prediction can be checked.
 
 # %%
 asked = laboratory.static_equilibrium(Inputs(tendon_tension=torch.tensor(pairs)), batch=len(pairs)).q

@@ -8,17 +8,16 @@
 # %% [markdown]
 # # Control
 #
-# A corrected simulator is there to plan with. Here the tip of a hanging rod, pulled by three tendons, draws a circle:
-# the tensions are planned on the simulator as the data sheet has it, and on the simulator that was identified from
-# recordings; another simulation, with a finer mesh and another material, plays the robot that executes both plans.
-# [The guide](../control.md) says what each stage does; this page runs all of it at a size that takes a minute or two,
+# A corrected simulator can be used for planning. Here the tip of a hanging rod, pulled by three tendons, draws a
+# circle: the tensions are planned with the data sheet's parameters, and with parameters identified from recordings;
+# another simulation, with a finer mesh and another material, stands in for the robot and executes both plans.
+# [The guide](../control.md) describes each stage; this page runs all of it at a size that takes a minute or two,
 # and then drives the robot from Python.
 #
 # ## The experiment
 #
-# A configuration in `configs/experiment` of the working directory is named by `experiment=`. This one takes
-# `tendon_rod_control` and makes everything small: coarse meshes, six recordings of 0.6 s, a small network, and one
-# circle.
+# `experiment=` selects a configuration in `configs/experiment` of the working directory. This one is based on
+# `tendon_rod_control` and reduces everything: coarse meshes, six recordings of 0.6 s, a small network, and one circle.
 
 # %%
 import csv
@@ -68,18 +67,18 @@ print("\n".join(ended.stdout.splitlines()[-3:]), ended.stderr[-2000:] if ended.r
 run = Path("runs/drawing/default")
 
 # %% [markdown]
-# ## Who follows the circle best
+# ## Comparison of controllers
 #
-# `control.json` has the mean distance of the tip from where it should be: of each plan as it was executed (open loop),
-# of a plan that begins anew at every step from what the markers show (receding horizon), and of two baselines that
-# know no simulator, a linear model of the recordings and feedback by the robot's Jacobian.
+# `control.json` has the mean distance of the tip from its reference: for each plan in open loop,
+# for a receding horizon, which plans at every step from the observed markers, and for two baselines
+# without a simulator, a linear model of the recordings and feedback by the robot's Jacobian.
 
 # %%
-told = json.loads((run / "control.json").read_text())
-errors = {name: found["mean_mm"] for name, found in told["tracking"]["1.5"].items()}
+results = json.loads((run / "control.json").read_text())
+errors = {name: error["mean_mm"] for name, error in results["tracking"]["1.5"].items()}
 for name, error in errors.items():
     print(f"{name:16s} {error:6.2f} mm")
-planning = told["command_ms"]["receding_sysid"]["median"]
+planning = results["command_ms"]["receding_sysid"]["median"]
 print(f"a new plan takes {planning:.1f} ms; a step lasts 10 ms")
 
 # %%
@@ -90,7 +89,7 @@ with h5py.File(run / "driven.h5") as file:
 figure, axes = plt.subplots(1, 3, figsize=(8.5, 3.2), sharex=True, sharey=True, layout="constrained")
 titles = ("open_simulation", "open_sysid", "receding_sysid")
 for axis, name in zip(axes, titles, strict=True):
-    axis.plot(*path[:, :2].T, color="0.75", linewidth=5, label="asked")
+    axis.plot(*path[:, :2].T, color="0.75", linewidth=5, label="reference")
     axis.plot(*points[names.index(name)][:, :2].T, color="#1a5fb4", label="executed")
     axis.set(title=f"{name}: {errors[name]:.2f} mm", xlabel="x [mm]", aspect="equal")
 axes[0].set_ylabel("y [mm]")
@@ -98,13 +97,12 @@ axes[0].legend(loc="center", frameon=False)
 plt.show()
 
 # %% [markdown]
-# The robot does not hang in the middle of the circle: the motion begins where it hangs, and leads to the circle in
-# a quarter of the circle's time before it, the first fifth of the motion.
+# The motion begins at the robot's rest position and leads to the circle in the first fifth of its duration.
 #
 # ## A plan is a table
 #
-# `plans/sysid_circle_1.5s.csv` is what a real robot is given: times, where the model expects the markers, and the
-# tensions to command. The identified simulator, loaded in three lines, plays it and goes where the plan says.
+# `plans/sysid_circle_1.5s.csv` is the plan for a real robot: times, predicted markers, and commanded
+# tensions. The identified simulator, loaded in three lines, plays it and follows the prediction.
 
 # %%
 robot = warp_resphys.load(run, model="sysid")
@@ -115,7 +113,7 @@ tensions = table[1:, [number for number, head in enumerate(heads) if head.starts
 expected = table[:, 1 : 1 + 3 * len(robot.labels)].reshape(len(table), -1, 3)
 played = robot.rollout(robot.begin(tendon_tension=tensions[0] * 0.0), tendon_tension=tensions)
 off = 1e3 * np.linalg.norm(played.markers[:, 0].numpy() - expected, axis=-1)
-print(f"markers are {off.mean():.3f} mm from where the plan has them, {off.max():.3f} at most")
+print(f"distance of the markers from the plan: {off.mean():.3f} mm on average, {off.max():.3f} mm at most")
 
 # %%
 figure, axis = plt.subplots(figsize=(7, 2.6), layout="constrained")
@@ -125,11 +123,10 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# ## What this shows
+# ## Summary
 #
-# The plan on the identified simulator leaves two thirds of the error of the plan on the data sheet, as far as six
-# short recordings can tell the material; planning anew at every step leaves less than a millimetre, and less than both
-# baselines.
+# With parameters identified from six short recordings, the error of the plan is two thirds of that with the data
+# sheet's parameters; the receding horizon has an error of less than a millimetre, and less than both baselines.
 
 # %%
 assert off.max() < 0.2

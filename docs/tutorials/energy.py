@@ -9,8 +9,8 @@
 # # Write your own energy
 #
 # Materials, pressure, fibres, tendons, muscles and water are energies. A new one is a Warp function and a class of a
-# few lines; solver, adjoint, tape and identification take it as they take the others, and know no energy by name. This
-# page writes a floor that a block falls on, and an elastic string.
+# few lines; solver, adjoint, tape and identification support it without changes. This
+# page implements a floor, on which a block falls, and an elastic string.
 #
 # ## The equation
 #
@@ -23,11 +23,11 @@
 #
 # ## The function and the class
 #
-# An energy is summed over points. A point sees a weighted sum of a few vertices: where a vertex is, the way from one to
-# another, or, as a matrix, the deformation gradient in a cell. The energy of a point is a Warp function of this and of
-# the point's values, which are the parameters and inputs that the class declares, in their order, with units and ranges
-# that are checked for whoever gives them. Warp differentiates the function for the forces; their own derivatives, for
-# Newton steps and gradients, are differences of fourth order of these, exact to about nine digits.
+# An energy is a sum over points. Its argument is a weighted sum of a few vertices: the position of a vertex, the vector
+# from one to another, or, as a matrix, the deformation gradient in a cell. The energy of a point is a Warp function of
+# this argument and of the point's values: the parameters and inputs that the class declares, in their order, with units
+# and ranges, which are checked. Warp differentiates the function for the forces; the second derivatives, for
+# Newton steps and gradients, are fourth-order differences of the forces, exact to about nine digits.
 
 # %%
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Floor(PointwiseEnergy):
     )
     density: ClassVar = floor_energy
     size: ClassVar = 1e-3  # metres; differences have steps of 3e-4 of it
-    vertices: np.ndarray  # those that may touch it
+    vertices: np.ndarray  # vertices that may touch the floor
     floor_stiffness: float  # k [N/m^2]
     floor_height: float  # z_0 [m]
 
@@ -92,7 +92,7 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# When it has come to rest, the floor must carry its weight, whatever the function says in between.
+# At rest, the floor must carry the weight of the block.
 
 # %%
 depth = (-0.02 - height[-1, bottom]).clamp_min(0.0)
@@ -102,8 +102,8 @@ print(f"carried {carried:.4f} N, weight {weight:.4f} N")
 # %% [markdown]
 # ## Its gradients
 #
-# How high the block is after the first rebound, by both parameters of the floor, against central differences. This is
-# the test that every new energy should have.
+# Derivatives of the block's height after the first rebound with respect to both parameters of the floor, compared with
+# central differences. Every new energy should have this test.
 
 # %%
 state = simulator.rest_state()
@@ -129,8 +129,9 @@ for number, step in enumerate((1.0, 1e-7)):
 # %% [markdown]
 # ## An elastic string
 #
-# The same for the way from one vertex to another: a spring along a diagonal of the block. With stiffness $k$ and length
-# $L$ it has the energy $\tfrac{k}{2} (|x| - L)^2$. With `per`, every spring has values of its own.
+# The argument of this energy is the vector from one vertex to another: a spring along a diagonal of the block. With
+# stiffness $k$ and length $L$ it has the energy $\tfrac{k}{2} (|x| - L)^2$. With `per`, every spring has its own
+# values.
 
 
 # %%
@@ -169,14 +170,14 @@ length = np.linalg.norm(pulled[ends[0, 0]] - pulled[ends[0, 1]])
 print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length - 0.05):.3f} N")
 
 # %% [markdown]
-# Memory is declared in the same way, with a function of where a step starts and ends; `warp_resphys.energies.friction`
-# is an example of 40 lines.
+# Memory is declared in the same way, with a function of the start and the end of a step;
+# `warp_resphys.energies.friction` is an example of 40 lines.
 #
 # ## From here to an experiment
 #
-# In `warp_resphys`, an energy lies in `warp_resphys/energies`, and `warp_resphys/experiment/actuators.py` says how a
-# configuration asks for it; its parameters can then be identified by name ([contributing](../contributing.md)). Where
-# speed counts, kernels are written by hand, as those of pressure are.
+# In `warp_resphys`, energies are in `warp_resphys/energies`, and `warp_resphys/experiment/actuators.py` creates them
+# from a configuration; their parameters can then be identified by name ([contributing](../contributing.md)). For
+# speed, kernels can be written by hand, as for pressure.
 
 # %%
 assert abs(carried / weight - 1) < 1e-3

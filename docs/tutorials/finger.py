@@ -8,8 +8,8 @@
 # %% [markdown]
 # # A finger with a tendon
 #
-# A soft finger, 10 cm long, with a tendon below its axis. Twenty lines simulate it, and find by a gradient the
-# tension that bends the tip to where it should be. All units are SI.
+# A soft finger, 10 cm long, with a tendon below its axis. Twenty lines simulate it, and use a gradient to compute the
+# tension that bends the tip to a target. All units are SI.
 
 # %%
 import matplotlib.pyplot as plt
@@ -18,7 +18,7 @@ import warp as wp
 
 import warp_resphys as wr
 
-wp.config.log_level = wp.LOG_WARNING  # not every kernel that is loaded
+wp.config.log_level = wp.LOG_WARNING  # no message for each loaded kernel
 
 mesh = wr.rod(centreline=[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], radii=0.01, layers=8)  # m
 tendon = wr.Tendons([[[x, 0.0, -0.006] for x in (0.0, 0.02, 0.04, 0.06, 0.08, 0.1)]])  # guides, m
@@ -38,17 +38,17 @@ reached = closer.q[-1, 0, tip, 2].mean()
 axis = motion.plot(tip)
 closer.plot(tip, ax=axis)
 axis.axhline(-25.0, color="k", linestyle=":")
-axis.legend([f"{each.item():.2f} N" for each in (tension, better)] + ["wanted"], frameon=False)
+axis.legend([f"{value.item():.2f} N" for value in (tension, better)] + ["target"], frameon=False)
 plt.show()
 
 # %% [markdown]
-# `rollout` returns positions (T + 1, B, N, 3) and velocities; every number that went in and requires a gradient gets
-# one through all sixty steps. `motion.save("finger.h5")` keeps the motion, `motion.write_vtk("finger.pvd")` writes it
+# `rollout` returns positions (T + 1, B, N, 3) and velocities, and is differentiable with respect to all inputs
+# and parameters. `motion.save("finger.h5")` saves the motion, `motion.write_vtk("finger.pvd")` writes it
 # for ParaView.
 #
 # ## Its stiffness from three markers
 #
-# Real fingers are softer or stiffer than the data sheet says. `identify` finds by how much, from markers that were seen
+# Real fingers are softer or stiffer than their data sheet. `identify` estimates the stiffness from markers observed
 # at every time step. Here the markers are those of a simulated finger of 430 kPa, with noise of 0.1 mm.
 
 # %%
@@ -59,18 +59,18 @@ real = simulator.rollout(simulator.rest_state(), 30, pull, {"youngs_modulus": 43
 noise = 1e-4 * torch.randn(31, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 seen = torch.cat([markers(q) for q in real.q]) + noise  # (T + 1, M, 3) m
 observed = wr.ObservedMotion(seen, start=simulator.rest_state(), inputs=pull, observation=markers)
-found = wr.identify(simulator, observed, {"youngs_modulus": (200e3, 1e6)})
-modulus = found.parameters["youngs_modulus"]
+identified = wr.identify(simulator, observed, {"youngs_modulus": (200e3, 1e6)})
+modulus = identified.parameters["youngs_modulus"]
 before = wr.evaluate(simulator, observed).mean().item()
-after = wr.evaluate(simulator, observed, parameters=found.parameters).mean().item()
-print(f"Young's modulus: {modulus / 1e3:.1f} kPa; the markers are off by {1e3 * before:.2f} mm before, ", end="")
-print(f"{1e3 * after:.2f} mm after, as much as their noise")
+after = wr.evaluate(simulator, observed, parameters=identified.parameters).mean().item()
+print(f"Young's modulus: {modulus / 1e3:.1f} kPa; error of the markers: {1e3 * before:.2f} mm before, ", end="")
+print(f"{1e3 * after:.2f} mm after identification, equal to their noise")
 
 # %% [markdown]
-# What identification leaves is for learned forces: `reconstruct` and `fit_force` take the same `ObservedMotion`, see
-# [the functions](../api/learning.md) and, step by step, [Residual forces](residual_forces.py).
+# Learned forces reduce the error that remains after identification: `reconstruct` and `fit_force` take the same
+# `ObservedMotion`, see [the functions](../api/learning.md) and, step by step, [Residual forces](residual_forces.py).
 #
-# ## What to take from this
+# ## Summary
 #
 # One gradient moves the tip close to its target; `identify` comes within one per cent of the stiffness.
 

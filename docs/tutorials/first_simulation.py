@@ -8,8 +8,8 @@
 # %% [markdown]
 # # First simulation
 #
-# A silicone beam, 10 cm long and 3 cm thick, is clamped at one end. It sags under its weight, is pulled down, and is
-# let go. All units are SI.
+# A silicone beam, 10 cm long and 3 cm thick, is clamped at one end. It sags under its weight, is pulled down, and
+# released. All units are SI.
 #
 # ## A body, a material, a simulator
 
@@ -21,7 +21,7 @@ import warp as wp
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, StableNeoHookean, box_hexahedra, quadratic, select_vertices
 
-wp.config.log_level = wp.LOG_WARNING  # not every kernel that is loaded
+wp.config.log_level = wp.LOG_WARNING  # no message for each loaded kernel
 
 mesh = quadratic(box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 2, 2)))  # m; 27-node hexahedra
 clamp, tip = select_vertices(mesh, x=0.0), select_vertices(mesh, x=0.1)
@@ -33,11 +33,11 @@ print(f"{len(mesh.vertices)} vertices, {len(mesh.cells)} cells, clamped at {len(
 # %% [markdown]
 # ## Equilibrium
 #
-# `static_equilibrium` finds where the body comes to rest. States have the shape (B, N, 3): B environments, here one, of
+# `static_equilibrium` computes the body at rest. States have the shape (B, N, 3): B environments, here one, of
 # N vertices.
 #
-# Is it right? For a beam this stiff, theory has an answer. Under a uniform load $w = \rho g A$ the tip of a cantilever
-# sinks by the bending of Euler and Bernoulli and the shear of Timoshenko,
+# The result can be compared with beam theory. Under a uniform load $w = \rho g A$ the deflection of a cantilever's tip
+# is the sum of Euler-Bernoulli bending and Timoshenko shear,
 #
 # $$ \delta = \frac{w L^4}{8 E I} + \frac{w L^2}{2 \kappa G A}, \qquad \kappa = \frac{5}{6}. $$
 
@@ -52,10 +52,11 @@ sag = -(hanging.q[0, tip, 2].mean() - simulator.rest_positions[tip, 2].mean()).i
 print(f"the tip sinks by {1e3 * sag:.3f} mm; Timoshenko's beam by {1e3 * expected:.3f} mm")
 
 # %% [markdown]
-# So good an agreement is luck: two errors of some five per cent cancel. The second term of this energy counts a third
-# of Lamé's $\lambda$ for small strains ([theory](../theory.md#materials)), so that this silicone is as soft as one of
-# 250 kPa; and the clamp, which theory does not have, keeps the section from growing thinner and holds a beam as short
-# as this one up. With `StableNeoHookean`, whose small strains are those of linear elasticity, only the clamp is left.
+# The agreement is this good because two errors of about five per cent cancel. For small strains, the second term of
+# this energy has a third of Lamé's $\lambda$ ([theory](../theory.md#materials)), so that this silicone is as soft as
+# one of 250 kPa; and the clamp, which beam theory neglects, prevents the contraction of the section and stiffens a
+# beam as short as this one. `StableNeoHookean` is linear elasticity for small strains, so that only the effect of the
+# clamp remains.
 
 # %%
 third = 264e3 * 0.45 / ((1 + 0.45) * (1 - 2 * 0.45)) / 3  # Pa, of Lame's first parameter
@@ -65,7 +66,7 @@ print(f"seen by small strains: {seen_modulus / 1e3:.1f} kPa, Poisson's ratio {se
 
 
 def sag_of(material):
-    """How far the tip sinks [m]."""
+    """Deflection of the tip [m]."""
     other = Simulator(body, material, time_step=0.01)
     return -(other.static_equilibrium().q[0, tip, 2].mean() - other.rest_positions[tip, 2].mean()).item()
 
@@ -77,9 +78,9 @@ print(f"stable neo-Hookean: {1e3 * linear:.2f} mm, with the moduli that small st
 # %% [markdown]
 # ## Motion
 #
-# A force at the tip holds the beam down. `rollout` lets it go: without `Inputs`, only gravity acts. The integrator is
-# implicit Euler, which is stable with any time step, and damps. `bdf2` and `midpoint` are of second order; a smaller
-# step shows how much they lose.
+# A force at the tip holds the beam down. `rollout` releases it: without `Inputs`, only gravity acts. The integrator is
+# implicit Euler, which is stable with any time step, but adds damping. `bdf2` and `midpoint` are of second order; a
+# smaller step shows their error.
 
 # %%
 pull = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)  # (B, N, 3) N
@@ -94,8 +95,8 @@ def height(trajectory):
 
 motions = {}
 for integrator, step in [("implicit_euler", 0.01), ("bdf2", 0.01), ("midpoint", 0.01), ("midpoint", 0.0025)]:
-    each = Simulator(body, silicone, time_step=step, integrator=integrator)
-    motions[integrator, step] = height(each.rollout(held, steps=round(0.5 / step)))
+    other = Simulator(body, silicone, time_step=step, integrator=integrator)
+    motions[integrator, step] = height(other.rollout(held, steps=round(0.5 / step)))
 
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
 for (integrator, step), values in motions.items():
@@ -105,12 +106,12 @@ figure.legend(loc="outside upper center", ncols=4, frameon=False)
 plt.show()
 
 # %% [markdown]
-# Nothing damps this material, so that the last two curves should go on for ever; implicit Euler takes most of the
-# motion away within two swings. Where a robot's damping is to be identified, the integrator must not hide it.
+# This material has no damping, so that the last two curves should not decay; implicit Euler dissipates most of the
+# motion within two swings. To identify a robot's damping, the damping of the integrator must be small.
 #
-# ## Many at once
+# ## Batches
 #
-# Environments of a batch are solved together. A parameter takes a value for each of them, of shape (B, 1).
+# Environments of a batch are solved together. A parameter may have a value for each of them, of shape (B, 1).
 
 # %%
 moduli = torch.tensor([[150e3], [264e3], [400e3]], dtype=torch.float64)  # Pa
@@ -129,22 +130,22 @@ figure.legend(loc="outside upper center", ncols=3, frameon=False)
 plt.show()
 
 # %% [markdown]
-# The stiffer the faster: the frequency of a cantilever goes with the root of its modulus. A period is
-# the mean time between two falls of the tip's height through its mean.
+# The frequency of a cantilever is proportional to the square root of its modulus. A period is
+# the mean time between two downward crossings of the mean height.
 
 # %%
 heights = swings.q[:, :, tip, 2].mean(-1).numpy()  # (T, B)
 falls = [np.flatnonzero(np.diff(np.sign(height - height.mean())) < 0) for height in heights.T]
-periods = np.array([0.005 * np.diff(each).mean() for each in falls])
+periods = np.array([0.005 * np.diff(crossings).mean() for crossings in falls])
 for value, period in zip(moduli[:, 0].tolist(), periods, strict=True):
     print(f"{value / 1e3:.0f} kPa: a period of {1e3 * period:.0f} ms, {period * value**0.5:.1f} s Pa^0.5")
 
 # %% [markdown]
-# ## What to take from this
+# ## Summary
 #
-# The equilibrium is a beam's, clamp and material considered; the midpoint rule at small steps brings the tip back, in
-# its last swings, to where it began, and implicit Euler does not; periods go with the root of the modulus. Where a
-# figure of this page were wrong, these lines would stop the book.
+# The equilibrium agrees with beam theory, up to clamp and material; with the midpoint rule at small steps the tip
+# returns to its initial height in the last swings, with implicit Euler it does not; periods depend on the modulus as
+# predicted. The following checks stop the build of the book if a figure of this page is wrong.
 
 # %%
 assert abs(sag / expected - 1) < 0.02

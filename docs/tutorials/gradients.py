@@ -8,9 +8,9 @@
 # %% [markdown]
 # # Gradients and identification
 #
-# Every time step is differentiable: by forces, states, materials and actuators, through any number of steps. This page
-# takes such a gradient, checks it against finite differences, and uses it to find Young's modulus and a viscosity from
-# noisy markers.
+# Every time step is differentiable with respect to forces, states, materials and actuators, through any number of
+# steps. This page computes such a gradient, checks it against finite differences, and uses it to identify Young's
+# modulus and a viscosity from noisy markers.
 
 # %%
 import matplotlib.pyplot as plt
@@ -27,7 +27,7 @@ torch.manual_seed(0)
 mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m
 body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
 tip = select_vertices(mesh, x=0.1)
-# Of second order, and with residuals far below what is measured; gradients are exact for what was solved.
+# Second order, with residuals far below the measured differences; gradients are exact at the solution.
 simulator = Simulator(
     body,
     Corotated(youngs_modulus=264e3, poissons_ratio=0.499, density=1070.0),
@@ -42,7 +42,7 @@ STEPS = 40
 
 
 def heights(modulus, viscosity=0.0):
-    """(T + 1,) height of the tip that is pulled down and let go [m], and the equilibrium that it starts from."""
+    """(T + 1,) height of the tip after the beam is released from a load [m]."""
     parameters = {"youngs_modulus": modulus, "stiffness_damping": viscosity}
     held = simulator.static_equilibrium(Inputs(external_force=load), parameters=parameters)
     return simulator.rollout(held, STEPS, parameters=parameters).q[:, 0, tip, 2].mean(-1)
@@ -51,7 +51,7 @@ def heights(modulus, viscosity=0.0):
 # %% [markdown]
 # ## A gradient through forty steps
 #
-# A parameter is a tensor that requires a gradient. The equilibrium before the motion depends on it, too.
+# The parameter is a tensor that requires a gradient. The initial equilibrium depends on it, too.
 
 # %%
 modulus = torch.tensor([264e3], dtype=torch.float64, requires_grad=True)
@@ -61,18 +61,18 @@ exact = modulus.grad.item()
 print(f"d(height at the end) / dE = {exact:.9e} m/Pa")
 
 # %% [markdown]
-# ## Is it right?
+# ## Check
 #
-# Central differences, from large to small. Their error falls with the square of the difference, until rounding takes
-# over. A wrong gradient would leave a floor.
+# The error of central differences decreases with the square of the step, until rounding dominates. With a wrong
+# gradient the error would not fall below a floor.
 
 # %%
 relative = 10.0 ** -np.arange(1.0, 7.5, 0.5)
 errors = []
 with torch.no_grad():
-    for each in relative:
-        up, down = (heights(torch.tensor([264e3 * (1 + sign * each)]))[-1].item() for sign in (1, -1))
-        errors.append(abs((up - down) / (2 * 264e3 * each) / exact - 1))
+    for step in relative:
+        up, down = (heights(torch.tensor([264e3 * (1 + sign * step)]))[-1].item() for sign in (1, -1))
+        errors.append(abs((up - down) / (2 * 264e3 * step) / exact - 1))
 figure, axis = plt.subplots(figsize=(5, 3), layout="constrained")
 axis.loglog(relative, errors, "o-")
 axis.set(xlabel="relative difference of E", ylabel="relative error of differences")
@@ -80,14 +80,14 @@ plt.show()
 print(f"smallest: {min(errors):.1e}")
 
 # %% [markdown]
-# The backward pass is the discrete adjoint of the implicit step: one linear solve with the Hessian where it ended,
-# whatever iterations led there. Its cost is that of about one step.
+# The backward pass is the discrete adjoint of the implicit step: one linear solve with the Hessian at the solution,
+# independent of the iterations. Its cost is about that of one step.
 #
 # ## Identification
 #
-# Now as with a robot: what is known is a noisy motion. Its material is stiffer than the data sheet says, and viscous.
-# The squared error is one number, and its gradient by both parameters comes from one backward pass, as it would by a
-# thousand of them. L-BFGS does the rest.
+# Now a noisy motion is given, as for a robot. Its material is stiffer than the data sheet's, and viscous.
+# One backward pass computes the gradient of the squared error with respect to both parameters, as it would for a
+# thousand. L-BFGS minimises the error.
 
 # %%
 truth = {"modulus": 300e3, "viscosity": 4e-3}  # Pa, s
@@ -97,7 +97,7 @@ measured = clean + 1e-4 * torch.randn(STEPS + 1, dtype=torch.float64)  # 0.1 mm 
 
 
 def loss(x):
-    """Mean squared error [noise^2] and its gradient, by the logarithms of the parameters over first guesses."""
+    """Mean squared error [noise^2] and its gradient by the logarithms of the parameters relative to initial guesses."""
     logarithms = torch.tensor(x, requires_grad=True)
     guess = torch.tensor([264e3, 1e-3], dtype=torch.float64) * logarithms.exp()
     error = ((heights(guess[:1], guess[1:]) - measured) / 1e-4).square().mean()
@@ -107,12 +107,10 @@ def loss(x):
 
 
 history = []
-found = scipy.optimize.minimize(loss, np.zeros(2), jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0), (-4.0, 4.0)])
-modulus, viscosity = 264e3 * np.exp(found.x[0]), 1e-3 * np.exp(found.x[1])
-print(
-    f"E = {modulus / 1e3:.2f} kPa (true: 300), viscosity {1e3 * viscosity:.2f} ms (true: 4.00), {found.nfev} roll-outs"
-)
-print(f"error that is left: {found.fun**0.5:.2f} of the noise")
+fit = scipy.optimize.minimize(loss, np.zeros(2), jac=True, method="L-BFGS-B", bounds=[(-1.0, 1.0), (-4.0, 4.0)])
+modulus, viscosity = 264e3 * np.exp(fit.x[0]), 1e-3 * np.exp(fit.x[1])
+print(f"E = {modulus / 1e3:.2f} kPa (true: 300), viscosity {1e3 * viscosity:.2f} ms (true: 4.00), {fit.nfev} roll-outs")
+print(f"remaining error: {fit.fun**0.5:.2f} of the noise")
 
 # %%
 with torch.no_grad():
@@ -127,13 +125,13 @@ figure.legend(loc="outside upper center", ncols=3, frameon=False)
 plt.show()
 
 # %% [markdown]
-# In an experiment the stage `identify` does this, with several starts, priors, markers whose place is uncertain,
+# In an experiment the stage `identify` does this, with several starts, priors, uncertain marker positions,
 # and a posterior of the parameters ([experiments](../experiments.md)).
 #
-# ## The same on a Warp tape
+# ## Gradients on a Warp tape
 #
-# Who writes Warp kernels has the same gradients by `wp.Tape`, on the same memory. Here the loss is the height of the
-# tip at the end, by a kernel, and the gradient is that by the initial positions.
+# For users of Warp kernels, `wp.Tape` gives the same gradients, in the same memory. Here a kernel computes the final
+# height of the tip, and the gradient is with respect to the initial positions.
 
 
 # %%
@@ -163,14 +161,14 @@ print(
 )
 
 # %% [markdown]
-# ## What to take from this
+# ## Summary
 #
-# Differences agree with the adjoint to a part in ten million; the parameters are found within what the noise
-# allows; torch and Warp give the same gradient.
+# Differences agree with the adjoint to a part in ten million; the parameters are identified within the accuracy that
+# the noise allows; torch and Warp give the same gradient.
 
 # %%
 assert min(errors) < 1e-7
 assert abs(modulus / 300e3 - 1) < 0.01
 assert abs(viscosity / 4e-3 - 1) < 0.1
-assert found.fun < 1.5
+assert fit.fun < 1.5
 assert torch.allclose(by_warp, state.q.grad, rtol=1e-9, atol=1e-12)

@@ -8,10 +8,10 @@
 # %% [markdown]
 # # A pneumatic arm
 #
-# A silicone arm hangs from its base. Three chambers run along it; air under pressure lengthens the side that it is on,
-# and the arm bends away. This page makes such an arm from its measures, bends it, lets the adjoint find the pressures
-# that bring the tip to a place, and switches a valve. What `experiment=sopra` adds, markers, identification and a
-# learned force, is in [the guide](../pressure.md).
+# A silicone arm with three chambers hangs from its base; air pressure in a chamber lengthens its side,
+# and the arm bends away. This page generates such an arm from its dimensions, bends it, uses the adjoint to compute the
+# pressures that bring the tip to a target, and switches a valve. [The guide](../pressure.md) adds markers,
+# identification and a learned force (`experiment=sopra`).
 #
 # ## The arm
 
@@ -53,11 +53,10 @@ def arm(energies):
 
 
 # %% [markdown]
-# ## Why it has fibres
+# ## Fibres
 #
-# Air pushes in all directions. Without a thread around it, a chamber grows wide rather than long, and much of the
-# pressure is lost to that. Fibres are an energy of the chamber's surface that pulls where it is stretched along the
-# thread.
+# Air pushes in all directions. Without a thread around it, a chamber widens more than it lengthens, and bends the arm
+# less. Fibres are an energy of the chamber's surface that resists stretching along the thread.
 
 # %%
 threads = Fibres(chambers, (8.0, -8.0), stiffness=1e4)  # degrees; N/m
@@ -80,10 +79,10 @@ axes[0].legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# ## Pressures for a place
+# ## Pressures for a target
 #
-# Where must the air go so that the tip comes to a given place? `static_equilibrium` is differentiable: its adjoint is
-# one linear solve. L-BFGS with bounds, as valves have, does the rest.
+# Which pressures bring the tip to a given position? `static_equilibrium` is differentiable: its adjoint is
+# one linear solve. L-BFGS minimises the distance, with bounds on the pressures.
 
 # %%
 simulator = arm([Pressure(chambers), threads])
@@ -103,16 +102,15 @@ def miss(x):
     return value.item(), 1e4 * pressure.grad[0].numpy()
 
 
-found = scipy.optimize.minimize(miss, np.full(3, 0.3), jac=True, method="L-BFGS-B", bounds=[(0.0, 2.5)] * 3)
-pressure = 1e4 * found.x
+best = scipy.optimize.minimize(miss, np.full(3, 0.3), jac=True, method="L-BFGS-B", bounds=[(0.0, 2.5)] * 3)
+pressure = 1e4 * best.x
 print(f"pressures {np.round(1e-3 * pressure, 2)} kPa; the tip is {history[-1]:.3f} mm from the target in the plane")
-print(f"{len(history)} equilibria; distances [mm]:", ", ".join(f"{each:.2f}" for each in history[:8]), "...")
+print(f"{len(history)} equilibria; distances [mm]:", ", ".join(f"{distance:.2f}" for distance in history[:8]), "...")
 
 # %% [markdown]
 # ## A valve
 #
-# Pressures that change in a step make the arm swing. Inputs of a roll-out have a leading axis of time where they
-# change.
+# A step of the pressures makes the arm swing. Time-dependent inputs of a roll-out have a leading axis of time.
 
 # %%
 STEPS = 120
@@ -131,13 +129,13 @@ plt.show()
 # %% [markdown]
 # ## Your own arm
 #
-# A mesh with closed chambers, pressures and markers in CSV files and some twenty lines of configuration make an
-# experiment of it: [robots driven by pressure](../pressure.md). With the threads of SoPrA in the simulator
-# (`experiment=sopra_fibres`), identification leaves 0.45 mm on its simulated laboratory, and the learned force 0.23
-# ([results](../results/index.md)).
+# An experiment needs a mesh with closed chambers, pressures and markers in CSV files, and about twenty lines of
+# configuration: [robots driven by pressure](../pressure.md). With the threads of SoPrA in the simulator
+# (`experiment=sopra_fibres`), the error on its simulated laboratory is 0.45 mm after identification, and 0.23 mm with
+# the learned force ([results](../results/index.md)).
 #
-# The pressures were found for a simulator. How well they do on a robot depends on how well the simulator was corrected:
-# that is [control](control.py).
+# The pressures were computed for a simulator. Their accuracy on a robot depends on the correction of the simulator:
+# see [control](control.py).
 
 # %%
 assert history[-1] < 0.1

@@ -8,15 +8,15 @@
 # %% [markdown]
 # # Residual forces
 #
-# Identification makes the best of a simulator's parameters. What is wrong with its physics stays. The method of this
-# package asks for the forces that would mend it, step by step, and learns to predict them:
+# Identification optimises a simulator's parameters, but errors of its physics remain. The method of this
+# package reconstructs the forces that correct them, step by step, and learns to predict these:
 #
 # 1. **reconstruct**: from each observed state, which force takes the simulator to the next one?
 # 2. **learn** that force as a function of the state,
 # 3. **roll out** the simulator with the learned force, from its own states.
 #
-# The command `warp-resphys` does all of it for an experiment. This page does it by hand, on a beam whose simulator has
-# a wrong modulus, and no viscosity.
+# The command `warp-resphys` does this for an experiment. This page does it in Python, for a beam whose simulator has
+# a wrong modulus and no viscosity.
 
 # %%
 import matplotlib.pyplot as plt
@@ -32,19 +32,19 @@ from warp_resphys.settings.learning import NetworkSettings
 
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
-torch.set_num_threads(1)  # a small network gains nothing by more, and loses much where cores are busy
+torch.set_num_threads(1)  # faster for a small network, in particular on busy cores
 
 mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 3, 3))  # m
 body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
 tip = select_vertices(mesh, x=0.1)
-settings = SolverSettings(on_failure="count")  # a roll-out that fails is lost, and the others go on
+settings = SolverSettings(on_failure="count")  # a failed environment does not stop the others
 robot = Simulator(body, Corotated(264e3, 0.45, density=1070.0, stiffness_damping=3e-3), solver=settings)
 simulator = Simulator(body, Corotated(215e3, 0.45, density=1070.0), solver=settings)
 
 # %% [markdown]
 # ## Motions of the robot
 #
-# Weights hang at the tip, the beam comes to rest, and is let go. All motions are one batch; two of them are kept back.
+# The beam is released from rest under different weights at its tip. All motions are one batch; two are for testing.
 
 # %%
 weights = torch.tensor([0.05, 0.09, 0.11, 0.13, 0.16, 0.19, 0.21, 0.07, 0.14], dtype=torch.float64)  # kg
@@ -57,13 +57,13 @@ motion = robot.rollout(held, STEPS)  # q and v (T + 1, B, N, 3)
 
 
 def rolled_out(simulator, predict=None):
-    """(T + 1, B, N, 3) positions of the test motions, from their first state on [m]."""
+    """(T + 1, B, N, 3) simulated positions of the test motions, from their first state [m]."""
     start = State(motion.q[0, test], motion.v[0, test])
     return closed_loop(Rollout(simulator, predict), start, STEPS).transpose(0, 1)
 
 
 def error(q):
-    """(T + 1,) mean distance of all vertices to where they are on the robot [mm]."""
+    """(T + 1,) mean distance of all vertices from the robot's [mm]."""
     return 1e3 * (q - motion.q[:, test]).norm(dim=-1).mean((1, 2))
 
 
@@ -76,9 +76,9 @@ print(
 # %% [markdown]
 # ## Reconstruct
 #
-# The force of a step brings the simulator as close to what was observed as a small force can,
-# $\min_f \lVert q^{+}(f) - \hat q^{+} \rVert^2 + \lambda \lVert f \rVert^2$. All vertices are seen here, and
-# Gauss-Newton needs two iterations a step.
+# The force of a step is a regularised least-squares solution,
+# $\min_f \lVert q^{+}(f) - \hat q^{+} \rVert^2 + \lambda \lVert f \rVert^2$. All vertices are observed here, and
+# Gauss-Newton needs two iterations per step.
 
 # %%
 reconstructor = make_reconstructor(
@@ -87,22 +87,22 @@ reconstructor = make_reconstructor(
 forces, misfit = [], 0.0
 for step in range(STEPS):
     state = State(motion.q[step], motion.v[step])
-    found = reconstructor.step(state, motion.q[step + 1])
-    forces.append(found.force)
-    misfit = max(misfit, (found.state.q - motion.q[step + 1]).abs().max().item())
+    reconstructed = reconstructor.step(state, motion.q[step + 1])
+    forces.append(reconstructed.force)
+    misfit = max(misfit, (reconstructed.state.q - motion.q[step + 1]).abs().max().item())
 force = torch.stack(forces)  # (T, B, N, 3) N
-print(f"with the force, no vertex is further than {1e3 * misfit:.1e} mm from where it was seen")
-print(f"sums of the forces over the body: up to {force.sum(2).norm(dim=-1).max():.2f} N")
+print(f"largest error with the force: {1e3 * misfit:.1e} mm")
+print(f"largest resultant force on the body: {force.sum(2).norm(dim=-1).max():.2f} N")
 
 # %% [markdown]
 # ## Learn
 #
-# The network sees few modes of the positions and velocities, and answers in few modes of the force (proper orthogonal
-# decomposition of the training samples). Its linear part is fitted by ridge regression, and the network learns what
-# that leaves. Tensors of torch and arrays of Warp share their memory; nothing is copied between them.
+# The network's inputs are a few modes of the positions and velocities, its outputs a few modes of the force (proper
+# orthogonal decomposition of the training samples). Its linear part is fitted by ridge regression, and the network
+# learns the remainder. Tensors of torch and arrays of Warp share their memory without copies.
 
 # %%
-samples = [each[:STEPS, train].flatten(0, 1) for each in (motion.q, motion.v, force)]
+samples = [series[:STEPS, train].flatten(0, 1) for series in (motion.q, motion.v, force)]
 network = NetworkSettings(position_modes=4, velocity_modes=4, force_modes=8, layers=2, width=64, activation="silu")
 model = build_model(network, simulator.rest_positions, *samples)
 
@@ -126,7 +126,7 @@ print(f"mean squared error of the standardised force: {losses[0]:.1e} to {losses
 # %% [markdown]
 # ## Roll out
 #
-# The hybrid simulator takes the force of its own state at every step. These motions are none that the network has seen.
+# The corrected simulator adds the force predicted for its own state at every step. These are the test motions.
 
 # %%
 model.eval()
@@ -149,9 +149,9 @@ plt.show()
 # %% [markdown]
 # ## From markers
 #
-# Of a real robot only a few points are seen. The force is then a small one that brings these points close to where
-# they were: it explains the markers, and says as little as it can of the rest. Here four vertices of the tip and four
-# half way are seen, with a regularisation that fits noise of a tenth of a millimetre.
+# For a real robot only a few points are observed. The regularised force then brings these points close to
+# the measurements, with little effect on the rest. Here four vertices of the tip and four at half length
+# are observed, with a regularisation for noise of a tenth of a millimetre.
 
 # %%
 middle = select_vertices(mesh, x=0.05)
@@ -166,17 +166,15 @@ guess, off = None, []
 for step in range(40):
     measured = motion.q[step + 1, 7:8, seen]
     measured = measured + 1e-4 * torch.randn_like(measured)
-    found = from_markers.step(state, measured, first_guess=guess)
-    state, guess = found.state, found.force
+    reconstructed = from_markers.step(state, measured, first_guess=guess)
+    state, guess = reconstructed.state, reconstructed.force
     off.append(1e3 * (state.q - motion.q[step + 1, 7:8]).norm(dim=-1).mean().item())
 alone = error(uncorrected)[1:41].mean().item()
-print(
-    f"all vertices, of which 8 were seen with noise: {sum(off) / len(off):.2f} mm off; without a force {alone:.2f} mm"
-)
+print(f"error of all vertices from 8 noisy ones: {sum(off) / len(off):.2f} mm; without a force {alone:.2f} mm")
 
 # %% [markdown]
-# How many markers it takes, and where: `warp-resphys experiment=marker_ablation`. From markers to the report of a robot
-# of your own: [bring your robot](bring_a_beam.py).
+# `warp-resphys experiment=marker_ablation` studies the number of markers. [Bring your robot](bring_a_beam.py) leads
+# from the markers of your own robot to a report.
 
 # %%
 assert misfit < 1e-6

@@ -1,4 +1,4 @@
-"""Tasks in several processes: their results, lost workers, and how the work ends."""
+"""Tasks in several processes: results, lost workers, errors and interruption."""
 
 import os
 import signal
@@ -31,7 +31,7 @@ def wait_until(condition, seconds=60.0):
 
 
 def work(task, advance):
-    """Waits until a second worker is at work, too."""
+    """Waits until a second worker has started."""
     folder, number = task
     (folder / f"worker_{os.getpid()}").touch()
     wait_until(lambda: len([*folder.glob("worker_*")]) > 1)
@@ -40,7 +40,7 @@ def work(task, advance):
 
 
 def done(function, tasks, workers, folder):
-    """Results, and the progress that was told, by call."""
+    """Runs tasks; returns the results and the calls of `advance`."""
     counted = []
 
     def advance(count=1, **fields):
@@ -70,9 +70,9 @@ def test_results_come_in_order_from_other_processes_on_one_thread(workers, tmp_p
 
 def fails(task, advance):
     if task == "bad input":
-        raise InputError("this cannot be simulated: take another.")
+        raise InputError("this is refused.")
     if task == "fault":
-        raise ZeroDivisionError("nothing that a user can mend")
+        raise ZeroDivisionError("a fault of the program")
     if task == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -80,8 +80,8 @@ def fails(task, advance):
 @pytest.mark.parametrize(
     ("task", "error", "message"),
     [
-        ("bad input", WorkerError, "^this cannot be simulated: take another.$"),
-        ("fault", WorkerFaultError, "ZeroDivisionError: nothing that a user can mend"),
+        ("bad input", WorkerError, "^this is refused.$"),
+        ("fault", WorkerFaultError, "ZeroDivisionError: a fault of the program"),
     ],
 )
 def test_an_error_ends_the_work(task, error, message, workers, tmp_path):
@@ -89,13 +89,13 @@ def test_an_error_ends_the_work(task, error, message, workers, tmp_path):
         done(fails, ["", task, ""], workers, tmp_path)
 
 
-def test_a_task_that_kills_its_worker_again_and_again_is_given_up(tmp_path):
+def test_a_task_that_always_kills_its_worker_is_an_error(tmp_path):
     with pytest.raises(WorkerError, match="3 times in a row"):
         done(fails, ["", "killed"], Workers(2), tmp_path)
 
 
 def dies_once(task, advance):
-    """Counts to three, and dies in between if it has not died before, once its progress was seen."""
+    """Counts to three; kills itself once in between, after its progress was seen."""
     folder, number = task
     for at in range(3):
         advance(shown=at)
@@ -106,7 +106,7 @@ def dies_once(task, advance):
     return number**2
 
 
-def test_the_task_of_a_killed_worker_is_done_again(workers, tmp_path):
+def test_the_task_of_a_killed_worker_is_repeated(workers, tmp_path):
     counts = []
 
     def advance(count, **fields):
@@ -139,18 +139,18 @@ def test_an_address_that_nobody_answers_at(backend, address, tmp_path):
 
 def interrupts_itself(task, advance):
     os.kill(os.getpid(), signal.SIGINT)
-    return "goes on"
+    return "continues"
 
 
 def test_workers_leave_ctrl_c_to_their_parent(tmp_path):
-    assert done(interrupts_itself, [0, 1, 2], Workers(2), tmp_path)[0] == ["goes on"] * 3
+    assert done(interrupts_itself, [0, 1, 2], Workers(2), tmp_path)[0] == ["continues"] * 3
 
 
 def takes_memory(mebibytes, advance):
     return len(b"x" * (mebibytes << 20))
 
 
-def test_a_worker_tells_the_memory_of_its_work_alone(tmp_path):
+def test_a_worker_reports_the_memory_of_its_own_work(tmp_path):
     gib = []
     for mebibytes in (512, 0):
         memory = WorkersMemory()
@@ -177,7 +177,7 @@ def lives(process):
 
 
 def test_workers_end_with_their_parent(tmp_path):
-    """Even if that is killed: nobody else may write to the files of a run that goes on."""
+    """Even if it is killed: otherwise they would write to the files of a run that resumes."""
     program = "from test_fan_out import *\nfolder = Path(sys.argv[1])\n"
     program += "fan_out(works_or_waits, [(folder, False), (folder, True)], Workers(2), print, folder)"
     parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parent)
@@ -199,7 +199,7 @@ def falls(steps, advance):
 
 @contextmanager
 def cluster_of_two_nodes(backend):
-    """The address of a cluster that was there before the work."""
+    """The address of a running cluster."""
     if backend == "ray":
         cluster = pytest.importorskip("ray.cluster_utils").Cluster()
         try:

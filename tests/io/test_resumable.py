@@ -1,4 +1,4 @@
-"""Work that goes on after an interruption, a crash or a full disk."""
+"""Work that resumes after an interruption, a crash or a full disk."""
 
 import os
 import signal
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from damage import flip_bit
 
 from warp_resphys.io import files
 from warp_resphys.io.errors import DataFileError
@@ -42,7 +43,7 @@ def resumable(path: Path, fingerprint: str = "f", frames: int = 10) -> Resumable
 
 
 def compute(path: Path, upto: int, *arguments: object, finish: bool = True) -> list[int]:
-    """Computes frames, which are numbered by the state that they go on from; returns those that were computed."""
+    """Computes frames from the number of the last one, which is the state; returns the computed ones."""
     computed = []
     with resumable(path, *arguments) as file:
         while file.done < upto:
@@ -59,7 +60,7 @@ def checkpoints(path: Path) -> list[Path]:
 
 
 class TestResumable:
-    def test_goes_on_where_it_was_left_and_ends_in_a_plain_hdf5_file(self, tmp_path):
+    def test_it_resumes_and_ends_in_a_plain_hdf5_file(self, tmp_path):
         path = tmp_path / "run" / "forces.h5"
         assert compute(path, 4, finish=False) == [0, 1, 2, 3]
         assert compute(path, 6, finish=False) == [4, 5]
@@ -97,20 +98,15 @@ class TestResumable:
         path = tmp_path / "forces.h5"
         for upto in (3, 5, 8):
             compute(path, upto, finish=False)
-        last = (0, 1, 3)[damaged]  # Kept after the first frame, and wherever a run was left.
-        place = checkpoints(path)[damaged]
-        content = bytearray(place.read_bytes())
-        content[-9] ^= 1
-        place.write_bytes(content)
+        last = (0, 1, 3)[damaged]  # Checkpoints are written after the first frame, and at the end of a run.
+        flip_bit(checkpoints(path)[damaged])
         assert compute(path, 10) == list(range(last, 10))
         with files.read_hdf5(path, "forces") as file:
             assert np.array_equal(files.read_array(file, "force")[:, 5], force(5))
 
     def test_a_damaged_file_is_an_error(self, tmp_path):
         compute(tmp_path / "forces.h5", 10)
-        content = bytearray((tmp_path / "forces.h5").read_bytes())
-        content[-9] ^= 1
-        (tmp_path / "forces.h5").write_bytes(content)
+        flip_bit(tmp_path / "forces.h5")
         with pytest.raises(DataFileError, match=r"forces\.h5 is damaged"):
             is_final(tmp_path / "forces.h5", "forces", "f")
 
@@ -122,7 +118,7 @@ class TestResumable:
                 file.finish()
 
     @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
-    def test_a_process_that_is_ended_goes_on_from_a_whole_frame(self, tmp_path, end):
+    def test_a_killed_process_resumes_from_a_whole_frame(self, tmp_path, end):
         program = """
             import signal, sys, numpy as np, torch
             from pathlib import Path
@@ -185,7 +181,7 @@ class TestDiskFull:
                 print(error)
     """
 
-    def test_one_sentence_no_half_file_and_the_work_is_kept(self, tmp_path):
+    def test_it_is_reported_and_no_work_is_lost(self, tmp_path):
         child = start_python(self.program, tmp_path, 40_000)
         lines, errors = child.communicate(timeout=200)
         assert (child.returncode, errors) == (0, "")
@@ -202,7 +198,7 @@ class TestDiskFull:
 
 
 class TestCheckpoints:
-    def test_other_settings_and_other_versions_are_not_gone_on_from(self, tmp_path, caplog):
+    def test_checkpoints_of_other_settings_or_versions_are_not_used(self, tmp_path, caplog):
         path = tmp_path / "a.safetensors"
         keep_checkpoint(path, "network", TENSORS, {"fingerprint": "f"})
         assert torch.equal(resume_checkpoint(path, "network", "f")[0]["weight"], TENSORS["weight"])
@@ -213,16 +209,15 @@ class TestCheckpoints:
         assert resume_checkpoint(path, "network", "f") is None
         assert "another version" in caplog.text
 
-    def test_a_damaged_checkpoint_gives_way_to_the_one_before(self, tmp_path, caplog):
+    def test_a_damaged_checkpoint_is_replaced_by_the_previous_one(self, tmp_path, caplog):
         path = tmp_path / "train.safetensors"
         for epoch in (1, 2, 3):
             keep_checkpoint(path, "training", TENSORS, {"fingerprint": "f", "epoch": epoch})
         assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 3
-        content = path.read_bytes()
-        path.write_bytes(content[:-3] + bytes([content[-3] ^ 4]) + content[-2:])
+        flip_bit(path, -3)
         assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
         assert f"{path} is damaged" in caplog.text
-        path.unlink()  # As if the program had been killed between two files.
+        path.unlink()  # as after a kill between two files
         assert resume_checkpoint(path, "training", "f")[1]["epoch"] == 2
         assert resume_checkpoint(path, "training", "g") is None
         forget_checkpoint(path)

@@ -69,11 +69,11 @@ class TestTypes:
         assert world.shape.divisions == (4, 5)
 
     @pytest.mark.parametrize("value", [True, "0.5", None, float("nan"), float("inf"), [0.5], 0.0, 1.5])
-    def test_what_is_no_share_is_refused(self, value):
+    def test_an_invalid_share_is_refused(self, value):
         assert refused(share=value).startswith(f"share is {value!r}: it must be a number above 0")
 
     @pytest.mark.parametrize("value", [2.0, True, "2", -1])
-    def test_what_is_no_count_is_refused(self, value):
+    def test_an_invalid_count_is_refused(self, value):
         assert refused(count=value) == f"count is {value!r}: it must be a whole number, zero or more."
 
     def test_a_setting_does_not_change(self):
@@ -86,8 +86,8 @@ class TestSentences:
         assert refused(damping=-1.0) == "damping is -1.0: it must be a number, zero or more, in 1/s, or null."
 
     def test_of_the_kind_of_group_that_was_named(self):
-        found = refused(shape={"kind": "brick", "size": [1, 2]})
-        assert found == "shape.size is [1, 2]: it must be three numbers, in m."
+        message = refused(shape={"kind": "brick", "size": [1, 2]})
+        assert message == "shape.size is [1, 2]: it must be three numbers, in m."
 
     def test_of_an_unknown_kind(self):
         assert refused(shape={"kind": "bal"}) == "shape.kind is 'bal': it must be one of ball, brick."
@@ -111,8 +111,7 @@ class TestSentences:
 
     def test_of_an_unknown_key(self):
         assert refused(coumt=1) == "unknown key 'coumt', did you mean 'count'?"
-        found = refused(spans={"early": {"hihg": 2.0}})
-        assert found == "unknown key 'spans.early.hihg', did you mean 'high'?"
+        assert refused(spans={"early": {"hihg": 2.0}}) == "unknown key 'spans.early.hihg', did you mean 'high'?"
         assert "did you mean 'shape.radius'" in refused(radius=1.0)
         assert refused(zzz=1).startswith("unknown key 'zzz': a configuration has shape, spans,")
 
@@ -144,5 +143,4 @@ class TestContent:
             parse(World, BALL).changed(count=-1)
 
     def test_all_keys_are_listed(self):
-        found = list(keys(World.model_json_schema()))
-        assert {"shape.radius", "shape.size", "spans.NAME.high", "share"} <= {*found}
+        assert {"shape.radius", "shape.size", "spans.NAME.high", "share"} <= {*keys(World.model_json_schema())}

@@ -36,11 +36,7 @@ class Experiment:
     def __init__(self, run_dir: Path) -> None:
         self.run_dir = run_dir
         self.ran: list[str] = []
-        self.settings: dict[str, dict[str, Any]] = {
-            "generate": {"seed": 0},
-            "train": {"epochs": 5},
-            "report": {},
-        }
+        self.settings: dict[str, dict[str, Any]] = {"generate": {"seed": 0}, "train": {"epochs": 5}, "report": {}}
         self.behaviour: dict[str, Callable[[StageContext], None]] = {}
 
     def work(self, context: StageContext) -> None:
@@ -77,11 +73,11 @@ def interrupt(context: StageContext) -> None:
 
 
 class TestResources:
-    def test_the_peak_is_that_of_the_stage_that_took_most(self, experiment):
+    def test_the_peak_is_the_largest_of_all_stages(self, experiment):
         experiment.run()
-        found = resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
-        assert found["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
-        assert found["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
+        used = resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
+        assert used["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
+        assert used["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
         path = experiment.run_dir / "stages" / "generate.json"
         write_json(path, json.loads(path.read_text()) | {"peak_memory_gib": 3.0})
         assert resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
@@ -91,8 +87,8 @@ class TestResources:
     def test_memory_in_bytes(self):
         program = "import sys; from warp_resphys.io.memory import peak_memory_gib; before = peak_memory_gib()\n"
         program += "held = b'x' * (300 * 2**20); print(peak_memory_gib() - before)"
-        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-        assert float(found) == pytest.approx(300 / 1024, rel=0.1)
+        output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+        assert float(output) == pytest.approx(300 / 1024, rel=0.1)
 
 
 class TestSkipping:
@@ -119,25 +115,23 @@ class TestSkipping:
     def test_missing_or_damaged_outputs_are_made_again(self, experiment, caplog):
         experiment.run()
         output = experiment.run_dir / "train.json"
-        for damage in (
-            output.unlink,
-            lambda: output.write_text("{"),
-            lambda: output.write_text('{\n  "epochs": 7\n}\n'),
-        ):
-            damage()
+        for content in (None, "{", '{\n  "epochs": 7\n}\n'):
+            output.unlink()
+            if content is not None:
+                output.write_text(content)
             assert experiment.run() == ["train"]
             assert "missing or changed since they were written: train.json" in caplog.text
             assert json.loads(output.read_text()) == {"epochs": 5}
         assert experiment.run() == []
 
-    def test_a_copied_run_folder_is_as_good_as_the_original(self, experiment):
+    def test_a_copied_run_folder_is_valid(self, experiment):
         experiment.run()
         for path in experiment.run_dir.glob("*.json"):
             os.utime(path, (0, 0))
         assert experiment.run() == []
 
     @pytest.mark.parametrize("record", ["", "[]", "{}", '{"fingerprint": 3}'])
-    def test_a_broken_record_is_no_record(self, experiment, record):
+    def test_a_stage_with_an_invalid_record_runs_again(self, experiment, record):
         experiment.run()
         (experiment.run_dir / "stages" / "train.json").write_text(record)
         assert experiment.run() == ["train"]
@@ -175,7 +169,7 @@ class TestSkipping:
         experiment.settings["train"] = {"epochs": 5}
         assert experiment.run() == []
 
-    def test_fingerprint_covers_all_that_it_should_and_not_the_order_of_keys(self):
+    def test_the_fingerprint_does_not_depend_on_the_order_of_keys(self):
         def of(upstream: str = "u", **changes: Any) -> str:
             fields = {"name": "s", "function": print, "outputs": (), "settings": {"a": 1, "b": {"c": 2.0}}}
             return fingerprint(Stage(**{**fields, "upstream": ("before",), **changes}), {"before": upstream})
@@ -192,7 +186,7 @@ class TestSkipping:
 
 
 class TestInterruption:
-    def test_the_message_says_what_is_kept_and_seconds_add_up(self, experiment, clock):
+    def test_the_message_names_finished_stages_and_seconds_add_up(self, experiment, clock):
         def interrupt_after_a_while(context: StageContext) -> None:
             clock[0] += 30.0
             raise KeyboardInterrupt

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from damage import flip_bit
 from main_job import IN_RUN, run
 from played_run import check_robots
 
@@ -306,9 +307,7 @@ class TestBadInput:
         sysid = warp_resphys.load(arm, "sysid")
         with pytest.raises(InputError, match="no network"):
             export_network(sysid, tmp_path / "net.pt2")
-        content = bytearray(kept.read_bytes())
-        content[-9] ^= 1
-        kept.write_bytes(content)
+        flip_bit(kept)
         with pytest.raises(DataFileError, match="checksum"):
             warp_resphys.load(kept)
 

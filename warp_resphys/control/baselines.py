@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .plan import Response
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _RANKS = (8, 12, 18, 24, 36)  # candidates; validation chooses one
 DELAYS: Final = 4  # D, frames of markers from which the state is computed

@@ -9,15 +9,14 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
 from .plan import Horizon, Limits, Plan, Planner, PredictionModel
 from .reduced import ReducedModel
+from .world import FloatArray
 
-FloatArray = NDArray[np.float64]
 Memory = dict[str, FloatArray]
 
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model

@@ -9,12 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .polynomials import Monomials
 from .reduced import ReducedModel, ReducedState
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,13 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..experiment.files import DRIVEN
 from ..experiment.models import Learned
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from .baselines import LinearModel
 from .reduced import ReducedModel
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"

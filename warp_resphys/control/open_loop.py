@@ -10,14 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..robot.robot import Robot
 from .files import PlannedMotion
 from .plan import Planner
 from .reduced import ReducedModel
+from .world import FloatArray
 
-FloatArray = NDArray[np.float64]
 OnProgress = Callable[[int], None]
 
 _SHORTER: Final = 0.25  # factor on a correction that made the motion worse

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..io.errors import InputError
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop

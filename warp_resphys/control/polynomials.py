@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _SHARE_OF_POINTS: Final = 0.5  # largest number of coefficients, relative to the number of samples
 _RIDGE: Final = 1e-9  # relative to the mean square of the features

@@ -37,9 +37,7 @@ from ..io.errors import ConvergenceError, InputError
 from .plan import Response
 from .polynomials import Monomials, Polynomial
 from .reduced_force import ForceAlong, ReducedForce
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from .world import BoolArray, FloatArray
 
 STATIC_ORDER: Final = 3
 TANGENT_ORDER: Final = 2

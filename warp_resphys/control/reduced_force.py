@@ -17,8 +17,8 @@ from ..data.input_response import told_of
 from ..learning.networks import SkipMLP, StateMap
 from ..learning.predictors import Range
 from .polynomials import Monomials, Polynomial
+from .world import FloatArray
 
-FloatArray = NDArray[np.float64]
 Array = NDArray[Any]
 Layer = Callable[[Array], Array]
 

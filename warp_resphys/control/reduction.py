@@ -7,7 +7,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import scipy.linalg
 import torch
-from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from ..io.errors import ConvergenceError
@@ -19,8 +18,7 @@ from .polynomials import Polynomial, solve_ridge
 from .reduced import STATIC_ORDER, TANGENT_ORDER, USUAL_ORDER, ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _LEAST_SETTLED: Final = 0.9  # share of the sampled inputs that must have an equilibrium
 _WINDOW: Final = 0.3  # length of the predictions that measure the error [s]

@@ -20,8 +20,7 @@ from .plan import tracked_of
 from .sampling import driven_input
 from .stages import controllers_of
 from .task import motions_of
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 
 def driven_settings(folder: Path) -> DriveStage:

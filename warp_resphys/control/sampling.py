@@ -8,7 +8,6 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 import torch
-from numpy.typing import NDArray
 
 from ..data.actuation import InputSequences
 from ..data.input_response import InputResponse, response_of
@@ -18,8 +17,8 @@ from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State
+from .world import FloatArray
 
-FloatArray = NDArray[np.float64]
 OnProgress = Callable[[int], None]
 
 _MORE_MODES: Final = 1.5  # computed vibrations per kept one, so that the slowest are accurate

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
@@ -55,8 +55,7 @@ from .open_loop import Follower
 from .reduction import reduce
 from .sampling import Sampling, driven_input
 from .task import Task, motion_name, motions_of
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from ..io.errors import InputError
@@ -13,8 +12,7 @@ from ..settings.control import FigureSettings, HorizonSettings, PlanSettings
 from .plan import Horizon, Limits, Planner, Weights, tracked_of
 from .reduced import ReducedModel
 from .reference import Path
-
-FloatArray = NDArray[np.float64]
+from .world import FloatArray
 
 _POINTS = 40  # number of points of a path whose reach is checked
 

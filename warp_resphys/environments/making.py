@@ -17,7 +17,7 @@ from ..control.plan import tracked_of
 from ..control.reduced import ReducedModel
 from ..control.reduction import reduce
 from ..control.sampling import Sampling, driven_input
-from ..control.world import World
+from ..control.world import FloatArray, World
 from ..io.errors import InputError
 from ..io.progress import Progress
 from ..io.settings import parse
@@ -29,8 +29,6 @@ from ..settings.stages import LaboratoryStage
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
 from .worlds import ReducedWorld, RobotWorld
-
-FloatArray = NDArray[np.float64]
 
 TASKS: Final = ("reach", "follow", "swing_up")
 WORLDS: Final = ("simulator", "reduced", "laboratory")

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import Monomials, Polynomial
+from ..control.world import FloatArray
 from ..io.errors import InputError
 from ..linalg.threads import threads_for
 from .tasks import GoalTask, Reach
 from .vector import Observation, RobotVectorEnv
 
-FloatArray = NDArray[np.float64]
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 _NETWORK: Final = 128  # width of the policy's layers

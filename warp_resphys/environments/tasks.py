@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.reference import Path
+from ..control.world import FloatArray
 from ..io.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed
 _FIGURES: Final = ("circle", "eight", "R", "E", "S")

@@ -10,12 +10,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..control.world import World
+from ..control.world import FloatArray, World
 from ..io.errors import InputError
 from .picture import Camera
 from .tasks import RobotTask
 
-FloatArray = NDArray[np.float64]
 Observation = NDArray[np.float32]
 
 RENDER_MODES: Final = ("rgb_array",)

@@ -264,6 +264,6 @@ def test_verdict_looks_from_the_largest_number_of_markers_down():
         return {"markers": markers, "median_mm": median, "interquartile_range_mm": spread}
 
     said = verdict([row(1, 0.05, 0.2), row(2, 0.2, 0.04), row(4, 0.09, 0.06), row(8, 0.02, 0.01)], 1.0)
-    assert said.startswith("From 4 markers on, the median error stays below 0.1\N{NO-BREAK SPACE}mm")
-    assert said.endswith("apart from 8 markers on.")
+    assert said.startswith("With 4 or more markers, the median error stays below 0.1\N{NO-BREAK SPACE}mm")
+    assert said.endswith("With 8 or more, the quartiles are less than 0.05\N{NO-BREAK SPACE}mm apart.")
     assert verdict([row(1, 0.2, 0.2)], 1.0).startswith("With none of these")

@@ -44,7 +44,7 @@ def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
     assert scene.fps == pytest.approx(fps)
     assert (scene.texts[0], scene.texts[-1]) == ("0.00 s", "1.00 s")
     sysid, resphys = scene.views
-    assert sysid.legend == [("SysID, open loop", TONES["sysid"].light), ("to be drawn", TONES["muted"].light)]
+    assert sysid.legend == [("SysID, open loop", TONES["sysid"].light), ("path", TONES["muted"].light)]
     assert resphys.legend == [("ResPhys, receding horizon", TONES["resphys"].light)]
     for view, points in zip(scene.views, shown.points.values(), strict=True):
         body, _, path, trail, ball, *drawing = view.layers

@@ -142,12 +142,12 @@ class TestIdentification:
 
     def test_what_the_data_cannot_tell(self, identified):
         said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
-        assert said == "SysID: the data tell least about damping by stiffness, to 3.4 % of the range."
+        assert said == "SysID: the data determine damping by stiffness least, to 3.4 % of the range."
         assert uncertainty_text("sysid", {**identified, "uncertainty": None}, {}) == ""
         identified["uncertainty"] |= {"poorest_deviation": 1.9, "correlation": [[1.0, -0.95], [-0.95, 1.0]]}
         said = uncertainty_text("sysid", identified, {})
-        assert "a prior would settle it" in said
-        assert f"cannot tell apart Young's modulus and damping by stiffness ({MINUS}0.95)" in said
+        assert "over the whole range: set a prior" in said
+        assert f"do not separate Young's modulus and damping by stiffness (correlation {MINUS}0.95)" in said
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
@@ -155,14 +155,14 @@ class TestIdentification:
         prior = {"mean": 250e3, "deviation": 10e3}
         ranges = {"youngs_modulus": parse(RangeSettings, {"lower": 5e4, "upper": 2e6, "prior": prior})}
         said = uncertainty_text("sysid", identified, ranges)
-        assert said.endswith("at 250 ± 10 kPa.") is not informs
+        assert said.endswith("at its prior, 250 ± 10 kPa.") is not informs
 
     def test_where_markers_and_recordings_lie(self):
         offsets = {"A": [0.001, 0.0, 0.0], "B": [0.0, 0.003, 0.004]}
         said = placement_text("sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]})
         said = said.replace(NO_BREAK_SPACE, " ")
-        assert "B the furthest, by 5.0 mm" in said
-        assert "2.0 mm and 5.7° off" in said
+        assert "B the most, by 5.0 mm" in said
+        assert "by 2.0 mm and rotated by 5.7°" in said
 
 
 def test_rows_of_markers_that_were_never_seen():

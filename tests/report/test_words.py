@@ -104,7 +104,7 @@ class TestGains:
         """Its error is that of identification, 30 % below the uncorrected one: not its own merit."""
         errors = {"simulation": [1.0, 2.0], "sysid": [0.7, 1.4], "resphys": [0.7, 1.4]}
         assert "adds nothing to SysID" in said_of("resphys", gains(errors, {"resphys": [0, 0]}))
-        assert "In 1 of 2 folds none" in said_of("resphys", gains(errors, {"resphys": [0, 2]}))
+        assert "In 1 of 2 folds no epoch" in said_of("resphys", gains(errors, {"resphys": [0, 2]}))
         means = {model: summary(sum(each) / 2) for model, each in errors.items()}
         assert best(means, untrained({"resphys": [0, 0], "simfree": [4, 0]})) == "sysid"
         assert best({**means, "resphys": summary(0.6)}) == "resphys"
@@ -165,7 +165,7 @@ def test_conclusions_of_folds_and_of_one_split():
     assert epochs_kept(metrics) == {"resphys": [0, 3]}
     sentences = conclusions(metrics, SETTINGS)
     assert "leaves 45 % (90 %: 40 to 50) less" in said_of("sysid", sentences)
-    assert "In 1 of 2 folds none of its training was kept." in said_of("resphys", sentences)
+    assert "In 1 of 2 folds no epoch of its training was kept." in said_of("resphys", sentences)
     for said in ("In 1 of 2 folds, youngs_modulus", "In 2 of 2 folds, poissons_ratio"):
         assert any(each.startswith(said) for each in sentences)
     alone = conclusions(metrics["folds"]["a"], SETTINGS)
@@ -210,7 +210,7 @@ def test_verdict_on_markers():
     lost = {"sysid": summary(2.0), "resphys": summary(None, 1)}
     assert "ResPhys diverged in 1 of 3 roll-outs" in marker_verdict(lost, ["a", "b"], None)
     said = marker_verdict({"sysid": {"mean": 1.0}}, ["step"], None, parted=True)
-    assert "in the part that no training or identification saw" in said
+    assert "in the part held out from training and identification" in said
 
 
 def test_a_trial_whose_rest_is_the_test_is_not_called_unseen():
@@ -251,7 +251,7 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     free, force = (each.replace(NO_BREAK_SPACE, " ") for each in range_texts(metrics, ["a", "b", "c"]))
     assert free.startswith("SimFree: none of 3 roll-outs")
     assert "higher" not in free
-    assert "ResPhys: 2 of 3 roll-outs left the states of the training, the first after 1.00 s (a)." in force
+    assert "ResPhys: 2 of 3 roll-outs left the training range, the first after 1.00 s (a)." in force
     assert "none of 3 (1.25 times), 1 of 3 (1.5 times), the first after 0.25 s (d)" in force
     (alone,) = range_texts({"range": {"resphys": {"first_s": {"a": 0.5}}}}, ["a"])
     assert alone.startswith("ResPhys: the roll-out left")
@@ -289,8 +289,8 @@ def test_it_is_said_which_weights_were_taken():
 def test_what_of_the_errors_is_mesh():
     check = {"cells": [100, 800], "model": "sysid", "errors_mm": [1.0, 0.9], "moved_mm": 0.2}
     (said,) = error_notes({}, {}, check)
-    assert "800 in place of 100 cells" in said
-    assert "0.900 mm in place of 1.000 mm" in said
+    assert "800 instead of 100 cells" in said
+    assert "0.900 mm instead of 1.000 mm" in said
     (said,) = error_notes({}, {}, {**check, "failed": "it diverged."})
     assert said.endswith("it diverged.")
     assert len(error_notes({"a": 2.0}, {"noise_mm": 0.1}, {})) == 2

@@ -1,4 +1,4 @@
-"""The page of the marker ablation: a box plot, its numbers, and how the motion was reconstructed."""
+"""The page of the marker ablation: a box plot, a table, and the method of reconstruction."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -46,9 +46,9 @@ def write_ablation_report(
         path: The page's file, such as `report.html`; missing folders are made.
         metrics: `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
         settings: The run's configuration.
-        vertices: How many the mesh has.
-        surface: How many of them are on its surface,
-        free: and how many of these are not clamped.
+        vertices: Number of vertices of the mesh.
+        surface: Number of vertices on its surface.
+        free: Number of surface vertices that are not clamped.
 
     Raises:
         DataFileError: A file could not be written.
@@ -57,7 +57,7 @@ def write_ablation_report(
     assert ablation is not None
     caption = (
         f"Mean distance of all {vertices} vertices from the target over the {settings.data.steps} steps of one "
-        "motion, of which the reconstruction sees the markers alone. The orange line is the median of "
+        "motion, reconstructed from the markers alone. The orange line is the median of "
         f"{ablation.draws} random sets of markers, the box extends from the lower to the upper "
         "quartile, the whiskers to the smallest and the largest error."
     )
@@ -68,7 +68,7 @@ def write_ablation_report(
     )
     if more := [str(row["markers"]) for row in rows if row["markers"] > free]:
         note += (
-            f" {', '.join(more)} markers are more than these, and are drawn from all {surface} surface vertices, as "
+            f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} surface vertices, as "
             "published."
         )
     how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
@@ -95,43 +95,39 @@ def _how_reconstructed(modes: int | None, regularisation: float) -> str:
     free = f"among the inertial forces of the {modes} slowest vibrations" if modes else "free at every vertex"
     return Markup(
         "Step by step from the known first state, with the force of least |markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
-        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², {}. The published study takes "
+        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², {}. The published study uses "
         "1.0&nbsp;×&nbsp;10⁻⁴&nbsp;m²/N² for λ."  # noqa: RUF001
     ).format(number_text(regularisation), free)
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
-    """Say from how many markers on the error stays below the published thresholds; uncorrected, it is this many mm."""
-    enough = _from_here_on(rows, "median_mm", 0.1)
-    said = (
+    """Return the number of markers needed for the published thresholds, and the uncorrected error [mm], in words."""
+    needed = _markers_below(rows, "median_mm", 0.1)
+    text = (
         "With none of these numbers of markers does the median error stay below 0.1 mm."
-        if enough is None
-        else f"From {enough} marker{'s' if enough > 1 else ''} on, the median error stays below 0.1 mm, that of the "
-        f"published reconstruction from 4 markers on. The uncorrected simulation is {number_text(uncorrected)} mm off."
+        if needed is None
+        else f"With {needed} or more markers, the median error stays below 0.1 mm; the published reconstruction needs "
+        f"4. The error of the uncorrected simulation is {number_text(uncorrected)} mm."
     )
-    narrow = _from_here_on(rows, "interquartile_range_mm", 0.05)
+    narrow = _markers_below(rows, "interquartile_range_mm", 0.05)
     if narrow is not None:
-        said += f" The quartiles lie less than 0.05 mm apart from {narrow} marker{'s' if narrow > 1 else ''} on."
-    return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
+        text += f" With {narrow} or more, the quartiles are less than 0.05 mm apart."
+    return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def _from_here_on(rows: Sequence[Mapping[str, Any]], key: str, below: float) -> int | None:
+def _markers_below(rows: Sequence[Mapping[str, Any]], key: str, threshold: float) -> int | None:
     """The smallest number of markers from which on a value stays below a threshold."""
-    least = None
-    for row in sorted(rows, key=lambda row: -int(row["markers"])):
-        if not row[key] < below:
-            break
-        least = int(row["markers"])
-    return least
+    above = [int(row["markers"]) for row in rows if not row[key] < threshold]
+    return min((int(row["markers"]) for row in rows if int(row["markers"]) > max(above, default=0)), default=None)
 
 
 def box_errors(metrics: Mapping[str, Any]) -> dict[int, FloatArray]:
-    """Return the draws' errors [mm] by number of markers."""
+    """Return the errors [mm] of all draws by number of markers."""
     return {int(row["markers"]): np.array(row["errors_mm"]) for row in metrics["by_markers"]}
 
 
 def describe_boxes(metrics: Mapping[str, Any]) -> str:
-    """Say what the box plot shows, by `by_markers`."""
+    """Return a description of the box plot, with its medians."""
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in metrics["by_markers"])
     return f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
 
@@ -145,7 +141,7 @@ def marker_boxes(
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
         uncorrected: Error without any correction [mm].
-        published: From which number of markers on the published median is below what error [mm].
+        published: A number of markers, and an upper bound of the published median error from there on [mm].
         narrow: Whether the figure is for a narrow page.
     """
     ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}

@@ -13,33 +13,38 @@ from .data import MODELS, mean_distance
 from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, RenderScene, View, pace, view_axes
 
 _LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
-MARGIN: Final = 0.02  # Around the bodies there, as the lengths below relative to the longer side of what is seen.
+MARGIN: Final = 0.02  # Around the bodies; this and the next lengths are over the longer side of the view.
 _WIDTHS: Final = (0.0034, 0.0018)  # Of the outline, and of the lines around faces.
-_NUDGE: Final = 0.005  # The outline is drawn this far behind the body where they coincide.
+_NUDGE: Final = 0.005  # Shift of the outline behind the body, where they coincide.
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
-SHADE: Final = 0.25  # Share of the colour that depends on the light; the rest stays readable as a value.
-_SHARP: Final = 30.0  # Between the normals of faces that share an edge of the outline [degrees].
-_DIVERGED: Final = 10.0  # Distance from the target, or from rest, over the body's, beyond which nothing is drawn.
+SHADE: Final = 0.25  # Share of the colour that depends on the light.
+_SHARP: Final = 30.0  # Least angle between the normals of faces at an edge of the outline [degrees].
+_DIVERGED: Final = 10.0  # Distance from the target or from rest beyond which nothing is drawn, over the body's size.
 
-_FAST: Final = 2.5  # [s] that a motion lasts which is shown slowed down, and from its start only,
-_FINE: Final = 0.025  # where its frames are no farther apart [s].
-BODIES: Final = ("#6b7580", "#8db4e8")  # Of the bodies behind, and of the last one.
-_RINGS: Final = ("#6b7580", "#1a5fb4")  # Of their markers.
+_FAST: Final = 2.5  # Longest duration of a motion that is shown in slow motion [s],
+_FINE: Final = 0.025  # if its frames are no farther apart than this [s].
+BODIES: Final = ("#6b7580", "#8db4e8")  # Colours of the bodies behind, and of the last one.
+_RINGS: Final = ("#6b7580", "#1a5fb4")  # Colours of their markers.
 BODY_LIGHT: Final = (0.72, 0.3)
-HEADROOM: Final = 0.12  # For the text above a film's view, over half its height.
-_LEAST_NEAR: Final = 0.03  # Of the body's size, half the height of the view from nearby, as of one marker alone.
-_MOST_NEAR: Final = 1.6  # How far the other models' markers may widen the view from nearby.
-FILM_VIEW: Final = (560, 480)  # [px] of each view.
+HEADROOM: Final = 0.12  # Space for the text above a film's view, over half its height.
+_LEAST_NEAR: Final = 0.03  # Least half height of the close-up, over the body's size.
+_MOST_NEAR: Final = 1.6  # Largest factor by which the other models' markers widen the close-up.
+FILM_VIEW: Final = (560, 480)  # Size of each view [px].
 _PICTURE_VIEW: Final = (480, 408)
-_RADII: Final = {FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Of a dot, over the height of a view; pictures are small.
+_RADII: Final = {FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Radius of a dot, over the height of a view.
 _RING: Final = 1.9  # Radius of a simulated marker's ring, over that of a dot.
-_WIDER: Final = 0.35  # That of each other model's ring.
-_BEHIND: Final = 0.3  # Opacity of the bodies that the last one is compared with.
-_BEFORE: Final = {"lines": 0.01, "others": -4.0, "rings": 2.5, "dots": 5.0}  # The last body, over half a view's height.
+_WIDER: Final = 0.35  # Increase of the radius for the ring of each further model.
+_BEHIND: Final = 0.3  # Opacity of the bodies with which the last one is compared.
+_BEFORE: Final = {
+    "lines": 0.01,
+    "others": -4.0,
+    "rings": 2.5,
+    "dots": 5.0,
+}  # Shift to the viewer, over half a view's height.
 
 
 def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> dict[str, float | None]:
-    """Return the largest distance of each body (N, 3) from the target's vertices (N, 3) [m]; None where it diverged."""
+    """Return the largest distance of each body (N, 3) from the target's vertices (N, 3) [m]; None if it diverged."""
     far = _DIVERGED * np.ptp(mesh.vertices, axis=0).max()
     return {
         name: float(np.linalg.norm(q - target, axis=1).max()) if np.all(np.abs(q - target) < far) else None
@@ -48,15 +53,15 @@ def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: F
 
 
 def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> RenderScene | None:
-    """Return deformed bodies, coloured by the distance from the target's vertices: from zero to the largest of each.
+    """Return deformed bodies, coloured by the distance from the target's vertices, from zero to the largest of each.
 
     Args:
         mesh: The undeformed body, drawn as an outline.
-        positions: (N, 3) deformed positions [m] by name; what has diverged is left out.
-        target: (N, 3) the target's [m].
+        positions: (N, 3) deformed positions [m] by name; diverged bodies are left out.
+        target: (N, 3) positions of the target [m].
 
     Returns:
-        A view of each body; None where all of them have diverged.
+        A view of each body; None if all of them have diverged.
     """
     distances = largest_distances(mesh, positions, target)
     largest = {name: max(most, 1e-15) for name, most in distances.items() if most is not None}
@@ -79,10 +84,10 @@ def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: Floa
 
 
 def face_edges(mesh: Mesh) -> IntArray:
-    """Return the lines (E, 2) around the faces of the boundary, each line once."""
+    """Return the unique lines (E, 2) around the faces of the boundary."""
     sides, corners = boundary_faces(mesh), mesh.element.face.corners
     rims = sides[:, :corners]
-    if sides.shape[1] > corners:  # Middles of the edges come after the corners.
+    if sides.shape[1] > corners:  # Edge midpoints follow the corners.
         rims = np.stack([rims, sides[:, corners : 2 * corners]], axis=2).reshape(len(sides), -1)
     edges = np.sort(np.stack([rims, np.roll(rims, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     return np.asarray(np.unique(edges, axis=0))
@@ -104,7 +109,7 @@ def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class ComparedMotion:
-    """A measured motion and simulations of it, at the same T times."""
+    """A measured motion and its simulations, at the same T times."""
 
     mesh: Mesh  # The body at rest.
     times: FloatArray  # (T,) since the release [s].
@@ -112,38 +117,40 @@ class ComparedMotion:
     positions: Mapping[str, FloatArray]  # (T, N, 3) [m] of the vertices, by model; the last is drawn solid.
     markers: Mapping[str, FloatArray]  # (T, M, 3) [m] of the same models.
     bound: FloatArray  # (M, 3) [m] markers on the body at rest.
-    gravity: FloatArray  # (3,) which way is down.
-    from_below: bool = False  # Whether the second view is from below, where a hanging body moves, not from nearby.
+    gravity: FloatArray  # (3,) direction of gravity.
+    from_below: bool = False  # Whether the second view is from below, as for hanging bodies, rather than a close-up.
     target: FloatArray | None = None  # (T, N, 3) [m] of the vertices, where every one is observed.
 
     @property
     def is_fast(self) -> bool:
-        """Whether it is shown slowed down."""
+        """Whether the motion is shown in slow motion."""
         return bool(self.times[-1] <= _FAST and np.diff(self.times).max(initial=0.0) <= _FINE)
 
     @property
     def instants(self) -> list[int]:
-        """The frames that are shown, as `instants` chooses them for the first model."""
+        """The frames of pictures, by `instants` for the first model."""
         return instants(self.measured, self.bound, next(iter(self.markers.values())))
 
     def at(self, frames: Sequence[int] | IntArray) -> "ComparedMotion":
-        """Return some of the frames."""
+        """Return the motion at some of its frames."""
         chosen = np.asarray(frames, dtype=np.int64)
-        positions, markers = ({m: q[chosen] for m, q in each.items()} for each in (self.positions, self.markers))
+        positions, markers = (
+            {m: q[chosen] for m, q in by_model.items()} for by_model in (self.positions, self.markers)
+        )
         times, measured = self.times[chosen], self.measured[chosen]
         target = None if self.target is None else self.target[chosen]
         return replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
 
     def scene(self) -> RenderScene:
-        """Return the whole body at some instants, and beside it the markers from nearby, or the body from below."""
+        """Return the scene of the body at some instants, with a close-up of the markers or a view from below."""
         return RenderScene(_views(self.at(self.instants), _PICTURE_VIEW), _PICTURE_VIEW)
 
     def film(self, seconds: float | None = None, slower: float | None = None) -> RenderScene:
-        """Return a film of the first seconds, slowed down if the motion is fast.
+        """Return the scene of a film of the first seconds.
 
         Args:
-            seconds: That are shown; 10, or 1.5 of a fast motion, if left out.
-            slower: How many times slower it is shown; 4 for a fast motion, if left out.
+            seconds: Duration [s]; by default 10, or 1.5 of a fast motion.
+            slower: Factor of slow motion; by default 1, or 4 of a fast motion.
         """
         usual, longest = (4.0, 1.5) if self.is_fast else (1.0, 10.0)
         frames, fps = pace(self.times, usual if slower is None else slower)
@@ -156,10 +163,10 @@ class ComparedMotion:
 
 
 def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:
-    """Return three frames that lie apart, or fewer of a short motion.
+    """Return three separate frames, or fewer of a short motion.
 
-    They are where the simulation is farthest off, where the markers have moved most, and the last one; where two of
-    these are close to each other, one from between is taken.
+    These are the frames of the largest error, of the largest motion of the markers, and the last one; where two of them
+    are close to each other, a frame in between is chosen.
 
     Args:
         target: (T, M, 3) [m], NaN where a marker was not seen.
@@ -178,21 +185,21 @@ def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> li
 
 
 def without_diverged(points: FloatArray, rest: FloatArray, far: float) -> FloatArray:
-    """Return points (..., P, 3), NaN in the frames in which one is not finite or farther than this from rest [m]."""
+    """Return points (..., P, 3), NaN in frames with a point that is not finite or farther than `far` from rest [m]."""
     with np.errstate(invalid="ignore", over="ignore"):
         kept = (np.abs(points - rest) < far).all(axis=(-2, -1), keepdims=True)
     return np.where(kept, points, np.nan)
 
 
 def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0) -> list[View]:
-    """The whole body, with room for text above it over half its height, and its markers from nearby or from below."""
+    """A view of the whole body, with space for text above it over half its height, and a second view."""
     rest = motion.mesh.vertices
     far = _DIVERGED * float(np.ptp(rest, axis=0).max())
     positions = without_diverged(np.stack([*motion.positions.values()]), rest, far)  # (B, T, N, 3)
     simulated = without_diverged(np.stack([*motion.markers.values()]), motion.bound, far)  # (B, T, M, 3)
     seen = np.concatenate([rest[None], *positions])
     axes = motion_axes(motion.gravity, seen)
-    everything = np.concatenate([each.reshape(-1, 3) for each in (seen, simulated, motion.measured)])
+    everything = np.concatenate([points.reshape(-1, 3) for points in (seen, simulated, motion.measured)])
     middle, half = frame_of(everything, axes)
     height = height_of(half, size)
     if motion.from_below:
@@ -215,14 +222,14 @@ def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0)
 
 
 def _bodies(mesh: Mesh, positions: FloatArray, half: float) -> list[Layer]:
-    """The last of some bodies (B, T, N, 3) solid with the lines around its faces, the others seen through behind it.
+    """Layers of bodies (B, T, N, 3): the last one solid with the lines around its faces, the others translucent.
 
-    The others' surfaces are so far behind that they show beside it only.
+    The surfaces of the others are shifted far behind, so that they show beside the solid body only.
     """
     triangles, edges = boundary_triangles(mesh), face_edges(mesh)
     sharp = sharp_edges(mesh.vertices, triangles)
     sharp = sharp if len(sharp) else edges
-    layers, before = [], {name: half * each for name, each in _BEFORE.items()}
+    layers, before = [], {name: half * shift for name, shift in _BEFORE.items()}
     *others, solid = positions
     for q in others:
         others_shift = before["others"]
@@ -235,7 +242,7 @@ def _bodies(mesh: Mesh, positions: FloatArray, half: float) -> list[Layer]:
 
 
 def _stems(motion: ComparedMotion, positions: FloatArray, markers: FloatArray) -> Layer:
-    """Lines to (T, M, 3) a body's markers from the points of it that are closest to them at rest."""
+    """Lines to the markers (T, M, 3) of a body from the points of it that are closest to them at rest."""
     closest = closest_points(motion.mesh, motion.bound)
     corners = motion.mesh.vertices[closest.triangles]  # (M, 3, 3)
     unit = np.full((len(markers[0]), 1, 3), corners.max() or 1.0)
@@ -253,7 +260,7 @@ def stems(feet: FloatArray, markers: FloatArray, colour: str, width: float) -> L
 
 
 def _dots(measured: FloatArray, simulated: FloatArray, half: float, radius: float) -> list[Layer]:
-    """Dots of the measured markers (T, M, 3) and rings of the simulated ones (B, T, M, 3), in front of all else."""
+    """Dots of the measured markers (T, M, 3) and rings of the simulated ones (B, T, M, 3), in the foreground."""
     size, layers = 2.0 * half * radius, []
     for behind, places in zip(reversed(range(len(simulated))), simulated, strict=True):
         colour, wide = _RINGS[0 if behind else 1], (_RING + _WIDER * behind) * size
@@ -264,10 +271,10 @@ def _dots(measured: FloatArray, simulated: FloatArray, half: float, radius: floa
 def _follow(
     motion: ComparedMotion, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]
 ) -> tuple[FloatArray, float]:
-    """(T, 3) middle of the markers in each frame, and half the height of a view that holds them [m].
+    """Middle (T, 3) of the markers in each frame, and half the height of a view that contains them [m].
 
-    Where not all markers were seen, those (B, T, M, 3) of the last model say where the middle is. The other models'
-    markers are in the view unless they are far off.
+    Where markers were not seen, the middle is that of the last model's markers (B, T, M, 3). The view contains the
+    markers of the other models unless they are far away.
     """
     measured, least = motion.measured, _LEAST_NEAR * float(np.ptp(motion.mesh.vertices, axis=0).max())
     places = np.where(np.isfinite(measured).all(axis=(1, 2), keepdims=True), measured, simulated[-1])

@@ -1,4 +1,4 @@
-"""A picture of a body at rest that shows its chambers or tendons."""
+"""A picture of a body at rest with its chambers or tendons."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, R
 
 TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
 _CUT: Final = "#d3dde7"
-_LIFT: Final = 2e-3  # Of lines above the surface that they lie on, over the body's longest side.
+_LIFT: Final = 2e-3  # Height of lines above their surface, over the body's longest side.
 _DOT: Final = 0.011  # Radius of a marker, over the body's longest side.
 _MARGIN: Final = 0.02  # Around the body, over its longer side.
 _LONGER_SIDE: Final = 1400  # of a view [px]
@@ -40,10 +40,10 @@ class MeshSummary:
 
     mesh: Mesh
     density: float  # Of its material [kg/m^3].
-    fixed: IntArray  # (P,) vertices that are clamped.
-    chambers: tuple[Chamber, ...]  # Its closed ones.
-    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
-    inside: str = "Chambers"  # What is in colours, as a title.
+    fixed: IntArray  # (P,) clamped vertices.
+    chambers: tuple[Chamber, ...]  # Closed chambers.
+    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
+    inside: str = "Chambers"  # Title of the coloured parts.
 
     @property
     def volume(self) -> float:
@@ -63,7 +63,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     Args:
         path: The PNG file to write.
         summary: The body.
-        markers: (M, 3) [m], drawn as dots where it is not cut.
+        markers: (M, 3) [m], drawn as dots in the uncut views.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
@@ -77,8 +77,10 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     size = picture_size(half, _LONGER_SIDE)
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
     ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True))
-    volumes = {each.name.replace("_", " "): _CUBIC_CENTI * summary.chamber_volume(each) for each in summary.chambers}
-    labels = [*(f"{name}: {volume:.1f} cm³" for name, volume in volumes.items())]
+    labels = [
+        f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
+        for chamber in summary.chambers
+    ]
     labels += [name.replace("_", " ") for name in summary.tendons]
     handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
     width, height = 3 * size[0] / _DPI, size[1] / _DPI
@@ -98,7 +100,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
-    """The body from outside, the half behind a plane along it, and its chambers within the translucent body.
+    """Layers of the body from outside, of its half behind a plane along it, and of chambers in the translucent body.
 
     Args:
         summary: The body.

@@ -1,4 +1,4 @@
-"""From where bodies are seen: directions of a view, and how much of them it holds."""
+"""Views of bodies: their axes and their size."""
 
 from typing import Final
 
@@ -7,11 +7,11 @@ import numpy as np
 from ..mesh.mesh import Mesh
 from .render import FloatArray, IntArray, view_axes
 
-_FRAME: Final = 0.06  # Margin around what is seen, over its longer side.
-_TILT: Final = (0.30, 0.30)  # From the right and from above.
-_HANGING: Final = 0.7  # Cosine between gravity and a body that hangs.
-_LEVEL: Final = 1.2  # How far a level path is seen from its near side, over how far from above;
-_UPRIGHT: Final = 0.3  # an upright one is seen from so far above.
+_FRAME: Final = 0.06  # Margin around the points in a view, over their longer side.
+_TILT: Final = (0.30, 0.30)  # Of the view, to the right and upwards.
+_HANGING: Final = 0.7  # Least cosine between gravity and the axis of a hanging body.
+_LEVEL: Final = 1.2  # Tilt of the view of a path in a level plane, towards its near side.
+_UPRIGHT: Final = 0.3  # Tilt of the view of a path in an upright plane, upwards.
 
 
 def upwards(gravity: FloatArray) -> FloatArray:
@@ -30,10 +30,10 @@ def hangs(mesh: Mesh, fixed: IntArray, gravity: FloatArray) -> tuple[bool, Float
 
 
 def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return axes (3, 3) as `view_axes`, with what extends or moves most across gravity to the right.
+    """Return axes (3, 3) as `view_axes`, whose right is the direction of largest extent or motion across gravity.
 
     Args:
-        gravity: (3,) which way is down; along -z where it is zero.
+        gravity: (3,) direction of gravity; -z is taken for zero.
         positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
     """
     up = upwards(gravity)
@@ -49,22 +49,22 @@ def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
 
 
 def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Return axes (3, 3) of a view from below, whose right is that of a view with the given axes.
+    """Return axes (3, 3) of a view from below with the same right as the given axes.
 
     Args:
-        axes: (3, 3) of a view that has gravity along its second row, or behind it.
-        gravity: (3,) which way is down; along -z where it is zero.
+        axes: (3, 3) of a view in which gravity points down or away.
+        gravity: (3,) direction of gravity; -z is taken for zero.
     """
     towards = -upwards(gravity)
     return np.stack([axes[0], np.cross(towards, axes[0]), towards])
 
 
 def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Return axes (3, 3) as `view_axes`, by which letters in a plane can be read and what is up is above.
+    """Return axes (3, 3) as `view_axes`, in which letters in a plane are readable.
 
     Args:
-        plane: (2, 3) to the right and upwards in it.
-        gravity: (3,) which way is down.
+        plane: (2, 3) directions to the right and upwards in the plane.
+        gravity: (3,) direction of gravity.
     """
     up, normal = upwards(gravity), np.cross(*plane)
     normal /= np.linalg.norm(normal)
@@ -74,12 +74,12 @@ def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
 
 
 def frame_of(points: FloatArray, axes: FloatArray, margin: float = _FRAME) -> tuple[FloatArray, FloatArray]:
-    """Return the middle (3,) of points (P, 3), and half the width and height (2,) of a view that holds them all [m].
+    """Return the middle (3,) of points (P, 3), and half the width and height (2,) of a view that contains them [m].
 
     Args:
-        points: [m]; what is not finite is left out.
+        points: [m]; those that are not finite are left out.
         axes: (3, 3) of the view.
-        margin: on each side, over the longer side of the points.
+        margin: On each side, over the longer side of the points.
     """
     turned = points[np.isfinite(points).all(axis=1)] @ axes.T
     low, high = turned.min(axis=0), turned.max(axis=0)
@@ -88,10 +88,10 @@ def frame_of(points: FloatArray, axes: FloatArray, margin: float = _FRAME) -> tu
 
 
 def picture_size(half: FloatArray, longer_side: float) -> list[int]:
-    """Return width and height [px] of a picture that shows half a width and height (2,) [m] to both sides."""
+    """Return width and height [px] of a picture of a view, from half its width and height (2,) [m]."""
     return [int(side) for side in np.ceil(longer_side * half / half.max())]
 
 
 def height_of(half: FloatArray, size: tuple[int, int]) -> float:
-    """Return half the height of a view of some size [px] that holds half a width and height (2,)."""
+    """Return half the height of a view of a size [px] that contains half a width and height (2,)."""
     return float(max(half[1], half[0] * size[1] / size[0]))

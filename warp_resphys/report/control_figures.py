@@ -20,11 +20,11 @@ _COLUMNS: Final = {False: 5, True: 2}  # of figures on a wide page, on a narrow 
 def followed_paths(
     paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray, *, narrow: bool
 ) -> Figure:
-    """Draw paths, and what controllers made of them, side by side in their plane.
+    """Draw paths and the paths of the controlled point, side by side in their plane.
 
     Args:
-        paths: That were followed.
-        controllers: Names of those that are drawn, in words.
+        paths: Paths and points.
+        controllers: Names in words of the controllers that are drawn.
         plane: (2, 3) directions of the width and of the height.
         narrow: Whether the figure is for a narrow page.
     """
@@ -36,18 +36,18 @@ def followed_paths(
     first = plane[0] / np.linalg.norm(plane[0])
     second = plane[1] - (plane[1] @ first) * first
     across = 1e3 * np.stack([first, second / np.linalg.norm(second)])
-    middle = np.mean([each.path.mean(axis=0) for each in paths], axis=0)
+    middle = np.mean([followed.path.mean(axis=0) for followed in paths], axis=0)
     lines: dict[str, Any] = {}
-    for axes, each in zip(every, paths, strict=False):
-        x, y = ((each.path - middle) @ across.T).T
-        (lines["to be followed"],) = axes.plot(x, y, color=TONES["target"].light, linewidth=3.2)
+    for axes, followed in zip(every, paths, strict=False):
+        x, y = ((followed.path - middle) @ across.T).T
+        (lines["path"],) = axes.plot(x, y, color=TONES["target"].light, linewidth=3.2)
         for controller, name in controllers.items():
             beginning, model = controller.split("_", 1)
-            x, y = ((each.points[controller] - middle) @ across.T).T
+            x, y = ((followed.points[controller] - middle) @ across.T).T
             tone = TONES[model].light
             (lines[name],) = axes.plot(x, y, color=tone, linestyle=_LINES[beginning], linewidth=1.1)
         axes.set_aspect("equal")
-        axes.set_title(each.name)
+        axes.set_title(followed.name)
         axes.grid(False)
     for axes in every[len(paths) :]:
         axes.set_visible(False)

@@ -1,4 +1,4 @@
-"""The section on control: how well paths are followed on the simulated laboratory, and how that was planned."""
+"""The section on control: errors of followed paths on the simulated laboratory, and how motions were planned."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -11,16 +11,16 @@ from ..settings.control import ControlSettings
 from .data import MODELS, RunReport
 from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
 
-_KINDS: Final[Mapping[str, tuple[str, str]]] = {  # by the beginning of a controller's name: its name and its meaning
-    "open_": ("{}, open loop", "planned once, on the whole path, and played"),
+_KINDS: Final[Mapping[str, tuple[str, str]]] = {  # By prefix of a controller: name in words, and description.
+    "open_": ("{}, open loop", "planned once for the whole path, and played"),
     "receding_linear": ("Linear model, receding horizon", "dynamic mode decomposition of the same recordings"),
     "receding_": ("{}, receding horizon", "planned anew at each step, from an estimate by the markers"),
-    "feedback_": ("Jacobian feedback, {}/s", "by how the point moved when each input was pressed"),
+    "feedback_": ("Jacobian feedback, {}/s", "with the measured Jacobian of the point by the inputs"),
 }
 
 
 def control_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return how well paths are followed; None where nothing is controlled, or no simulation plays the robot."""
+    """Return the section; None where nothing is controlled, or no simulation plays the robot."""
     from . import control_figures
 
     metrics, control = data.metrics.get("control") or {}, data.settings.control
@@ -28,15 +28,14 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
         return None
     blocks: list[Any] = [Text(_task(control), "control"), _table(metrics["tracking"])]
     slowest = max(control.seconds)
-    drawn = [each for each in data.followed if each.seconds == slowest]
+    drawn = [followed for followed in data.followed if followed.seconds == slowest]
     if drawn:
-        chosen = compared_controllers(control)
-        named = {each: controller_name(each) for each in chosen}
+        named = {controller: controller_name(controller) for controller in compared_controllers(control)}
         names = ", ".join(named.values())
-        alt = f"{len(drawn)} paths of {slowest:g} s, and where the point went, by {names}."
+        alt = f"{len(drawn)} paths of {slowest:g} s, and the paths of the point with {names}."
         caption = (
-            f"What was to be drawn in {slowest:g} s (grey), and what the simulated laboratory drew: {names}. The tip "
-            "comes from where it hangs."
+            f"Paths of {slowest:g} s (grey), and the paths of the point in the simulated laboratory with {names}. The "
+            "point starts from where the tip hangs."
         )
         plane = np.array([control.right, control.up], dtype=np.float64)
         blocks.append(
@@ -52,10 +51,10 @@ def controller_name(controller: str) -> str:
 
 
 def _words(controller: str) -> tuple[str, str]:
-    """The name of a controller and its meaning."""
-    beginning = next(each for each in _KINDS if controller.startswith(each))
-    name, meaning = _KINDS[beginning]
-    rest = controller.removeprefix(beginning)
+    """The name and the description of a controller."""
+    prefix = next(prefix for prefix in _KINDS if controller.startswith(prefix))
+    name, meaning = _KINDS[prefix]
+    rest = controller.removeprefix(prefix)
     return name.format(MODELS[rest][0] if rest in MODELS else rest), meaning
 
 
@@ -64,8 +63,8 @@ def _task(control: ControlSettings) -> str:
     named = f"the mean of {', '.join(tracked[:-1])} and {tracked[-1]}" if len(tracked) > 1 else tracked[0]
     return (
         f"A point, {named}, follows {len(shapes)} paths ({', '.join(shapes)}) of {1e3 * control.size:g} mm, by "
-        "inputs within their bounds and rates, which are given to the simulation that plays the robot. Errors are "
-        "distances of the point there from the path, at the same time, without the noise of the cameras."
+        "inputs within their limits of value and rate, applied to the simulation that plays the robot. Errors are "
+        "distances of the point from the path at the same time, without camera noise."
     )
 
 
@@ -81,7 +80,8 @@ def _table(tracking: Mapping[str, Any]) -> PageTable:
     rows = []
     for controller in first:
         name, meaning = _words(controller)
-        rows.append(Row(name, [cell(each.get(controller)) for each in tracking.values()], controller == best, meaning))
+        cells = [cell(errors.get(controller)) for errors in tracking.values()]
+        rows.append(Row(name, cells, controller == best, meaning))
     return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 
@@ -92,23 +92,23 @@ def compared_controllers(control: ControlSettings) -> list[str]:
 
 
 def _facts(metrics: Mapping[str, Any]) -> list[str]:
-    said = []
+    facts = []
     for model, reduced in metrics["reduced"].items():
         window, whole = mm_text(reduced["window_error_mm"]), mm_text(reduced["whole_error_mm"])
-        said.append(
+        facts.append(
             f"{MODELS[model][0]} in {reduced['modes']} modes: over {reduced['window_s']:g} s, {window} from the full "
             f"model, {percent_text(reduced['window_relative'], 1)} of its motion; over whole motions, {whole}."
         )
-    for model, motions in metrics["planned_mm"].items():  # By motion: the error before and after each correction.
-        first, last = fmean(each[0] for each in motions.values()), fmean(min(each) for each in motions.values())
-        said.append(
+    for model, motions in metrics["planned_mm"].items():  # By motion: errors before and after each correction.
+        first, last = fmean(errors[0] for errors in motions.values()), fmean(map(min, motions.values()))
+        facts.append(
             f"{MODELS[model][0]} follows its own plans to {mm_text(last)} after corrections by its full simulator, to "
             f"{mm_text(first)} before."
         )
     for controller, times in metrics["command_ms"].items():
         if controller.startswith("receding_"):
-            said.append(
+            facts.append(
                 f"{controller_name(controller)}: a command takes {times['median']:.1f} ms, 95 % of them less than "
                 f"{times['largest_of_20']:.1f} ms, estimate and plan together, on one core."
             )
-    return said
+    return facts

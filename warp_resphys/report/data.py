@@ -1,4 +1,4 @@
-"""Data that the page of a run shows; whatever a run does not have is left out."""
+"""Data of the page of a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from ..stepping.quantity import Quantity
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# In the order of the tables: a name, and what it means.
+# In the order of the tables: name and description.
 MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "published": ("Published setting", "the simulator as the published code sets it up"),
     "simulation": ("Uncorrected simulation", "the simulator as it is, with the values of the data sheet"),
@@ -29,8 +29,8 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
 MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
-_TIP: Final = 0.12  # Markers that are so close to the farthest one from the clamp are at the tip, over its distance.
-_OTHER: Final = 0.25  # How far from the tip's height another marker must be to tell more than those.
+_TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
+_OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,57 +39,57 @@ class TrialResults:
 
     names: tuple[str, ...]
     labels: tuple[str, ...]  # Of the M markers; empty where all vertices are observed, so that M = N.
-    begins: tuple[str, ...]  # Of each: given (the state is known), released, rest or static (a pose without time).
-    times: FloatArray  # (R, T) of the frames [s]; those that count.
-    target: FloatArray  # (R, T, M, 3) [m] what was observed, NaN where it was not seen.
-    positions: Mapping[str, FloatArray]  # (R, T, M, 3) [m] by model; not finite from where it diverged.
+    begins: tuple[str, ...]  # Of each trial: given (the state is known), released, rest or static (a pose).
+    times: FloatArray  # (R, T) of the evaluated frames [s].
+    target: FloatArray  # (R, T, M, 3) [m] observed, NaN where a marker was not seen.
+    positions: Mapping[str, FloatArray]  # (R, T, M, 3) [m] by model; not finite after it diverged.
     bound: FloatArray  # (M, 3) [m] the markers on the undeformed body, or its vertices.
     gravity: FloatArray  # (3,) [m/s^2]
     time_step: float  # Of the simulation [s].
-    axes: tuple[int, ...] = (0, 1, 2)  # Of the body, along which markers are seen.
-    own_frame: bool = False  # Whether markers are seen in a frame of their own.
+    axes: tuple[int, ...] = (0, 1, 2)  # Observed axes of the body.
+    own_frame: bool = False  # Whether the position of the body in the recordings is not known.
 
     @cached_property
     def errors_mm(self) -> dict[str, FloatArray]:
-        """(R, T) mean distances [mm] by model; see `mean_distance`."""
+        """Mean distances (R, T) [mm] from `mean_distance`, by model."""
         return {model: mean_distance(q, self.target) for model, q in self.positions.items()}
 
     @property
     def plain_errors_mm(self) -> FloatArray:
-        """(R, T) errors [mm] of the uncorrected simulation, or else of the first model."""
+        """Errors (R, T) [mm] of the uncorrected simulation or, without it, of the first model."""
         return self.errors_mm.get("simulation", next(iter(self.errors_mm.values())))
 
     @cached_property
     def worst(self) -> int:
-        """The trial of which the uncorrected simulation, or else the first model, makes most errors."""
+        """Index of the trial with the largest mean of `plain_errors_mm`."""
         means = [row[np.isfinite(row)].mean() if np.isfinite(row).any() else np.inf for row in self.plain_errors_mm]
         return int(np.argmax(means))
 
     @property
     def moves(self) -> bool:
-        """Whether there are motions, and not only poses."""
+        """Whether there are motions, rather than poses alone."""
         return self.target.shape[1] > 1
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The bodies in one test trial."""
+    """Motion of the bodies in one test trial."""
 
     trial: str  # Its name.
     times: FloatArray  # (F,) of the frames [s].
-    positions: Mapping[str, FloatArray]  # (F, N, 3) [m] by model, NaN from where it diverged.
+    positions: Mapping[str, FloatArray]  # (F, N, 3) [m] by model, NaN after it diverged.
 
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """The inputs that drive trials, such as pressures."""
+    """Inputs that drive trials, such as pressures."""
 
-    quantity: Quantity  # What they are.
-    channels: tuple[str, ...]  # C names of parts, such as chambers.
+    quantity: Quantity
+    channels: tuple[str, ...]  # Names of the C parts, such as chambers.
     values: Mapping[str, FloatArray]  # (K, C) during each step, by trial, in the quantity's unit.
-    limit: float | None = None  # That none may exceed.
-    scaled: tuple[str, ...] = ()  # Names of the trials at higher inputs than those of the training.
-    poses: tuple[str, ...] = ()  # Names of the trials without time, which the last inputs hold.
+    limit: float | None = None  # Largest allowed value.
+    scaled: tuple[str, ...] = ()  # Names of the trials with higher inputs than in training.
+    poses: tuple[str, ...] = ()  # Names of the poses, which the last inputs hold.
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,80 +98,80 @@ class Recordings:
 
     quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
     residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-    drawn: str  # Name of the trial that fits worst, whose picture is drawn.
+    drawn: str  # Name of the trial that fits worst, which is drawn.
     labels: tuple[str, ...]  # Of its M markers.
-    positions: FloatArray  # (M, 3) [m] where they are at rest, NaN for one that was not seen.
-    residual_mm: FloatArray  # (M,) [mm] how far from where they should be.
-    outliers: tuple[str, ...]  # That should have taken part in the fit, and were too far off.
-    nominal: FloatArray  # (M, 3) [m] where they should be.
-    feet: FloatArray  # (M, 3) [m] the closest points of the body.
-    mesh: Mesh  # The body as it is at rest.
+    positions: FloatArray  # (M, 3) [m] at rest, NaN for markers that were not seen.
+    residual_mm: FloatArray  # (M,) [mm] distance from the nominal positions.
+    outliers: tuple[str, ...]  # Labels of markers that were left out of the fit, as they were too far off.
+    nominal: FloatArray  # (M, 3) [m] nominal positions.
+    feet: FloatArray  # (M, 3) [m] closest points of the body.
+    mesh: Mesh  # The body at rest.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FollowedPath:
-    """A path, and where controllers had the point that was to follow it."""
+    """A path, and the paths of the controlled point."""
 
     name: str  # Of the shape.
-    seconds: float  # That it takes [s].
+    seconds: float  # Duration [s].
     path: FloatArray  # (T, 3) [m].
-    points: Mapping[str, FloatArray]  # (T, 3) [m], by controller.
+    points: Mapping[str, FloatArray]  # (T, 3) [m] controlled point, by controller.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
     """Data of the page of a run, of a fold, or over the folds."""
 
-    metrics: Mapping[str, Any]  # What `metrics.json` holds of a split, or of all folds.
-    settings: RunSettings  # The run's configuration.
+    metrics: Mapping[str, Any]  # Content of `metrics.json`, of a split or of all folds.
+    settings: RunSettings
     mesh: Mesh  # The undeformed body.
-    fixed: IntArray  # Its vertices that are clamped.
-    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Where all vertices are observed.
-    chambers: tuple[Chamber, ...] = ()  # The closed ones that are under pressure.
-    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) their guides [m], by name.
-    trials: TrialResults | None = None  # Of the test; None over the folds.
-    film: Film | None = None  # The bodies in one of them.
-    driven: Driven | None = None  # What drives it.
+    fixed: IntArray  # Clamped vertices.
+    tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Vertices, where all are observed.
+    chambers: tuple[Chamber, ...] = ()  # Chambers under pressure.
+    tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
+    trials: TrialResults | None = None  # Test trials; None over the folds.
+    film: Film | None = None  # Motion of the bodies in one of them.
+    driven: Driven | None = None  # Inputs of all trials.
     recordings: Recordings | None = None  # Quality and registration of all trials.
-    identification: Mapping[str, Any] = field(default_factory=dict)  # What `identification.json` holds.
-    start: Mapping[str, float] = field(default_factory=dict)  # The values of the data sheet, by parameter.
-    truth: Mapping[str, Any] = field(default_factory=dict)  # Those of the simulated laboratory, where there is one.
+    identification: Mapping[str, Any] = field(default_factory=dict)  # Content of `identification.json`.
+    start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
+    truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
-    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # As well.
-    published_note: str = ""  # How the published set-up differs from this run's.
+    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
+    published_note: str = ""  # How the published errors differ from those of this run.
     notes: Sequence[str] = ()  # Sentences on the errors.
-    network_note: str = ""  # Which network ResPhys uses, and how it was trained.
-    kept_note: str = ""  # Which weights were taken.
-    simulator: str = ""  # The simulator that is corrected, in words, such as "E 215 kPa".
-    target: str = ""  # What it is brought to, in words.
-    followed: Sequence[FollowedPath] = ()  # What was driven, where there is control.
+    network_note: str = ""  # Network of ResPhys and its training.
+    kept_note: str = ""  # Weights that were kept.
+    simulator: str = ""  # Corrected simulator in words, such as "E 215 kPa".
+    target: str = ""  # Target simulator in words.
+    followed: Sequence[FollowedPath] = ()  # Driven paths of the group `control`.
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
     @property
     def experiment(self) -> str:
-        """Its name."""
+        """Name of the experiment."""
         return self.settings.name
 
     @property
     def published(self) -> Mapping[str, PublishedError]:
-        """Published errors of this experiment by model; empty where there are none."""
+        """Published errors of this experiment by model; may be empty."""
         return published_errors(self.experiment)
 
     @property
     def sees_markers(self) -> bool:
-        """Whether markers are observed, and not every vertex."""
+        """Whether markers are observed, rather than every vertex."""
         return self.trials is None or bool(self.trials.labels)
 
     @property
     def models(self) -> list[str]:
-        """Models that have errors, in the order of the tables."""
+        """Models with errors, in the order of the tables."""
         return [model for model in MODELS if model in self.metrics["errors_mm"]]
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
-    """Return (R, T) mean distances [mm] of the points that were seen.
+    """Return mean distances (R, T) [mm] of the observed points.
 
-    Where none was seen it is NaN, where a simulated one has diverged infinite.
+    The mean is NaN where no point was seen, and infinite where a simulated one has diverged.
 
     Args:
         positions: (R, T, M, 3) [m].
@@ -187,28 +187,28 @@ def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def best_and_worst(trials: TrialResults) -> list[int]:
-    """Return the motions in which the last model of the table is farthest off, and closest; one where there is one."""
+    """Return the motions with the largest and the least error of the last model of the table; one if there is one."""
     moving = [row for row, begins in enumerate(trials.begins) if begins != "static"]
     errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)][moving]
-    each = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors])
-    worst, best = moving[int(np.argmax(each))], moving[int(np.argmin(each))]
+    means = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors])
+    worst, best = moving[int(np.argmax(means))], moving[int(np.argmin(means))]
     return [worst] if worst == best else [worst, best]
 
 
 def shown_models(positions: Mapping[str, Any]) -> list[str]:
-    """Return the models that are drawn as bodies: the uncorrected one, and last the best that there is."""
+    """Return the models that are drawn as bodies: the uncorrected one, then the best available one."""
     plain = next((m for m in ("simulation", "published") if m in positions), None)
     solid = next((m for m in ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic") if m in positions), None)
     return [m for m in (plain, solid) if m is not None]
 
 
 def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> FloatArray:
-    """Return (T, N, 3) positions at some times, linear between the frames.
+    """Return positions (T, N, 3) at given times, interpolated linearly between the frames.
 
     Args:
-        positions: (F, N, 3) [m]; what is not finite is not used where it has no weight.
+        positions: (F, N, 3) [m]; values that are not finite are ignored where their weight is zero.
         frames: (F,) increasing times of the positions [s].
-        times: (T,) [s]; before the first and after the last one nothing moves.
+        times: (T,) [s]; positions are constant before the first and after the last frame.
     """
     at = np.interp(times, frames, np.arange(len(frames), dtype=np.float64))
     low = np.floor(at + 1e-9).astype(int)
@@ -220,7 +220,7 @@ def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> Fl
 
 
 def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
-    """Return (M,) how far markers are from the clamped end, in the direction from it to their middle [m].
+    """Return distances (M,) of markers from the clamped end, along the direction from it to their mean [m].
 
     Args:
         bound: (M, 3) [m] on the undeformed body.
@@ -234,18 +234,18 @@ def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
 
 
 def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
-    """Return which markers are about as far along the body as any; see `along_body`."""
+    """Return the indices of the markers at the tip: those that are farthest by `along_body`."""
     away = along_body(bound, clamped)
     return np.flatnonzero(away >= (1.0 - _TIP) * away.max())
 
 
 def shown_markers(target: FloatArray) -> IntArray:
-    """Return which of the markers (T, M, 3) of a trial were seen in any of its frames; NaN where one was not."""
+    """Return the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
     return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))
 
 
 def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:
-    """Return the marker at the tip that moves most and, where there is one well above the tip, that of those.
+    """Return the marker at the tip that moves most and, of those well above the tip, the one that moves most.
 
     Args:
         target: (T, M, 3) [m], NaN where a marker was not seen.

@@ -1,7 +1,6 @@
-"""The style of all figures, and the figures of errors: a function each, from arrays.
+"""The style of all figures, and the figures of errors.
 
-Every figure exists in two widths, for a page and, with `narrow`, for a phone, and takes its colours from the reader's
-theme.
+Every figure exists in two widths, for a page and, with `narrow`, for a phone. Its colours follow the reader's theme.
 """
 
 import io
@@ -26,13 +25,13 @@ FloatArray = NDArray[np.float64]
 
 
 class Tone(NamedTuple):
-    """One role's colour on a light page, and on a dark one."""
+    """Colour of a role on a light page and on a dark one."""
 
     light: str
     dark: str
 
 
-# The light tones are what matplotlib draws and what `themed_svg` looks for, so no two are equal.
+# matplotlib draws the light tones, and `themed_svg` replaces them, so they must differ.
 TONES: Final[Mapping[str, Tone]] = {
     "ink": Tone("#1c2127", "#e4e7eb"),
     "muted": Tone("#5c6670", "#9aa4af"),
@@ -51,13 +50,13 @@ TONES: Final[Mapping[str, Tone]] = {
 LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.items()} | {
     "published_network": "Published network"
 }
-# Okabe and Ito (2008): everyone can tell them apart.
+# Okabe and Ito (2008): distinguishable with colour vision deficiencies.
 CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
-LARGEST_SHOWN: Final = 1e5  # Of an error [mm], or a loss.
+LARGEST_SHOWN: Final = 1e5  # Largest error [mm] or loss that is drawn.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
-ROUND_STEPS: Final = (1, 2, 5, 10)  # Between two ticks, times a power of ten.
+ROUND_STEPS: Final = (1, 2, 5, 10)  # Distances of ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
-_LEGEND_ROW: Final = 5  # Most names in one row.
+_LEGEND_ROW: Final = 5  # Largest number of names in one row.
 NARROW: Final = 3.7  # [in]
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 STYLE: Final[dict[Any, Any]] = {
@@ -68,7 +67,7 @@ STYLE: Final[dict[Any, Any]] = {
     "axes.labelcolor": TONES["ink"].light,
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
-    "axes.titley": 1.0,  # Where it is anyway: looking for ticks in its way takes long.
+    "axes.titley": 1.0,  # Its usual position; computing it from the ticks is slow.
     "axes.labelsize": 9,
     "axes.edgecolor": TONES["muted"].light,
     "axes.linewidth": 0.7,
@@ -94,7 +93,7 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def in_style() -> Iterator[None]:
-    """Draw in the style of all figures; also as a decorator."""
+    """Apply the style of all figures; also as a decorator."""
     with mpl.rc_context(STYLE):
         yield
 
@@ -109,15 +108,15 @@ def error_over_time(
     window: float | None = None,
     narrow: bool,
 ) -> Figure:
-    """Draw each model's mean error over time, and around the main ones the range of the trials.
+    """Draw each model's mean error over time and, for the main models, the range of the trials.
 
     Args:
-        errors: For each model (R, T) errors [mm] of R trials; NaN where nothing was seen, infinite where it diverged.
-        times: (T,) [s]; or the time between two frames, of which the first is at zero.
+        errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
+        times: (T,) [s]; or the time between two frames, the first of which is at zero.
         published: Published errors of models [mm], means over time, drawn as dashed lines.
-        of: What is observed.
-        window: Of a median filter [s], for long trials: its result is drawn in place of the range, and thin behind it
-            what went in. None for no filter.
+        of: What is observed: "vertex" or "marker".
+        window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
+            unfiltered one as a thin line. None for no filter.
         narrow: Whether the figure is for a narrow page.
     """
     figure = new_figure(3.5, 3.9, narrow=narrow)
@@ -138,14 +137,14 @@ def error_over_time(
         axes.set_xlim(0.0, time[-1])
     for model, error in (published or {}).items():
         axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
-    use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Models begin close to the measured rest: not shown.
+    use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
     axes.set(xlabel="time [s]", ylabel=f"mean {of} error [mm]")
     legend_above(figure, axes, narrow=narrow)
     return figure
 
 
 def mean_of_trials(rows: FloatArray) -> FloatArray:
-    """Return (T,) the mean of the trials (R, T) with a value; infinite where one diverged, NaN where none has one."""
+    """Return the mean (T,) over trials (R, T), without NaN; infinite where one diverged, NaN where all are NaN."""
     held = ~np.isnan(rows)
     count = held.sum(axis=0)
     mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
@@ -154,12 +153,12 @@ def mean_of_trials(rows: FloatArray) -> FloatArray:
 
 @in_style()
 def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: bool) -> Figure:
-    """Draw the mean errors [mm] by model against the scale of the inputs; one that diverged is left out."""
+    """Draw the mean errors [mm] by model over the scale of the inputs, without those that diverged."""
     figure = new_figure(3.0, 3.6, narrow=narrow)
     axes = figure.subplots()
-    scales = sorted({scale for each in errors.values() for scale in each})
-    for model, each in errors.items():
-        values = positive(np.array([each.get(scale, np.nan) for scale in scales]))
+    scales = sorted({scale for means in errors.values() for scale in means})
+    for model, means in errors.items():
+        values = positive(np.array([means.get(scale, np.nan) for scale in scales]))
         axes.plot(scales, values, marker="o", **model_line(model))
     use_logarithm(axes)
     axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
@@ -169,14 +168,14 @@ def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: boo
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Write a figure on white."""
+    """Write a figure with a white background."""
     figure.savefig(path, format="png", dpi=200, facecolor="white")
 
 
 def themed_svg(figure: Figure, name: str) -> bytes:
-    """Return a figure as an SVG file whose colours follow the reader's theme, with text that stays text.
+    """Return a figure as an SVG file with text as text, whose colours follow the reader's theme.
 
-    The name makes the identifiers in the file the same in every run.
+    Identifiers in the file depend on the name alone, so that they are the same in every run.
     """
     buffer = io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": name}):
@@ -193,42 +192,42 @@ def themed_svg(figure: Figure, name: str) -> bytes:
 
 @in_style()
 def settle(figure: Figure) -> None:
-    """Lay a figure out, once for all that is written of it."""
+    """Compute the layout of a figure once, for all files that are written of it."""
     if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
-    """Return how a model's line looks, with its name; that of the residual force is the thickest."""
+    """Return style and label of a model's line; that of ResPhys is thicker."""
     width += 0.5 if model == "resphys" else 0.0
     look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-")}
     return {**look, "linewidth": width, "label": LABELS[model]}
 
 
 def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
-    """An empty figure of one of the two widths, of these heights [in]."""
+    """Return an empty figure of one of the two widths, with its height for each of them [in]."""
     size = (NARROW, narrow_height) if narrow else (WIDE, height)
     return Figure(figsize=size, layout="constrained")
 
 
 def legend_above(figure: Figure, axes: Axes, *, narrow: bool) -> None:
-    """Put the legend above the figure: in rows of four, or of two where there is less room."""
+    """Put the legend above the figure: in rows of four, or of two in a narrow figure."""
     handles, labels = axes.get_legend_handles_labels()
     columns = 2 if narrow else len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 
 def positive(values: FloatArray) -> FloatArray:
-    """Return what a logarithmic axis can show; the rest, and what a blown-up roll-out reaches, becomes a gap."""
+    """Return values for a logarithmic axis: NaN where they are not positive or exceed `LARGEST_SHOWN`."""
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 
 def use_logarithm(axes: Axes, least: float = 0.0) -> None:
-    """A logarithmic axis of at least a decade and from a least value, labelled 0.1, 1, 10 or, where long, as powers.
+    """Make the y axis logarithmic, over at least a decade and from a least value; call it after drawing.
 
-    Everything is drawn already. It is labelled at 2 and 5 as well where there would be a label or two. Where there is
-    nothing that it can show, such as errors that are all zero, the axis says so.
+    Labels are 0.1, 1, 10 or, on long axes, powers of ten; on short axes 2 and 5 are labelled too. Where no value can be
+    shown, such as errors that are all zero, a sentence is written instead.
     """
     if not np.isfinite(axes.dataLim.minposy):
         axes.set(yticks=[], ylim=(0.0, 1.0))

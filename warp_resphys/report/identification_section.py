@@ -1,4 +1,4 @@
-"""The section on identification: its parameters, how well the trials determine them, and the loss around them."""
+"""The section on identification: parameters, how well the trials determine them, and the loss around them."""
 
 import math
 import re
@@ -12,7 +12,7 @@ from ..settings.learning import RangeSettings
 from .data import MODELS, FloatArray, RunReport
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 
-# A name, the unit that it is written in, and how many of these make an SI unit.
+# Name, unit on the page, and its number in an SI unit.
 Wording = tuple[str, str, float]
 _PARAMETERS: Final[Mapping[str, Wording]] = {
     "youngs_modulus": ("Young's modulus", "kPa", 1e-3),
@@ -26,42 +26,39 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
     "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
 }
-_MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Of which a region may have its own.
+_MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Parameters that regions may have.
 _COMMANDS: Final[Mapping[str, Wording]] = {
     "factor": ("Factor", "", 1.0),
     "delay": ("Delay", "ms", 1e3),
     "rise": ("Time constant", "ms", 1e3),
 }
-_WHOLE: Final = 99.5  # [%] of a parameter's range.
-_OPEN: Final = "and leave that open over the whole range: a prior would settle it"
-_TIED: Final = 0.9  # From this correlation on, two parameters are named as not told apart.
-_NOTHING_NEW: Final = 0.8  # Share of a prior's deviation from which on the data tell next to nothing of a parameter.
+_WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
+_TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
+_UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
 
 
 def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return what was identified, how well the data tell it, and the loss around it."""
+    """Return the identified parameters, how well the data determine them, and the loss around them."""
     identified = {name: data.identification[name] for name in MODELS if name in data.identification}
     if not identified:
         return None
     columns = ["Data sheet", "Identified", *(["True"] if data.truth else []), "At a bound"]
     blocks: list[Any] = [
-        PageTable(MODELS[name][0], columns, parameter_rows(each, data.start, data.truth))
-        for name, each in identified.items()
+        PageTable(MODELS[name][0], columns, parameter_rows(result, data.start, data.truth))
+        for name, result in identified.items()
     ]
     ranges = {} if data.settings.identify is None else data.settings.identify.parameters
-    uncertain = [said for name, each in identified.items() if (said := uncertainty_text(name, each, ranges))]
+    uncertain = list(filter(None, (uncertainty_text(name, result, ranges) for name, result in identified.items())))
     notes = []
     if uncertain:
-        notes.append(
-            "± is one standard deviation in the Gauss-Newton approximation, for residuals that are correlated in time."
-        )
+        notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
     if data.truth:
         model = data.truth.get("model", "corotated").replace("_", " ")
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
-    blocks += [Text(said) for said in uncertain]
-    placed = {name: each["placement"] for name, each in identified.items() if each.get("placement")}
-    blocks += [Text(placement_text(name, each)) for name, each in placed.items()]
+    blocks += [Text(text) for text in uncertain]
+    placed = {name: result["placement"] for name, result in identified.items() if result.get("placement")}
+    blocks += [Text(placement_text(name, placement)) for name, placement in placed.items()]
     return Part("Identification", [*blocks, *_loss_figures(data, identified, canvas)])
 
 
@@ -70,14 +67,14 @@ def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas
     from . import learning_figures
 
     drawn = []
-    if histories := {name: each["history"] for name, each in identified.items() if any(each["history"])}:
+    if histories := {name: result["history"] for name, result in identified.items() if any(result["history"])}:
         drawn.append(
             canvas.figure(
                 "loss_history",
                 partial(learning_figures.loss_histories, histories),
-                "Loss of the identification over its evaluations, a line a start, on a logarithmic axis.",
-                "Lowest loss so far over the evaluations, a line a start; the start that was kept is the bold one. The "
-                "loss is the mean squared distance of the markers over the square of the motion’s amplitude.",  # noqa: RUF001
+                "Loss of the identification over its evaluations, with a line for each start, on a logarithmic axis.",
+                "Lowest loss so far over the evaluations, with a line for each start; the kept start is bold. The loss "
+                "is the mean squared distance of the markers over the square of the motion’s amplitude.",  # noqa: RUF001
             )
         )
     if grid := data.identification.get("landscape"):
@@ -90,7 +87,7 @@ def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas
                 "landscape",
                 partial(learning_figures.landscape, modulus, ratio, loss, points),
                 f"Loss over Young's modulus{' and Poisson’s ratio' if loss.ndim > 1 else ''}: {marked}.",  # noqa: RUF001
-                "The loss on a grid around what SysID has identified, the other parameters held there. It is empty "
+                "The loss on a grid around the parameters identified by SysID, with the others fixed. It is empty "
                 "where no simulation succeeded.",
             )
         )
@@ -100,21 +97,21 @@ def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas
 def _landscape_points(
     data: RunReport, loss: FloatArray, modulus: FloatArray, ratio: FloatArray
 ) -> dict[str, tuple[float, float]]:
-    """Modulus [Pa] and ratio of what is marked in the landscape."""
+    """Modulus [Pa] and ratio of the points marked in the landscape, by name."""
     points: dict[str, tuple[float, float]] = {}
     if np.isfinite(loss).any():
         row, *column = np.unravel_index(int(np.nanargmin(loss)), loss.shape)
         points["lowest of the grid"] = (float(modulus[row]), float(ratio[column[0]]) if column else 0.0)
-    own = data.identification.get("sysid", {}).get("parameters", {})
-    own = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **own}
-    for name, values in {"data sheet": data.start, "identified": own, "true": data.truth}.items():
+    identified = data.identification.get("sysid", {}).get("parameters", {})
+    identified = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **identified}
+    for name, values in {"data sheet": data.start, "identified": identified, "true": data.truth}.items():
         if {"youngs_modulus", "poissons_ratio"} <= values.keys():
             points[name] = (values["youngs_modulus"], values["poissons_ratio"])
     return points
 
 
 def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:
-    """Return a row a parameter: the data sheet's value, what was identified, the true one if known, if at a bound."""
+    """Return a row for each parameter: values of data sheet, identification and truth if known; if at a bound."""
     deviations = (identified.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in identified["parameters"].items():
@@ -129,7 +126,7 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 
 def _wording(parameter: str) -> Wording:
-    """Name, unit and factor of a parameter, also of one of a tendon, of a branch or of the commands of an input."""
+    """Name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
     if command := re.fullmatch(r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise)", parameter):
         (kind, unit, factor), words = _COMMANDS[command[2]], command[1]
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
@@ -147,7 +144,7 @@ def _wording(parameter: str) -> Wording:
 
 
 def _digits(value: float | None, factor: float, deviation: float | None = None) -> str:
-    """A value in its unit, with as many decimals as its standard deviation deserves, or four digits."""
+    """A value in its unit, with two digits of its standard deviation, or with four digits without one."""
     if value is None:
         return NONE
     if not deviation:
@@ -157,29 +154,30 @@ def _digits(value: float | None, factor: float, deviation: float | None = None) 
 
 
 def _decimals(deviation: float) -> int:
-    """For two digits of a standard deviation."""
+    """Number of decimals for two digits of a standard deviation."""
     return max(0, 1 - math.floor(math.log10(deviation)))
 
 
 def placement_text(name: str, placed: Mapping[str, Any]) -> str:
-    """Say how far from where they should be an identification found the markers and the recordings."""
+    """Return a sentence on the identified displacements of markers and recordings from their nominal positions."""
     away = {label: 1e3 * math.dist(offset, (0.0, 0.0, 0.0)) for label, offset in placed["offsets"].items()}
     furthest = max(away, key=lambda label: away[label])
     shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
-    said = (
-        f"{MODELS[name][0]}, with the parameters: markers sit beside their nominal places, {furthest} the furthest, by "
-        f"{away[furthest]:.1f} mm; the recordings lie {1e3 * shift:.1f} mm and {math.degrees(turn):.1f}° off."
+    text = (
+        f"{MODELS[name][0]}, identified with the parameters: markers are displaced from their nominal positions, "
+        f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
+        f"rotated by {math.degrees(turn):.1f}°."
     )
-    return said.replace(" mm", f"{NO_BREAK_SPACE}mm")
+    return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
 def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, RangeSettings]) -> str:
-    """Say which parameters the data of a model's identification cannot tell, or tell apart; empty if that is not known.
+    """Return sentences on the parameters that the data do not determine or separate; empty without uncertainties.
 
     Args:
-        name: of the model.
-        identified: its identification.
-        ranges: of the parameters, with what was known of them before.
+        name: Of the model.
+        identified: Its identification.
+        ranges: Of the parameters, with their priors.
     """
     uncertainty = identified.get("uncertainty")
     if not uncertainty:
@@ -190,20 +188,20 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     largest = max(abs(weight) for weight in uncertainty["poorest"].values())
     along = [words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest]
     share = 100.0 * uncertainty["poorest_deviation"]
-    said = f"{MODELS[name][0]}: the data tell least about {' together with '.join(along)}, "
-    said += f"to {share:.2g} % of the range" if share < _WHOLE else _OPEN
+    text = f"{MODELS[name][0]}: the data determine {' together with '.join(along)} least, "
+    text += f"to {share:.2g} % of the range" if share < _WHOLE else "leaving it open over the whole range: set a prior"
     correlation = np.array(uncertainty["correlation"], dtype=np.float64)
     tied = [
-        f"{words[names[i]]} and {words[names[j]]} ({correlation[i, j]:+.2f})".replace("-", MINUS)
+        f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace("-", MINUS)
         for j in range(len(names))
         for i in range(j)
         if abs(correlation[i, j]) > _TIED
     ]
-    said += f"; they cannot tell apart {', '.join(tied)}, by their correlation." if tied else "."
+    text += f"; they do not separate {', '.join(tied)}." if tied else "."
     for parameter, deviation in uncertainty["deviation"].items():
         prior = ranges[parameter].prior if parameter in ranges else None
-        if prior is not None and deviation > _NOTHING_NEW * prior.deviation:
+        if prior is not None and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = _wording(parameter)
             where = f"{_digits(prior.mean, factor)} ± {_digits(prior.deviation, factor)} {unit}".rstrip()
-            said += f" They tell next to nothing of {words[parameter]}: it stays where its prior has it, at {where}."
-    return said.replace(" %", f"{NO_BREAK_SPACE}%")
+            text += f" They add almost nothing about {words[parameter]}: it stays at its prior, {where}."
+    return text.replace(" %", f"{NO_BREAK_SPACE}%")

@@ -1,4 +1,4 @@
-"""Figures of learning: losses of a training and of an identification, and the loss around what was identified."""
+"""Figures of learning: losses of a training and of an identification, and the loss around identified parameters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -20,12 +20,12 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     """Draw the losses and, where they were recorded, the validation roll-out error and the learning rate.
 
     Args:
-        records: One an epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or all epochs
-            `rollout_error_mm` and `learning_rate`; what was not measured is None or absent.
+        records: One for each epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or all epochs
+            `rollout_error_mm` and `learning_rate`; values that were not measured are None or absent.
         narrow: Whether the figure is for a narrow page.
     """
     heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
-    heights = {key: each for key, each in heights.items() if key == "losses" or len(_measured(records, key)[0])}
+    heights = {key: height for key, height in heights.items() if key == "losses" or len(_measured(records, key)[0])}
     muted, strong = TONES["muted"].light, TONES["resphys"].light
     thin: dict[str, Any] = {"linewidth": 1.1, "marker": "." if len(records) == 1 else ""}
     height = 0.6 + 0.57 * sum(heights.values())
@@ -46,8 +46,8 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
     if "learning_rate" in axes:
         axes["learning_rate"].plot(*_measured(records, "learning_rate"), color=muted, drawstyle="steps-mid", **thin)
         axes["learning_rate"].set_ylabel("learning\nrate")
-    for each in rows:
-        use_logarithm(each)
+    for row in rows:
+        use_logarithm(row)
     rows[-1].set_xlabel("epoch")
     _count(rows[-1].xaxis, 6)
     figure.align_ylabels()
@@ -56,18 +56,18 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
 
 @in_style()
 def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], *, narrow: bool) -> Figure:
-    """Draw the best loss so far over the evaluations of each start, a panel an identification.
+    """Draw the best loss so far over the evaluations of each start, with a panel for each identification.
 
     Args:
-        histories: By identification: for every start the records with `loss`, one an evaluation.
+        histories: By identification: for every start its records with `loss`, one for each evaluation.
         narrow: Whether the figure is for a narrow page.
     """
     shape = (len(histories), 1) if narrow else (1, len(histories))
     figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
     panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
-        ends = [each["loss"] for start in starts for each in start if each["loss"] is not None]
-        for start in (each for each in starts if each):
+        ends = [record["loss"] for start in starts for record in start if record["loss"] is not None]
+        for start in filter(None, starts):
             losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
             best = bool(ends) and losses[-1] <= min(ends)
             tone = TONES["sysid" if best else "muted"].light
@@ -76,7 +76,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
         axes.set_title(LABELS[name])
         axes.set_xlabel("evaluation")
         _count(axes.xaxis, 5)
-    for axes in panels:  # With everything drawn, as they share their axis.
+    for axes in panels:  # Once everything is drawn, as they share their axis.
         use_logarithm(axes)
     for axes in panels if narrow else panels[:1]:
         axes.set_ylabel("loss")
@@ -92,7 +92,7 @@ def landscape(
     *,
     narrow: bool,
 ) -> Figure:
-    """Draw the loss over Young's modulus and Poisson's ratio; as a curve where the grid has one ratio only.
+    """Draw the loss over Young's modulus and Poisson's ratio; as a curve where the grid has one ratio.
 
     Args:
         modulus: (A,) [Pa].
@@ -150,12 +150,12 @@ def _contours(figure: Figure, axes: Axes, modulus: FloatArray, ratio: FloatArray
 
 
 def _count(axis: Axis, most: int) -> None:
-    """Label an axis at whole numbers only, also where there is but one."""
+    """Label an axis at whole numbers only, even if there is just one."""
     axis.set_major_locator(MaxNLocator(most, integer=True, min_n_ticks=1))
 
 
 def _measured(records: Sequence[Mapping[str, Any]], key: str) -> tuple[FloatArray, FloatArray]:
-    """The epochs in which a quantity was measured, and its values."""
+    """Epochs in which a quantity was measured, and its values."""
     measured = [(record["epoch"], record[key]) for record in records if record.get(key) is not None]
     epochs, values = np.asarray(measured, dtype=np.float64).reshape(-1, 2).T
     return epochs, positive(values)

@@ -1,4 +1,4 @@
-"""The section on markers: the path of the tip where inputs drive it, else coordinate by coordinate."""
+"""The section on markers: paths of the tip of driven bodies, coordinates of the markers of others."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,54 +21,59 @@ from .data import (
 )
 from .page import Canvas, Drawn, Part
 
-_ONE_BY_ONE: Final = ("simulation", "sysid", "simfree", "resphys")  # Marker by marker, where all would hide each other.
-_MOST_MARKERS: Final = 6  # That are drawn coordinate by coordinate.
+_DRAWN: Final = (
+    "simulation",
+    "sysid",
+    "simfree",
+    "resphys",
+)  # Models whose coordinates are drawn, as more would overlap.
+_MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
-_SPACE_SECONDS: Final = 2.5  # And in space, where a longer one cannot be told apart.
+_SPACE_SECONDS: Final = 2.5  # Of a path in space, where longer ones overlap.
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the motion of markers: of the tip where inputs drive it, else coordinate by coordinate."""
+    """Return the motion of the tip where inputs drive the body, else the coordinates of the markers."""
     trials = data.trials
     if trials is None or not trials.labels or not trials.moves:
         return None
     places = dict(zip(("worst", "best"), best_and_worst(trials), strict=False))
     which = {"worst": "", "best": ""}
     if len(places) > 1:
-        which["worst"] = ", in which the last model of the table is farthest off"
-        which["best"] = ", in which the same model is closest"
+        which["worst"] = ", in which the last model of the table has its largest error"
+        which["best"] = ", in which the same model has its least error"
     if data.driven is None:
         drawn = [_coordinates(data, trials, row, at, which[at], canvas) for at, row in places.items()]
         return Part("Marker by marker", drawn)
     markers = _driven_markers(data, trials, places["worst"], data.driven, canvas)
-    if trials.own_frame or len(trials.axes) < 3:  # Where the tip is in space is not known.
+    if trials.own_frame or len(trials.axes) < 3:  # The position of the tip in space is not known.
         return Part("Marker by marker", [markers])
     planes = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
     return Part("The tip", [*planes[:1], _space(data, trials, places["worst"], canvas), markers, *planes[1:]])
 
 
 def _coordinates(data: RunReport, trials: TrialResults, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
-    """Coordinates of the markers that move most."""
+    """Draws the coordinates of the markers that move most."""
     reach = np.nanmax(np.linalg.norm(trials.target[row] - trials.bound, axis=2), axis=0, initial=0.0)
     shown = shown_markers(trials.target[row])
     kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
     name, hidden = trials.names[row], len(shown) - len(kept)
-    models = [m for m in _ONE_BY_ONE if m in trials.positions]
+    models = [m for m in _DRAWN if m in trials.positions]
     bands = _bands(data, trials, row, kept)
     return canvas.figure(
         f"paths_{place}",
         _paths(trials, row, kept, models, trials.bound, bands),
         f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines.",
-        f"Trial {name}{which}: coordinates of the markers from where they were held.{_band_note(bands)}"
+        f"Trial {name}{which}: coordinates of the markers relative to where they were held.{_band_note(bands)}"
         + (f" The {hidden} markers that move least are not drawn." if hidden else ""),
     )
 
 
 def _driven_markers(data: RunReport, trials: TrialResults, row: int, driven: Driven, canvas: Canvas) -> Drawn:
-    """Markers over what drives them."""
+    """Draws the coordinates of markers and, below them, the inputs."""
     name, words, per = trials.names[row], driven.quantity.plural, driven.quantity.per
     kept = drawn_markers(trials.target[row], trials.bound, data.mesh.vertices[data.fixed])
-    models = [m for m in _ONE_BY_ONE[1:] if m in trials.positions] or [m for m in MODELS if m in trials.positions]
+    models = [m for m in _DRAWN[1:] if m in trials.positions] or [m for m in MODELS if m in trials.positions]
     own, bands = replace(driven, values={words.capitalize(): driven.values[name]}), _bands(data, trials, row, kept)
     return canvas.figure(
         "markers",
@@ -87,7 +92,7 @@ def _paths(
     bands: Mapping[str, FloatArray],
     driven: Driven | None = None,
 ) -> partial[Any]:
-    """The figure of some markers of a trial as some models have them, from where all (M, 3) of them started [m]."""
+    """Prepares the figure of some markers of a trial, measured and by model, relative to their start (M, 3) [m]."""
     from . import motion_figures
 
     target, *moved = ((q[row] - start)[:, kept] for q in (trials.target, *(trials.positions[m] for m in models)))
@@ -97,7 +102,7 @@ def _paths(
 
 
 def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
-    """(T, M) half-widths [m] of the prediction intervals of some markers, by model, of the last one that has any."""
+    """Half-widths (T, M) [m] of the prediction intervals of some markers, of the last model with intervals."""
     intervals = data.metrics.get("intervals", {}).get("models", {})
     model = next((m for m in ("resphys", "sysid") if "factor" in intervals.get(m, {}) and m in trials.positions), None)
     if model is None:
@@ -107,17 +112,17 @@ def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int])
 
 
 def _band_note(bands: Mapping[str, FloatArray]) -> str:
-    return " The band around it is to hold nine of ten measured coordinates." if bands else ""
+    return " The band should contain nine of ten measured coordinates." if bands else ""
 
 
 def _start(trials: TrialResults, row: int) -> FloatArray:
-    """(M, 3) where markers were seen first [m]."""
+    """First measured positions (M, 3) of the markers [m]."""
     first = trials.target[row, 0]
     return np.where(np.isfinite(first), first, trials.bound)
 
 
 def _tip_paths(data: RunReport, trials: TrialResults, row: int, seconds: float) -> tuple[Any, ...]:
-    """(T,) first times [s], and (T, 3) how the mean of the markers at the tip moves [m]: measured, and by model."""
+    """Times (T,) [s], and displacements (T, 3) of the mean of the markers at the tip [m]: measured, and by model."""
     shown = shown_markers(trials.target[row])
     tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
     tip = tip if len(tip) else shown
@@ -129,7 +134,7 @@ def _tip_paths(data: RunReport, trials: TrialResults, row: int, seconds: float) 
 
 
 def _plane(data: RunReport, trials: TrialResults, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
-    """The path of the tip in the plane."""
+    """Draws the path of the tip in the plane across gravity."""
     from . import motion_figures
 
     name = trials.names[row]
@@ -139,13 +144,13 @@ def _plane(data: RunReport, trials: TrialResults, row: int, place: str, which: s
         partial(motion_figures.tip_planes, seen, paths),
         f"Path of the tip in the plane of x and y in the trial {name}: measured in grey, the models over it.",
         f"Path of the tip across gravity over the first {min(_PLANE_SECONDS, trials.times[row, -1]):g} s of the trial "
-        f"{name}{which}: displacement of the mean of the markers at the tip, measured in grey. What leaves the frame "
-        "is cut.",
+        f"{name}{which}: displacement of the mean of the markers at the tip, measured in grey. Paths are cut at the "
+        "frame.",
     )
 
 
 def _space(data: RunReport, trials: TrialResults, row: int, canvas: Canvas) -> Drawn:
-    """The path of the tip in space."""
+    """Draws the path of the tip in space."""
     from . import motion_figures
 
     name = trials.names[row]
@@ -156,5 +161,5 @@ def _space(data: RunReport, trials: TrialResults, row: int, canvas: Canvas) -> D
         partial(motion_figures.tip_in_space, times, seen, {m: paths[m] for m in last}),
         f"Path of the tip in space in the trial {name}: measured in grey, the models as lines beside it.",
         f"The first {min(_SPACE_SECONDS, trials.times[row, -1]):g} s of the trial {name} in space, with points every "
-        "0.5 s that are joined to the measured ones.",
+        "0.5 s connected to the measured ones.",
     )

@@ -1,4 +1,4 @@
-"""Figures of motion: markers and tips against models, deformed bodies, and the inputs that drive them."""
+"""Figures of motion: markers and tips with models, deformed bodies, and inputs."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -34,19 +34,19 @@ from .figures import (
 from .render import COLOUR_MAP, Pixels
 
 _MILLI: Final = 1e3
-_MOST_DOTS: Final = 75  # Along an axis of time.
+_MOST_DOTS: Final = 75  # Dots along a time axis.
 _BAND: Final = 0.16  # Opacity of prediction intervals.
-_LEAST_SPAN: Final = 0.08  # Of a coordinate's axis, over the largest motion of the trial.
-_ABOVE: Final = 0.35  # What is seen around the measured path, over its longest side.
-_LEAST: Final = 0.25  # Of the shortest side, over the longest.
-_LEGEND_ROW: Final = 4  # Most names of chambers in one row.
-_ROUND: Final = 0.5  # [s] between the points along a path in space.
-_BARS: Final = 0.8  # Height of a pose's bars, over that between two poses.
+_LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
+_ABOVE: Final = 0.35  # Margin around the measured path, over its longest side.
+_LEAST: Final = 0.25  # Shortest side of a view, over the longest.
+_LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
+_ROUND: Final = 0.5  # Time between the points along a path in space [s].
+_BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
 
 
 @in_style()
 def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, *, narrow: bool) -> Figure:
-    """Draw how the tip moves, and below it how far each model's tip is from the target's.
+    """Draw the displacement of the tip and, below it, the distance of each model's tip from the target's.
 
     Args:
         displacements: (T+1, 3) displacement [m] of the tip from rest, of the "target" and of the models.
@@ -75,9 +75,9 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
 
 
 def _keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0) -> None:
-    """Limit what is shown to (T,) a measured motion and a share of it above and below, over a least span.
+    """Limit an axis to a measured motion (T,) and a margin, a share of it, with a least span.
 
-    So a model that runs away does not set the scale, nor does noise look like motion.
+    A model that diverges then does not set the scale, and noise does not look like motion.
     """
     if np.isfinite(seen).any():
         low, high = np.nanmin(seen), np.nanmax(seen)
@@ -90,11 +90,11 @@ def _keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0
 
 @in_style()
 def shape_comparison(pictures: Pixels | None, largest: Mapping[str, float | None], *, narrow: bool) -> Figure:
-    """Show each model's deformed body side by side, coloured by the distance from the target's vertices.
+    """Show the deformed bodies of models side by side, coloured by the distance from the target's vertices.
 
     Args:
-        pictures: (H, V * W, 4) of the V models that did not diverge, as they were drawn of `bodies.distance_scene`.
-        largest: Distance [m] that has the last colour, by model; None for one that diverged.
+        pictures: (H, V * W, 4) of the V models that did not diverge, drawn from `bodies.distance_scene`.
+        largest: Distance [m] with the last colour, by model; None for a model that diverged.
         narrow: Whether the figure is for a narrow page.
     """
     kept = [model for model, most in largest.items() if most is not None]
@@ -132,17 +132,17 @@ def marker_paths(
     bands: Mapping[str, FloatArray] | None = None,
     narrow: bool,
 ) -> Figure:
-    """Draw each marker's coordinates over time, measured as dots, models as lines, and what drives the body below them.
+    """Draw the coordinates of markers over time, measured as dots, simulated as lines, and below them the inputs.
 
     Args:
         times: (T,) [s].
         target: (T, M, 3) displacement [m] from where the markers were held, NaN where a marker was not seen.
-        models: (T, M, 3) [m] by model.
+        models: (T, M, 3) displacement [m] by model.
         labels: Of the M markers.
-        driven: What drives this trial; all panels are then below each other.
-        coordinates: Which of x, y and z are seen.
+        driven: Inputs of this trial; all panels are then stacked.
+        coordinates: Observed ones of x, y and z.
         bands: (T, M) half-widths of prediction intervals [m], by model.
-        narrow: Whether the figure is for a narrow page; the panels then are below each other, too.
+        narrow: Whether the figure is for a narrow page; the panels are then stacked, too.
     """
     many = len(coordinates)
     count, stacked = len(labels), narrow or driven is not None
@@ -184,7 +184,7 @@ def marker_paths(
 
 @in_style()
 def tip_planes(target: FloatArray, models: Mapping[str, FloatArray], *, narrow: bool) -> Figure:
-    """Draw the path of the tip in the plane across gravity, a panel a model, over the measured one.
+    """Draw the path of the tip in the plane across gravity, with a panel for each model, over the measured one.
 
     Args:
         target: (T, 3) displacement from rest [m], NaN where it was not seen.
@@ -218,7 +218,7 @@ def tip_planes(target: FloatArray, models: Mapping[str, FloatArray], *, narrow: 
 
 
 def _range(target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The middle (D,) of a measured path (T, D) [m], and half the widths (D,) of a view of it [mm]."""
+    """The middle (D,) of a measured path (T, D) [m], and half the size (D,) of a view of it [mm]."""
     seen = _MILLI * target[np.isfinite(target).all(axis=1)]
     if not len(seen):
         return np.zeros(target.shape[1]), np.ones(target.shape[1])
@@ -228,20 +228,20 @@ def _range(target: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _shown(path: FloatArray) -> FloatArray:
-    """A path [mm], with gaps where it ran away."""
+    """A path [mm], with NaN where it diverged."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(np.abs(_MILLI * path) < LARGEST_SHOWN, _MILLI * path, np.nan)
 
 
 @in_style()
 def tip_in_space(times: FloatArray, target: FloatArray, models: Mapping[str, FloatArray], *, narrow: bool) -> Figure:
-    """Draw the path of the tip in space, a panel a model, with points at equal times joined to the measured ones.
+    """Draw the path of the tip in space, with a panel for each model and points connected to the measured ones.
 
     Args:
         times: (T,) [s].
         target: (T, 3) displacement from rest [m], NaN where it was not seen.
-        models: (T, 3) [m] by model; what leaves the box around the measured path is a gap.
-        narrow: Whether the figure is for a narrow page; the panels then are below each other.
+        models: (T, 3) [m] by model; outside the box around the measured path they are not drawn.
+        narrow: Whether the figure is for a narrow page; the panels are then stacked.
     """
     every = max(1, round(_ROUND / float(times[1] - times[0]))) if len(times) > 1 else 1
     centre, half = _range(target)
@@ -278,7 +278,7 @@ def tip_in_space(times: FloatArray, target: FloatArray, models: Mapping[str, Flo
 
 @in_style()
 def input_sequences(time_step: float, driven: Driven, *, narrow: bool) -> Figure:
-    """Draw inputs over time, a panel a trial, with its name above; the time step is in [s]."""
+    """Draw inputs over time, with a panel for each trial; the time step is in [s]."""
     height = 0.9 + 1.35 * len(driven.values)
     figure = new_figure(height, height + 0.4, narrow=narrow)
     panels = figure.subplots(len(driven.values), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -298,7 +298,7 @@ def _axis_label(quantity: Quantity) -> str:
 
 
 def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> None:
-    """Steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
+    """Draw steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
     factor = driven.quantity.shown_factor
     for values, colour in zip(rows.T, cycle(CHAMBER_COLOURS), strict=False):
         axes.stairs(factor * values, times, baseline=None, color=colour, linewidth=1.2)
@@ -310,10 +310,7 @@ def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> 
 
 @in_style()
 def pose_inputs(driven: Driven, *, narrow: bool) -> Figure:
-    """Draw the inputs that poses are held by, the last ones of each, as bars beside its name.
-
-    Parts that never have any are left out.
-    """
+    """Draw the last inputs of each pose as bars beside its name; parts without inputs are left out."""
     factor = driven.quantity.shown_factor
     names, values = list(driven.values), factor * np.stack([rows[-1] for rows in driven.values.values()])
     used = np.flatnonzero(values.any(axis=0))
@@ -337,7 +334,7 @@ def pose_inputs(driven: Driven, *, narrow: bool) -> Figure:
 
 
 def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = (), *, narrow: bool) -> None:
-    """Names of the parts, or of those that are used, below the figure."""
+    """Draw a legend of the parts, or of the used ones, below the figure."""
     handles: list[Any] = [
         Line2D([], [], color=CHAMBER_COLOURS[at % len(CHAMBER_COLOURS)], label=driven.channels[at].replace("_", " "))
         for at in used or range(len(driven.channels))
@@ -349,10 +346,10 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = (), *, na
 
 @in_style()
 def motion_instants(frames: Pixels, titles: Sequence[str], *, narrow: bool) -> Figure:
-    """Show the body at a few instants, and beside or below each picture its markers from nearby.
+    """Show the body at a few instants, each with a second view of its markers.
 
     Args:
-        frames: (F, H, 2 * W, 4) as they were drawn of `bodies.ComparedMotion.scene`.
+        frames: (F, H, 2 * W, 4) drawn from `bodies.ComparedMotion.scene`.
         titles: Of the F instants.
         narrow: Whether the figure is for a narrow page.
     """

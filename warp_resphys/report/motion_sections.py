@@ -27,18 +27,18 @@ from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_
 from .render import Pixels, draw, write_film
 from .verdict import unbroken
 
-_MOST_POINTS: Final = 6  # Of the tip that are shown, where every vertex is observed.
-_MOST_FRAMES: Final = 256  # Of the view in space, as films have.
-_SEQUENCES: Final = 3  # TrialResults whose inputs are drawn over time.
+_MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
+_MOST_FRAMES: Final = 256  # Of the interactive view.
+_SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
-    """Have other processes draw the motion: the instants with, of vertices, the bodies after them, and the film."""
+    """Start processes that draw the motion: instants, coloured bodies where vertices are observed, and the film."""
     motion = motion_of(data)
     if motion is None:
         return {}
     started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion)}
-    # A film takes longer than all else on the page; of vertices, it shows no more than the instants.
+    # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
     if data.sees_markers and len(motion.times) > 1:
         started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film())
     return started
@@ -50,58 +50,58 @@ def _draw_pictures(data: RunReport, motion: ComparedMotion) -> list[Pixels]:
 
 
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
-    """Return the motion that is drawn: that of the film; where vertices are observed, of the worst trial at its tip.
+    """Return the motion that is drawn: that of the film or, where vertices are observed, of the worst trial.
 
     Args:
-        data: What the page shows.
-        every_model: Whether all models are in it, not only the two that are compared in pictures.
+        data: Data of the page.
+        every_model: Whether it has all models, rather than the two that are compared in pictures.
     """
     trials, film = data.trials, data.film
     if trials is None:
         return None
     seen_from_below, away = hangs(data.mesh, data.fixed, trials.gravity)
-    some = None
+    points = None
     if not trials.labels:
         row = trials.worst
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
-        some = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
-        some = some[np.unique(np.linspace(0, len(some) - 1, _MOST_POINTS).round().astype(int))]
+        points = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
+        points = points[np.unique(np.linspace(0, len(points) - 1, _MOST_POINTS).round().astype(int))]
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row = trials.names.index(film.trial)
     models = shown_models(film.positions)
     if every_model:
         models = [model for model in MODELS if model in film.positions and model in trials.positions]
-    some = shown_markers(trials.target[row]) if some is None else some
+    points = shown_markers(trials.target[row]) if points is None else points
     times = trials.times[row]
     frames = np.flatnonzero(np.append(True, np.diff(times) > 0.0))
-    if len(frames) > len(film.times):  # The closest ones.
+    if len(frames) > len(film.times):  # The frames that are closest to those of the film.
         nearest = np.abs(times[frames][:, None] - film.times).argmin(axis=0)
         frames = frames[np.unique(nearest)]
     bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
-    target, *markers = (q[row][frames][:, some] for q in (trials.target, *(trials.positions[m] for m in models)))
+    target, *markers = (q[row][frames][:, points] for q in (trials.target, *(trials.positions[m] for m in models)))
     seen = dict(zip(models, markers, strict=True))
     whole = None if trials.labels else trials.target[row][frames]
-    at_rest = trials.bound[some]
+    at_rest = trials.bound[points]
     return ComparedMotion(
         data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole
     )
 
 
 def worst_state(trials: TrialResults, row: int) -> int:
-    """Return the frame of a trial at which the uncorrected simulation, or the first model, is farthest off."""
+    """Return the frame of a trial with the largest error of the uncorrected simulation or the first model."""
     errors = trials.plain_errors_mm[row]
     return int(np.argmax(np.where(np.isfinite(errors), errors, -1.0)))
 
 
 def _bodies(trials: TrialResults) -> tuple[dict[str, FloatArray], FloatArray]:
-    """(N, 3) the bodies [m] in the worst frame of the worst trial by model, and the target."""
+    """Positions (N, 3) [m] in the worst frame of the worst trial: by model, and of the target."""
     at = trials.worst, worst_state(trials, trials.worst)
     return {m: trials.positions[m][at] for m in shown_models(trials.positions)}, trials.target[at]
 
 
 def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """A film and a few instants of a trial; with vertices, its tip and the deformed bodies as well."""
+    """Return a film and a few instants of a trial and, where vertices are observed, its tip and the coloured bodies."""
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
@@ -112,15 +112,15 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks = [] if data.sees_markers else _vertex_figures(data, trials, canvas)
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
-        pace = "four times slower than it was" if motion.is_fast else "as fast as it was"
-        said = Markup(
+        pace = "four times slower than real time" if motion.is_fast else "in real time"
+        caption = Markup(
             "The trial {}, {}: {}. {} Dots: measured; rings: simulated. The film lies in "
             "<code>figures/motion.mp4</code>."
         ).format(name, pace, views, colours)
 
         def film(path: Path) -> Drawn:
             canvas.started["video"].result()
-            return Drawn("video", said, film=data_address(path.read_bytes(), "video/mp4"))
+            return Drawn("video", caption, film=data_address(path.read_bytes(), "video/mp4"))
 
         blocks += canvas.attempt("motion.mp4", film)
     blocks += _in_space(data, name)
@@ -130,7 +130,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def _in_space(data: RunReport, name: str) -> list[Block]:
-    """The bodies of all models, to be turned and played."""
+    """Returns an interactive view of the bodies of all models."""
     from .view import view_in_space
 
     motion = motion_of(data, every_model=True)
@@ -139,38 +139,38 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     if (count := len(motion.times)) > _MOST_FRAMES:
         motion = motion.at(np.unique(np.linspace(0, count - 1, _MOST_FRAMES).round().astype(int)))
     shown, compared = shown_models(motion.positions), "markers" if data.sees_markers else "vertices"
-    against = "what was measured" if data.sees_markers else "the target"
+    against = "the measured ones" if data.sees_markers else "the target"
     caption = (
         f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; arrow keys turn, plus "
-        f"and minus zoom, the space bar plays, comma and full stop step, 0 resets. Colours of errors are distances of "
-        f"the {compared} of the solid body from {against}, from zero to its largest in this trial."
+        f"and minus zoom, the space bar plays, comma and full stop step, 0 resets. Colours show the distance of the "
+        f"{compared} of the solid body from {against}, from zero to the largest in this trial."
     )
-    alt = f"The bodies of {', '.join(MODELS[model][0] for model in motion.positions)} in motion, to be turned."
+    alt = f"An interactive view of the bodies of {', '.join(MODELS[model][0] for model in motion.positions)} in motion."
     return [view_in_space("view", motion, shown, unbroken(caption), alt)]
 
 
 def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours: str, canvas: Canvas) -> Drawn:
-    """The body at a few instants, and its markers."""
+    """Draws the body and its markers at a few instants."""
     from . import motion_figures
 
     frames = canvas.started["pictures"].result()[0]
     titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
-    said, when = f"{name} at {len(titles)} instants; in one of them the grey body is farthest off.", ", ".join(titles)
-    if len(motion.times) == 1:  # A pose has no time.
-        titles, said, when = [""], f"{name}.", "rest"
-    said += f" Drawn to scale; {'below, the view from below' if motion.from_below else 'the second view follows'}"
-    said += "." if motion.from_below else (" the markers." if data.sees_markers else " some vertices of the tip.")
+    caption, when = f"{name} at {len(titles)} instants, one with the largest error of the grey body.", ", ".join(titles)
+    if len(motion.times) == 1:  # A pose.
+        titles, caption, when = [""], f"{name}.", "rest"
+    caption += f" Drawn to scale; {'below, the view from below' if motion.from_below else 'the second view follows'}"
+    caption += "." if motion.from_below else (" the markers." if data.sees_markers else " some vertices of the tip.")
     if not data.sees_markers:
-        said += f" {colours} Dots: the target’s tip; rings: simulated."  # noqa: RUF001
+        caption += f" {colours} Dots: the target’s tip; rings: simulated."  # noqa: RUF001
     last = list(motion.positions)[-1]
     if data.metrics["errors_mm"][last]["diverged"]:
-        said += f" Where {MODELS[last][0]} is not drawn, it has diverged."
+        caption += f" Where {MODELS[last][0]} is not drawn, it has diverged."
     alt = f"The deformed body at {when}, with observed and simulated markers."
-    return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, said)
+    return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, caption)
 
 
 def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
-    """The tip over time, and the bodies coloured by their error."""
+    """Draws the tip over time, and the bodies coloured by their error."""
     from . import motion_figures
 
     row, blocks = trials.worst, list[Block]()
@@ -185,13 +185,13 @@ def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> li
                 "tip_displacement",
                 partial(motion_figures.tip_displacement, paths, float(np.median(np.diff(trials.times[row])))),
                 f"Tip displacement over time. {'; '.join(reached)}.",
-                "Tip displacement from rest, the target drawn wide beneath the simulations. Below: distance of the "
-                "simulated tip from the target’s, on a logarithmic axis.",  # noqa: RUF001
+                "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
+                "the target’s, on a logarithmic axis.",  # noqa: RUF001
             )
         )
     bodies, target = _bodies(trials)
     reached = (f"{MODELS[m][0]}, up to {_largest(q - target)}" for m, q in bodies.items())
-    moment = f"{trials.times[row, worst_state(trials, row)]:.2f} s, where the first body is farthest off"
+    moment = f"{trials.times[row, worst_state(trials, row)]:.2f} s, where the error of the first body is largest"
     caption = (
         f"The same trial{f' at {moment}' if trials.moves else ''}: each body coloured by the distance of its vertices "
         "from the target’s. The colour scales differ. Grey: the undeformed body. Drawn to scale."  # noqa: RUF001
@@ -207,23 +207,22 @@ def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> li
 
 
 def _largest(differences: FloatArray) -> str:
-    """The longest of (..., C) vectors [m], in words; not finite is infinite."""
+    """The largest length of vectors (..., C) [m] as text, where values that are not finite count as infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         distances = 1e3 * np.linalg.norm(differences, axis=-1)
     return largest_text(np.where(np.isnan(distances), np.inf, distances))
 
 
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The body with its chambers or tendons, and what drives them."""
+    """Return the picture of the body with its chambers or tendons, and the inputs."""
     trials, driven = data.trials, data.driven
     if trials is None or driven is None:
         return None
     quantity, markers = driven.quantity, len(trials.labels)
     parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
     dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
-    said = (
-        f"The body that is simulated: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}. Dark: "
-        "clamped."
+    caption = (
+        f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}. Dark: clamped."
     )
     alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
@@ -235,14 +234,14 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         coloured = f"{quantity.per}s".capitalize()
         summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured)
         draw_mesh(path, summary, trials.bound if trials.labels else None)
-        return drawn_file(path, alt, said)
+        return drawn_file(path, alt, caption)
 
     blocks = canvas.attempt("body.png", body)
     return Part(f"The body and its {quantity.plural}", [*blocks, *_input_figures(driven, trials, canvas)])
 
 
 def _input_figures(driven: Driven, trials: TrialResults, canvas: Canvas) -> list[Drawn]:
-    """The inputs of a few trials over time, and those of the poses."""
+    """Draws the inputs of a few trials over time, and those of the poses."""
     from . import motion_figures
 
     over_time, poses = input_sequences(driven, trials), {}
@@ -254,21 +253,21 @@ def _input_figures(driven: Driven, trials: TrialResults, canvas: Canvas) -> list
     what, blocks = f"{words} of {len(driven.channels)} {per}s", []
     if over_time:
         drawn = partial(motion_figures.input_sequences, trials.time_step, replace(driven, values=over_time))
-        alt, said = f"{what} over time: {', '.join(over_time)}.", f"{words} of {whose}{limit}."
-        blocks.append(canvas.figure("inputs", drawn, alt, unbroken(said)))
+        alt, caption = f"{what} over time: {', '.join(over_time)}.", f"{words} of {whose}{limit}."
+        blocks.append(canvas.figure("inputs", drawn, alt, unbroken(caption)))
     if poses:
         drawn = partial(motion_figures.pose_inputs, replace(driven, values=poses))
-        alt, said = (
+        alt, caption = (
             f"{what} by pose: {', '.join(poses)}.",
-            f"{words} that hold the poses; {per}s without any are left out{limit}.",
+            f"{words} of the poses; unused {per}s are left out{limit}.",
         )
-        blocks.append(canvas.figure("pose_inputs", drawn, alt, unbroken(said)))
+        blocks.append(canvas.figure("pose_inputs", drawn, alt, unbroken(caption)))
     return blocks
 
 
 def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
-    """A few trials' inputs by the panels' titles: of the test, of the training, and at the highest inputs."""
-    values = {name: each for name, each in driven.values.items() if name not in driven.poses}
+    """Return inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
+    values = {name: inputs for name, inputs in driven.values.items() if name not in driven.poses}
     test = [name for name in trials.names if name in values]
     others = [name for name in values if name not in test and name not in driven.scaled][:1]
     highest = sorted(driven.scaled, key=lambda name: float(values[name].max()))[-1:]

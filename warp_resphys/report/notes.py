@@ -1,4 +1,4 @@
-"""Sentences on the page of a run about how it was set up: its simulator, its network, and what its errors contain."""
+"""Notes on the page of a run: its simulator, its network, and contributions to its errors."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -25,18 +25,18 @@ _AGAINST: Final = "The published errors are measured against the reconstructed t
 _MASS: Final = {
     "per_vertex": " This run computes masses and volumes as the published code does.",
     "row_sum": (
-        " The published simulator doubles the beam's mass and locks (physics=published computes the same); "
-        "this run does not, so that its uncorrected error is another one."
+        " The published simulator doubles the beam's mass and locks (physics=published computes the same); this run "
+        "does not, so its uncorrected error differs."
     ),
 }
 _OF_A_BEAM: Final = (
-    "The published errors are those of other data: recordings with ten markers on the beam's sides, whose weight is "
-    "cut off at the release, compared with trajectories reconstructed from them; the published uncorrected simulation "
-    "has the published setting, the published SysID elastic parameters only."
+    "The published errors are for other data: recordings with ten markers on the beam's sides, whose weight is cut off "
+    "at the release, compared with trajectories reconstructed from them; the published uncorrected simulation has the "
+    "published setting, and the published SysID identifies elastic parameters only."
 )
 _OF_AN_ARM: Final = {
-    True: "The published errors are those of another body: recordings of a real arm, which this run has not seen.",
-    False: "The published errors are those of the published simulator, of 494 vertices, on the authors' recordings.",
+    True: "The published errors are for another body: recordings of a real arm, which this run does not use.",
+    False: "The published errors are for the published simulator, of 494 vertices, on the authors' recordings.",
 }
 
 
@@ -48,19 +48,19 @@ def published_note(settings: RunSettings) -> str:
 
 
 def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_check: Mapping[str, Any]) -> list[str]:
-    """Return how the bodies of the test trials were held, and how much of the errors is noise or mesh, where known.
+    """Return sentences on how bodies were held, and on the contributions of noise and mesh to the errors, if known.
 
     Args:
-        sideways: how far bodies were held sideways [mm], by trial.
-        truth: of a simulated laboratory, with `noise_mm`.
-        mesh_check: what a finer mesh changes.
+        sideways: Estimated sideways displacement of held bodies [mm], by trial.
+        truth: Of a simulated laboratory, with `noise_mm`.
+        mesh_check: Results on a finer mesh.
     """
     notes = []
     if sideways:
-        each = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
+        distances = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
         notes.append(
-            "The first frames of a trial tell how far sideways its body was held: the markers by "
-            f"{each}, as the identified simulator has it. Every simulator begins with its own estimate."
+            "The sideways displacement of the held body is estimated from the first frames of a trial: with the "
+            f"identified simulator, the markers by {distances}. Every simulator starts from its own estimate."
         )
     if "noise_mm" in truth:
         notes.append(f"The noise of the markers alone is {truth['noise_mm']:.2f} mm.")
@@ -68,14 +68,14 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_ch
         return notes
     cells, finer = mesh_check["cells"]
     model = "the identified simulator" if mesh_check["model"] == "sysid" else "the simulator"
-    finer_mesh = f"a mesh of {finer:,} in place of {cells:,} cells"
+    finer_mesh = f"a mesh of {finer:,} instead of {cells:,} cells"
     if "failed" in mesh_check:
-        return [*notes, f"How much of the errors is mesh is not known: on {finer_mesh}, {mesh_check['failed']}"]
+        return [*notes, f"The error of the mesh is not known: on {finer_mesh}, {mesh_check['failed']}"]
     before, after = map(number_text, mesh_check["errors_mm"])
     return [
         *notes,
-        f"How much of the errors is mesh: on {finer_mesh}, with the same constants, the markers of {model} are "
-        f"{number_text(mesh_check['moved_mm'])} mm elsewhere, and its error is {after} mm in place of {before} mm.",
+        f"Error of the mesh: on {finer_mesh}, with the same constants, the markers of {model} move by "
+        f"{number_text(mesh_check['moved_mm'])} mm, and its error is {after} mm instead of {before} mm.",
     ]
 
 
@@ -102,16 +102,16 @@ def network_note(settings: RunSettings) -> str:
 
 
 def kept_note(networks: Mapping[str, Any]) -> str:
-    """Return which weights of the residual force were taken, and their error in validation; empty without any."""
+    """Return which weights of the residual force were kept, and their validation error; empty without any."""
     kept, refined = networks.get("resphys"), networks.get("resphys_refined")
     if kept is None:
         return ""
-    said = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
+    text = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
     if refined is None:
-        return said
+        return text
     if refined["epoch"] == 0:
-        return f"{said} No epoch of the refinement was better: the weights are those from before it."
-    return f"{said} Taken in the end: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
+        return f"{text} No epoch of the refinement was better: the weights are those from before it."
+    return f"{text} Final weights: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
 
 
 def _validated(kept: Mapping[str, Any]) -> str:
@@ -122,9 +122,9 @@ def _validated(kept: Mapping[str, Any]) -> str:
 
 
 def material_note(material: MaterialSettings) -> str:
-    """Return the constants of a material, and its model where it is not the usual one; a region at a time."""
+    """Return the constants of a material, and its model unless it is corotated; for each region if there are any."""
     if material.regions:
-        return "; ".join(f"{region}: {material_note(own)}" for region, own in material.by_region.items())
+        return "; ".join(f"{region}: {material_note(part)}" for region, part in material.by_region.items())
     model = material.model
     constants: dict[str, Any] = dict(make_material(model, **material.constants).constants)
     if "youngs_modulus" in constants:

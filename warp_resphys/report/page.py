@@ -1,4 +1,4 @@
-"""Pages that need nothing beside them: sections of text, tables and figures, and how numbers are written on them."""
+"""Self-contained HTML pages of text, tables and figures, the same in Markdown, and the formats of numbers."""
 
 import base64
 import hashlib
@@ -30,15 +30,15 @@ _LOG = logging.getLogger(__name__)
 NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
-_MOST_DECIMALS = 6  # What takes more is written with a power of ten.
+_MOST_DECIMALS = 6  # Numbers that need more are written with a power of ten.
 
 
 class Cell(NamedTuple):
     """One entry of a table."""
 
     text: str
-    small: str = ""  # What stands small below it.
-    beside: str = ""  # What stands beside it, such as a deviation.
+    small: str = ""  # In small print below it.
+    beside: str = ""  # Beside it, such as a deviation.
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Row:
 
     head: str
     cells: Sequence[Cell]  # One a column.
-    answer: bool = False  # Whether the row is the one that counts.
-    small: str = ""  # What stands small below the head.
-    address: str = ""  # Where the head leads to; may be empty.
+    answer: bool = False  # Whether the row is highlighted as the main result.
+    small: str = ""  # In small print below the head.
+    address: str = ""  # Link of the head; may be empty.
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,15 @@ class PageTable:
     """A table."""
 
     head: str  # Above the first column.
-    columns: Sequence[str]  # Heads of the others.
+    columns: Sequence[str]  # Heads of the other columns.
     rows: Sequence[Row]
-    note: str = ""  # What stands below.
-    summary: str = ""  # What unfolds the table; empty for one that is always seen.
-    unfolded: bool = False  # Whether it is at first.
+    note: str = ""  # Below the table.
+    summary: str = ""  # Title of a table that can be folded; empty for one that cannot.
+    unfolded: bool = False  # Whether it is unfolded at first.
 
 
 class Picture(NamedTuple):
-    """One figure on the page: two widths of it as data addresses, and what it shows, in words."""
+    """A figure in two widths as data addresses, and its description."""
 
     wide: str
     narrow: str
@@ -77,14 +77,14 @@ class Text:
     """A paragraph."""
 
     text: str
-    name: str = ""  # Its identifier on the page.
-    note: bool = False  # Whether it is written small,
-    heading: bool = False  # or large.
+    name: str = ""  # Identifier on the page.
+    note: bool = False  # Whether it is in small print.
+    heading: bool = False  # Whether it is a heading.
 
 
 @dataclass(frozen=True)
 class Items:
-    """A list, of commands where `code` says so."""
+    """A list; with `code`, of commands."""
 
     items: Sequence[str]
     name: str = ""
@@ -95,8 +95,8 @@ class Items:
 class Drawn:
     """A picture or a film with its caption."""
 
-    name: str  # Of its file, and on the page.
-    caption: str  # What stands below.
+    name: str  # Of the file, and on the page.
+    caption: str
     picture: Picture | None = None
     film: str = ""  # Address of a film, in place of a picture.
     scrolls: bool = False  # Whether it stays wide on a narrow page.
@@ -104,30 +104,30 @@ class Drawn:
 
 @dataclass(frozen=True)
 class ViewInSpace:
-    """Bodies that are turned and played in the browser, and what the script of the page reads of them."""
+    """An interactive view of bodies in motion, with the data that the script of the page reads."""
 
     name: str  # On the page.
-    caption: str  # What stands below.
-    alt: str  # What it shows, in words.
+    caption: str
+    alt: str  # Description.
     payload: Markup
     models: Sequence[Mapping[str, Any]]  # `name`, `light` and `dark` colour, and whether it is `shown` at first.
     frames: int
-    speed: float  # At first, over the real one.
-    observed: str  # What was observed, such as "markers".
+    speed: float  # Initial speed, over the real one.
+    observed: str  # "markers" or "vertices".
 
 
 Block = Text | Items | PageTable | Drawn | ViewInSpace
 
 
 class Script(NamedTuple):
-    """A script on a page, and what its policy of contents allows by it."""
+    """A script on a page, and its digest for the content security policy."""
 
     text: Markup
     digest: str
 
     @classmethod
     def of(cls, parts: "Sequence[Part]") -> "Script | None":
-        """The script that the blocks of a page need, if they need one."""
+        """Returns the script that the blocks of a page need, or None."""
         if not any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
             return None
         text = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
@@ -137,7 +137,7 @@ class Script(NamedTuple):
 
 @dataclass(frozen=True)
 class Part:
-    """A section of a page: its heading, and blocks in their order."""
+    """A section of a page: its heading and its blocks."""
 
     title: str
     blocks: Sequence[Block]
@@ -148,8 +148,8 @@ class Canvas:
     """Draws the figures of a page into a folder."""
 
     folder: Path  # Of their files.
-    started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # What other processes draw already, by name.
-    missing: set[str] = field(default_factory=set)  # Why something cannot be drawn on this machine.
+    started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # Pictures drawn by other processes, by name.
+    missing: set[str] = field(default_factory=set)  # Reasons why pictures cannot be drawn on this machine.
 
     def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
         """Draw a figure in two widths, for a wide and for a narrow page, and save the wide one as a PNG file.
@@ -157,8 +157,8 @@ class Canvas:
         Args:
             name: Of the figure, and of the file.
             draw: Makes the figure; takes the keyword `narrow`.
-            alt: What it shows, in words.
-            caption: What stands below.
+            alt: Description of the figure.
+            caption: Below the figure.
         """
         from . import figures
 
@@ -170,26 +170,26 @@ class Canvas:
         return Drawn(name, caption, Picture(wide, narrow, alt))
 
     def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
-        """Return what is drawn into a file, or why it cannot be, unless that was said before.
+        """Return a picture drawn into a file, or a sentence why it cannot be drawn, once for each reason.
 
-        A file that an earlier page has left there is then removed, as it would not belong to this one.
+        Where it cannot be drawn, the file of an earlier page is removed.
         """
         path = self.folder / file
         try:
             return [draw(path)]
         except DrawingError as error:
             path.unlink(missing_ok=True)
-            said = f"{error}, then delete this page and run the same command again."
-            if said in self.missing:
+            reason = f"{error}, then delete this page and run the same command again."
+            if reason in self.missing:
                 return []
             _LOG.warning("the report lacks a picture: %s", error)
-            self.missing.add(said)
-            return [Text(said, path.stem, note=True)]
+            self.missing.add(reason)
+            return [Text(reason, path.stem, note=True)]
 
 
 @contextmanager
 def figures_beside(path: Path) -> Iterator[Path]:
-    """Give the folder `figures` beside a page, made where it is missing.
+    """Yield the folder `figures` beside a page, created if it does not exist.
 
     Raises:
         DataFileError: A figure could not be written there.
@@ -216,18 +216,18 @@ def write_page(
     settings: Mapping[str, Any] | None = None,
     timed: PageTable | None = None,
 ) -> None:
-    """Write a page: its heading, what stands above and below that, its sections, and how they were computed.
+    """Write a page.
 
     Args:
         path: The page's file.
         parts: Its sections.
         title: Its heading.
-        kicker: What stands above the heading.
-        verdict: What stands below it, and
-        conclusions: further sentences there.
+        kicker: Line above the heading.
+        verdict: Sentences below the heading.
+        conclusions: Further sentences below the verdict.
         metrics: Of a run: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
-        settings: Of the same run.
-        timed: How long the simulations of that run take.
+        settings: Of the same run, as nested data.
+        timed: Times of the simulations of that run.
 
     Raises:
         DataFileError: The file cannot be written.
@@ -256,7 +256,7 @@ def markdown(title: str, verdict: str, parts: Sequence[Part], folder: str) -> st
 
 
 def experiment_kicker(name: str) -> Markup:
-    """Return what stands above the heading of the page of an experiment."""
+    """Return the line above the heading of the page of an experiment."""
     return Markup("experiment <code>{}</code>").format(name)
 
 
@@ -282,13 +282,13 @@ def mm_text(value: float | None) -> str:
 
 
 def largest_text(errors: NDArray[np.float64]) -> str:
-    """Return the largest of errors [mm] in words; NaN is left out, what is infinite has diverged."""
+    """Return the largest of errors [mm] as text; NaN is left out, an infinite error has diverged."""
     values = errors[~np.isnan(errors)]
     return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a mean and its "± deviation" if it has one, with as many digits as the smaller of the two deserves."""
+    """Return a mean and its "± deviation", if there is one, with two digits of the smaller of the two."""
     mean, std = summary["mean"], summary["std"]
     if mean is None:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
@@ -299,7 +299,7 @@ def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _alike(values: Sequence[float], least: float) -> list[str]:
-    """Numbers with three decimals, or as many as give one of them two digits, or the same power of ten."""
+    """Numbers with three decimals, or more for two digits of the least one, or with a common power of ten."""
     decimals, exponent, power = max(3, 1 - math.floor(math.log10(abs(least)))) if least else 3, 0, ""
     if decimals > _MOST_DECIMALS:
         decimals, exponent = 1, math.floor(math.log10(values[0]))
@@ -308,7 +308,7 @@ def _alike(values: Sequence[float], least: float) -> list[str]:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration as one reads it: "0.42 s", "12.3 s", "3 min 05 s"."""
+    """Return a duration as "0.42 s", "12.3 s" or "3 min 05 s"."""
     if seconds < 60.0:
         return f"{seconds:.2f} s" if seconds < 10.0 else f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -316,18 +316,18 @@ def duration_text(seconds: float) -> str:
 
 
 def published_parts(error: PublishedError) -> tuple[str, str]:
-    """Return the number as it was printed: both parts with the same decimals."""
+    """Return mean and deviation as they were published: both with the same decimals."""
     decimals = max(len(repr(float(part)).partition(".")[2]) for part in error)
     return f"{error.mean:.{decimals}f}", f"± {error.std:.{decimals}f}"
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Return the settings as the dotted keys by which the command line sets them, with their values."""
+    """Yield settings as dotted keys, as on the command line, with their values."""
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
             yield from flatten(value, f"{prefix}{key}.")
         elif isinstance(value, list | tuple):
-            yield f"{prefix}{key}", f"[{', '.join(str(each) for each in value)}]"
+            yield f"{prefix}{key}", f"[{', '.join(map(str, value))}]"
         else:
             yield f"{prefix}{key}", "null" if value is None else str(value)
 
@@ -339,11 +339,11 @@ def drawn_file(path: Path, alt: str, caption: str) -> Drawn:
 
 
 def data_address(content: bytes, kind: str) -> str:
-    """Return a file's content as a data address, for a page that needs no other file."""
+    """Return content as a data address."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def percent_text(ratio: float, decimals: int = 0) -> str:
-    """Return a share with its sign, in per cent."""
+    """Return a ratio as a percentage with its sign."""
     text = f"{100.0 * ratio:+.{decimals}f}"
     return f"{text.replace('-', MINUS) if float(text) else '0'} %"

@@ -1,4 +1,4 @@
-"""A picture of registered markers on a body, by which a user sees whether the registration is right."""
+"""A picture of registered markers on a body, for checking the registration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,35 +37,35 @@ NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 _GREY: Final = "#5b6570"
 _VIEWS: Final = {"From above": (0.62, -1.0, 0.52), "From the side": (0.0, -1.0, 0.0)}  # Towards the viewer.
 _DPI: Final = 160
-_FINER: Final = 2  # Drawn so many times finer, as translucent surfaces are sorted without smooth rims.
+_FINER: Final = 2  # Oversampling, as sorted translucent surfaces have no smooth edges.
 _LONGER_SIDE: Final = 6.6  # Of a panel [inch].
-_MARGIN: Final = 0.03  # Around what is seen, over its longer side.
-_LETTER: Final = 0.088  # Widest that the letters of a name are on average [inch].
-_TITLE, _HEAD, _STRIP, _PAD = 0.7, 0.42, 0.9, 0.12  # [inch] of the title above, above and below a view, around all.
+_MARGIN: Final = 0.03  # Around the points, over their longer side.
+_LETTER: Final = 0.088  # Largest mean width of the letters of a name [inch].
+_TITLE, _HEAD, _STRIP, _PAD = 0.7, 0.42, 0.9, 0.12  # Heights of title, above and below a view, and outer margin [inch].
 _LABEL_HEIGHT: Final = 0.36  # [inch]
 _RADIUS: Final = 0.016  # Of a marker, over the longest side of the body.
 _RING: Final = 1.55  # Radius of a nominal position's ring, in radii of a marker.
-_FOOT: Final = 0.42  # That of the small ball at the foot of a stem.
-_NUDGE: Final = 0.1  # Lines are drawn this far before the surface, over the radius of a marker.
+_FOOT: Final = 0.42  # Radius of the ball at the foot of a stem, in radii of a marker.
+_NUDGE: Final = 0.1  # Shift of lines towards the viewer, over the radius of a marker.
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One side from which the body is drawn."""
+    """A view of the body from one side."""
 
     title: str
     axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
-    focus: FloatArray  # (3,) [m] what is in the middle.
-    half: FloatArray  # (2,) half the width and height that are seen [m].
+    focus: FloatArray  # (3,) [m] point in the middle.
+    half: FloatArray  # (2,) half the width and height of the view [m].
 
     @property
     def inch(self) -> float:
-        """Length on the body that an inch of the picture shows [m]."""
+        """Length on the body that corresponds to an inch of the picture [m]."""
         return float(2.0 * self.half.max() / _LONGER_SIDE)
 
     @property
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest coordinates (2,) that are seen [m], to the right and up."""
+        """Lowest and highest coordinates (2,) of the view [m], to the right and up."""
         middle = self.project(self.focus)
         return middle - self.half, middle + self.half
 
@@ -74,17 +74,17 @@ class Panel:
         return points @ self.axes[:2].T
 
     def scene(self, layers: Sequence[Layer]) -> RenderScene:
-        """Return the scene that is drawn beneath names and rings."""
+        """Return the scene that is drawn below names and rings."""
         size = picture_size(self.half, _FINER * _DPI * _LONGER_SIDE)
         return RenderScene([View(layers, self.axes, self.focus, self.half[1])], size, background="white", sorts=True)
 
 
 def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> None:
-    """Draw the body, the measured markers and what they are bound to, from two sides, with names and residuals.
+    """Draw the body, the measured markers and their feet from two sides, with names and residuals.
 
     Args:
         path: The PNG file to write.
-        recordings: Markers that were not seen are not drawn.
+        recordings: With the markers; those that were not seen are not drawn.
         fixed: Vertices of the clamped region.
 
     Raises:
@@ -103,7 +103,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> No
 
 
 def panels_of(points: FloatArray) -> list[Panel]:
-    """Return the panels, which hold all points (P, 3) [m] with a margin around them."""
+    """Return the panels, which contain all points (P, 3) [m] with a margin."""
     panels = []
     for title, towards in _VIEWS.items():
         axes = view_axes(towards)
@@ -117,10 +117,10 @@ def registration_layers(
     """Return the translucent body with its clamped region, and markers (M, 3) on stems from their feet (M, 3) [m]."""
     q, triangles, lift = mesh.vertices, boundary_triangles(mesh), _NUDGE * radius
     clamped = triangles[np.isin(triangles, fixed).all(axis=1)]
-    line = 2.0 * _FINER  # [px] of a thin one.
+    line = 2.0 * _FINER  # Width of a thin line [px].
     layers = [Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28))]
     if len(clamped):
-        rim = sharp_edges(q, clamped)  # Seen edge-on, this is all of it.
+        rim = sharp_edges(q, clamped)  # All that is visible of a region that is seen edge-on.
         layers.append(Layer("surface", q, clamped, CLAMPED, opacity=0.75, light=(0.7, 0.22), shift=lift))
         layers.append(Layer("lines", q, rim, CLAMPED, size=5.0 * line))
     sharp = sharp_edges(q, triangles)
@@ -137,12 +137,12 @@ def registration_layers(
 
 
 def _compose(panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Recordings, radius: float) -> Figure:
-    """The views, one above the other or side by side, with names, rings, axes and a scale.
+    """Composes the views, stacked or side by side, with names, rings, axes and a scale.
 
-    The figure has an inch, so that all places are in inches; how much of the plane is written is seen at the end.
+    The figure is one inch wide and high, so that all positions are in inches; it is cropped to its content when saved.
     """
     (wide, tall), (other_wide, other_tall) = sizes = [2.0 * panel.half / panel.inch for panel in panels]
-    longest = max(len(text) for each in range(len(recordings.labels)) for text in _label(recordings, each))
+    longest = max(len(text) for marker in range(len(recordings.labels)) for text in _label(recordings, marker))
     margin = _LETTER * max(longest, 9) + 0.15
     corners = [(0.0, 0.0), (wide + 2.0 * margin, tall - other_tall)]
     if wide + other_wide > 1.6 * max(tall, other_tall):
@@ -168,7 +168,7 @@ def _compose(panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Re
 
 
 def _directions(axes: Axes, panel: Panel, margin: float) -> None:
-    """Arrows along x, y and z in the margin [inch] at the lower left."""
+    """Draws arrows along x, y and z in the margin [inch] at the lower left."""
     origin = panel.corners[0] - panel.inch * np.array([margin - 0.3, _STRIP - 0.2])
     for direction, name in zip(panel.axes[:2].T, "xyz", strict=True):
         length = float(np.linalg.norm(direction))
@@ -181,7 +181,7 @@ def _directions(axes: Axes, panel: Panel, margin: float) -> None:
 
 
 def _scale(axes: Axes, panel: Panel, margin: float) -> None:
-    """A bar of a round length in the margin [inch] at the lower right."""
+    """Draws a bar of a round length in the margin [inch] at the lower right."""
     low, high = panel.corners
     length = round_length(0.3 * (high - low)[0])
     right, height = high[0] + panel.inch * (margin - 0.25), low[1] - panel.inch * (_STRIP - 0.2)
@@ -192,13 +192,13 @@ def _scale(axes: Axes, panel: Panel, margin: float) -> None:
 
 
 def round_length(longest: float) -> float:
-    """Return the longest of 1, 2, 5, 10, ... [mm] that is not longer than what is given [m]."""
+    """Return the largest of the lengths 1, 2, 5, 10, ... mm that does not exceed a given one [m]."""
     decade = 10.0 ** np.floor(np.log10(longest))
     return float(max(factor * decade for factor in (1.0, 2.0, 5.0) if factor * decade <= longest * (1.0 + 1e-9)))
 
 
 def _rings(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> None:
-    """Rings at the nominal positions, with lines to the markers that are outside of them."""
+    """Draws rings at the nominal positions, with lines to the markers outside of them."""
     for ring, marker in zip(panel.project(recordings.nominal), panel.project(recordings.positions), strict=True):
         axes.add_patch(Circle((ring[0], ring[1]), _RING * radius, fill=False, edgecolor=NOMINAL, linewidth=1.5))
         if np.linalg.norm(marker - ring) > _RING * radius:
@@ -206,7 +206,7 @@ def _rings(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> N
 
 
 def _names(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> None:
-    """Names and residuals of the markers that were seen in columns on both sides, with leaders to them."""
+    """Writes names and residuals of the visible markers in columns on both sides, with lines to the markers."""
     at = panel.project(recordings.positions)  # (M, 2) [m]
     seen = np.flatnonzero(np.isfinite(at).all(axis=1))
     on_the_left = at[:, 0] < np.median(at[seen, 0])
@@ -214,26 +214,26 @@ def _names(axes: Axes, panel: Panel, recordings: Recordings, radius: float) -> N
         group = seen[on_the_left[seen] == (side < 0.0)]
         group = group[np.argsort(at[group, 1], kind="stable")]
         align: Any = "right" if side < 0.0 else "left"
-        for each, height in zip(group, spread(at[group, 1], _LABEL_HEIGHT * panel.inch), strict=True):
+        for marker, height in zip(group, spread(at[group, 1], _LABEL_HEIGHT * panel.inch), strict=True):
             end, x = np.array([edge + side * 0.05 * panel.inch, height]), edge + side * 0.1 * panel.inch
-            away = 1.2 * radius / float(np.linalg.norm(end - at[each]))
-            start = at[each] + min(away, 1.0) * (end - at[each])
+            away = 1.2 * radius / float(np.linalg.norm(end - at[marker]))
+            start = at[marker] + min(away, 1.0) * (end - at[marker])
             axes.plot(*np.stack([start, end]).T, color=_GREY, linewidth=0.7, clip_on=False)
-            name, note = _label(recordings, each)
+            name, note = _label(recordings, marker)
             colour = MEASURED if name in recordings.outliers else _GREY
             axes.text(x, height, name, ha=align, va="bottom", fontweight="bold", clip_on=False)
             axes.text(x, height, note, ha=align, va="top", fontsize=8, color=colour, clip_on=False)
 
 
 def _label(recordings: Recordings, marker: int) -> tuple[str, str]:
-    """Name of a marker, and how well it fits."""
+    """Name and residual of a marker."""
     name = recordings.labels[marker]
     return name, f"{recordings.residual_mm[marker]:.2f} mm" + ", left out" * (name in recordings.outliers)
 
 
 def spread(heights: FloatArray, least: float) -> FloatArray:
-    """Return sorted heights moved apart to a least distance, as little as that takes in the mean square."""
-    apart = least * np.arange(len(heights))  # With these taken off they need only be in order.
+    """Return sorted heights moved apart to a least distance, with the least mean square displacement."""
+    apart = least * np.arange(len(heights))  # Less these, the heights need to be in order only.
     return isotonic_regression(heights - apart).x + apart if len(heights) else heights
 
 

@@ -1,7 +1,7 @@
-"""Pictures and films of bodies: what a scene consists of, and the process that draws it with pyvista, off screen.
+"""Pictures and films of bodies: scenes, and the process that draws them with pyvista, off screen.
 
-Where no OpenGL driver works, VTK ends the process that asks for a picture. Hence pyvista is only ever imported in a
-process of its own, `warp_resphys.report.render_process`, which takes scenes and gives back frames through pipes.
+Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate process only,
+`warp_resphys.report.render_process`, which reads scenes and returns frames through pipes.
 """
 
 import io
@@ -42,7 +42,7 @@ BODY: Final = "#a9bccf"
 CLAMPED: Final = "#33485e"
 MEASURED: Final = "#d55e00"  # Vermilion of Okabe and Ito (2008).
 INK: Final = "#1c2127"
-OUTLINE: Final = "#808891"  # Of the undeformed body: one grey that reads on a light and on a dark page.
+OUTLINE: Final = "#808891"  # Of the undeformed body: a grey that is visible on light and dark pages.
 TOWARDS_LIGHT: Final = (0.15, -0.75, 1.0)
 _CODEC: Final = ["-f", "mp4", "-crf", "23", "-preset", "fast", "-threads", "1", "-movflags", "+faststart", "-bitexact"]
 
@@ -53,45 +53,45 @@ class DrawingError(ResphysError):
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One thing to draw; what moves has a first axis of F frames, and is not drawn where it is not finite."""
+    """An object of a scene. Moving points have a first axis of F frames; it is not drawn where they are not finite."""
 
     kind: str  # surface, lines, balls, rings (towards the viewer), slice or slice_edges (of solid cells, by a plane).
-    points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres of balls and rings, which come and go one by one.
+    points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres of balls and rings, which are hidden one by one.
     cells: IntArray | None = None  # (S, 3) triangles, (E, 2) lines or (C, 4 | 8) solid cells.
-    colour: str = INK  # Where nothing is painted.
-    paint: FloatArray | None = None  # (P,) values in [0, 1] in the colours of `COLOUR_MAP`.
+    colour: str = INK  # Used without `paint`.
+    paint: FloatArray | None = None  # (P,) values in [0, 1], in the colours of `COLOUR_MAP`.
     size: float = 1.0  # Radius of balls and rings [m], or width of lines [px].
     opacity: float = 1.0
-    light: tuple[float, float] | None = None  # Shares of the ambient and the scene's light; None: the colour as it is.
-    shift: float = 0.0  # How far it is moved towards the viewer [m].
-    plane: FloatArray | None = None  # (2, 3) normal and a point of a plane; of a surface, what is behind it is drawn.
+    light: tuple[float, float] | None = None  # Shares of ambient and scene light; None draws the plain colour.
+    shift: float = 0.0  # Towards the viewer [m].
+    plane: FloatArray | None = None  # (2, 3) normal and point of a plane; of a surface, the part behind it is drawn.
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One of the views side by side, without perspective."""
+    """A view of layers, by parallel projection."""
 
     layers: Sequence[Layer]  # In the order in which they are drawn.
     axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
-    focus: FloatArray  # (3,) or (F, 3) [m] what is in the middle.
-    half_height: float  # Of what is seen [m].
-    legend: Sequence[tuple[str, str]] = ()  # Texts and colours, at its top.
+    focus: FloatArray  # (3,) or (F, 3) [m] point in the middle.
+    half_height: float  # Of the view [m].
+    legend: Sequence[tuple[str, str]] = ()  # Texts and colours, at the top.
 
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """Views side by side, and how they are drawn."""
+    """Views side by side, and their drawing options."""
 
     views: Sequence[View]
     size: Sequence[int]  # (2,) width and height of each view [px]; even for a film.
     background: str | None = None  # A colour; None for a transparent one.
-    sorts: bool = False  # Whether translucent surfaces are sorted by depth, at the price of smooth rims.
-    texts: Sequence[str] = ()  # One a frame, in the first view, before its legend.
+    sorts: bool = False  # Whether translucent surfaces are sorted by depth, which excludes smooth edges.
+    texts: Sequence[str] = ()  # One for each frame, in the first view, before its legend.
     fps: float = LARGEST_RATE  # Of a film.
 
 
 def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
-    """(3, 3) orthonormal rows: to the right, up, towards the viewer."""
+    """Return orthonormal rows (3, 3): to the right, up, towards the viewer."""
     towards = np.array(towards_viewer, dtype=np.float64)
     right = np.cross(np.array(up, dtype=np.float64), towards)
     rows = np.stack([right, np.cross(towards, right), towards])
@@ -99,12 +99,12 @@ def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Flo
 
 
 def chain(count: int) -> IntArray:
-    """(count - 1, 2) lines from each of some points to the next."""
+    """Return lines (count - 1, 2) from points to the next ones."""
     return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
 
 
 class Renderer:
-    """A process that draws one scene after the other; a context manager.
+    """A process that draws scenes one after the other; a context manager.
 
     Raises:
         DrawingError: The process cannot be started.
@@ -112,7 +112,7 @@ class Renderer:
 
     def __init__(self) -> None:
         environment = dict(os.environ)
-        if sys.platform == "linux":  # Neither X nor OSMesa is looked for where there is none.
+        if sys.platform == "linux":  # Skips the search for X and OSMesa.
             environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
         self._messages = TemporaryFile()  # noqa: SIM115
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self._messages}
@@ -129,14 +129,14 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """End the process; so does whatever forgets the renderer."""
+        """End the process, as does garbage collection of the renderer."""
         self._end()
 
     def frames(self, scene: RenderScene) -> Iterator[Pixels]:
         """Yield frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
 
         Raises:
-            DrawingError: There is no pyvista, no OpenGL driver that works off screen, or it takes too long.
+            DrawingError: There is no pyvista, no OpenGL driver that works off screen, or drawing takes too long.
         """
         end = time.monotonic() + TIME_OUT
         timer = threading.Timer(TIME_OUT, self._process.kill)
@@ -165,7 +165,7 @@ class Renderer:
         self._messages.seek(0)
         said = self._messages.read().decode(errors="replace").strip()
         _LOG.debug("the drawing process wrote: %s", said)
-        if code < 0:  # The signal that ended it tells more than what VTK says before.
+        if code < 0:  # The signal is more informative than the messages of VTK before it.
             return f"not done after {TIME_OUT:g} s" if late else str(signal.strsignal(-code))
         return said.rpartition("\n")[2].strip().rstrip(".") or f"exit code {code}"
 
@@ -175,16 +175,16 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
     process.wait()
     messages.close()
     for pipe in (process.stdin, process.stdout):
-        with suppress(BrokenPipeError):  # Of what it has not read.
+        with suppress(BrokenPipeError):  # Data that the process has not read.
             if pipe is not None:
                 pipe.close()
 
 
 def draw(*scenes: RenderScene) -> list[Pixels]:
-    """Draw scenes, in one process, as its start takes longer than most pictures.
+    """Draw scenes in one process, as its start takes longer than most pictures.
 
     Returns:
-        Of each scene (F, H, V * W, 3 | 4), see `Renderer.frames`.
+        Frames (F, H, V * W, 3 | 4) of each scene, as from `Renderer.frames`.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
@@ -205,7 +205,7 @@ def write_film(path: Path, scene: RenderScene) -> None:
     with atomic_path(path) as target, Progress("video", len(scene.texts), "frames") as progress, Renderer() as renderer:
         frames = renderer.frames(scene)
         first = next(frames)
-        target.touch()  # A place that cannot be written to is named here.
+        target.touch()  # Raises an error where the folder cannot be written.
         try:
             import imageio_ffmpeg
 
@@ -226,14 +226,14 @@ def write_film(path: Path, scene: RenderScene) -> None:
 
 
 def pace(times: FloatArray, slower: float) -> tuple[IntArray, float]:
-    """Return which of the frames of a motion at times (T,) [s] a film shows, and how many of them a second."""
+    """Return the frames of a film of a motion at times (T,) [s], and its frame rate [Hz]."""
     step = float(np.median(np.diff(times)))
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     return np.arange(0, len(times), every), 1.0 / (slower * step * every)
 
 
 def packed(scene: RenderScene) -> bytes:
-    """Return a scene as JSON with names in place of its arrays, these once each, and before all that its length."""
+    """Return a scene as bytes: the length, then an archive of its arrays and of JSON that refers to them by name."""
     arrays: dict[str, Any] = {}
 
     def plain(value: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Draws scenes with pyvista: the program of the process that `warp_resphys.report.render.Renderer` starts.
+"""The program of the process that `warp_resphys.report.render.Renderer` starts: draws scenes with pyvista.
 
-It reads scenes from stdin, as `render.packed` writes them, until that is closed, and writes to stdout the shape and the
-pixels of every frame, and after each scene a shape of zeros.
+It reads scenes from stdin, packed by `render.packed`, until stdin is closed. It writes shape and pixels of every frame
+to stdout, and a shape of zeros after each scene.
 """
 
 import io
@@ -17,9 +17,9 @@ import numpy as np
 
 from .render import COLOUR_MAP, INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Pixels
 
-_FAR: Final = 20.0  # Of the eye, in half heights of the view.
-_PEELS: Final = 12  # Layers of translucent surface that are sorted.
-_SAMPLES: Final = 8  # A pixel, where there are no such layers.
+_FAR: Final = 20.0  # Distance of the eye, in half heights of the view.
+_PEELS: Final = 12  # Sorted layers of translucent surfaces.
+_SAMPLES: Final = 8  # Samples a pixel, in scenes that are not sorted.
 _CORNERS: Final = 48  # Of a ring.
 _RING_WIDTH: Final = 2.5  # [px]
 
@@ -28,7 +28,7 @@ def main() -> None:
     """Draw scenes until there are no more."""
     source = sys.stdin.buffer
     target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # What VTK prints is no frame.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Keeps messages of VTK out of the frames.
     drawer = _Drawer()
     while (scene := _read(source)) is not None:
         for frame in drawer.frames(scene):
@@ -48,13 +48,13 @@ def _read(source: BinaryIO) -> Any:
         arrays = dict(held)
 
     def named(plain: dict[str, Any]) -> SimpleNamespace:
-        return SimpleNamespace(**{key: arrays.get(str(each), each) for key, each in plain.items()})
+        return SimpleNamespace(**{key: arrays.get(str(value), value) for key, value in plain.items()})
 
     return json.loads(str(arrays.pop("spec")), object_hook=named)
 
 
 class _Drawer:
-    """Draws scenes into a window, which is kept for the next scene of the same layout."""
+    """Draws scenes into a window, which is reused for scenes of the same layout."""
 
     def __init__(self) -> None:
         self._layout: tuple[Any, ...] = ()
@@ -76,16 +76,16 @@ class _Drawer:
             else:
                 self._plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
         self._plotter.clear()
-        # Where it is transparent, smooth rims have a share of the background's colour.
+        # Smooth edges of transparent pictures have a share of the background's colour.
         self._plotter.set_background(scene.background or OUTLINE, all_renderers=True)
         light = {"light_type": "scene light", "position": TOWARDS_LIGHT, "focal_point": (0.0, 0.0, 0.0)}
         self._plotter.add_light(pyvista.Light(**light))
         return self._plotter
 
     def frames(self, scene: Any) -> Iterator[Pixels]:
-        """(H, V * W, 3 | 4) of each frame."""
+        """Yields the pixels (H, V * W, 3 | 4) of each frame."""
         plotter, layers = self._window(scene), []
-        plotter.suppress_rendering = True  # Which a window that was used does with everything that is added to it.
+        plotter.suppress_rendering = True  # A reused window would render after each added object.
         for column, view in enumerate(scene.views):
             plotter.subplot(0, column)
             layers += [_DrawnLayer(plotter, layer, view.axes) for layer in view.layers]
@@ -119,7 +119,7 @@ def _at(values: FloatArray, frame: int) -> Any:
 
 
 class _DrawnLayer:
-    """A layer in the current view, with a corner or a centre at each of its points (1 | F, P, 3)."""
+    """A layer in the current view, with corners or centres at its points (1 | F, P, 3)."""
 
     def __init__(self, plotter: Any, layer: Any, axes: FloatArray) -> None:
         points = layer.points if layer.points.ndim == 3 else layer.points[None]
@@ -128,7 +128,7 @@ class _DrawnLayer:
         cells = layer.cells
         if layer.kind in ("balls", "rings"):
             self.around, corners = _ball(layer.size) if layer.kind == "balls" else _ring(layer.size, axes)
-            cells = np.concatenate([corners + len(self.around) * each for each in range(points.shape[1])])
+            cells = np.concatenate([corners + len(self.around) * place for place in range(points.shape[1])])
         self.mesh = _mesh(layer, self._places(0), cells)
         style = {"opacity": layer.opacity, "lighting": layer.light is not None, "smooth_shading": layer.kind == "balls"}
         if layer.light is not None:
@@ -145,7 +145,7 @@ class _DrawnLayer:
             plotter.add_mesh(self.mesh, **style)
 
     def _places(self, frame: int) -> FloatArray:
-        """(P Q, 3) where its points are in a frame; what is not finite shrinks to nothing."""
+        """Positions (P Q, 3) of its points in a frame; points that are not finite are shrunk to zero size."""
         points = _at(self.points, frame)
         whole = np.isfinite(points).all(axis=1, keepdims=True)
         if self.around is None:
@@ -154,7 +154,7 @@ class _DrawnLayer:
         return (centres + np.where(whole[:, None], self.around, 0.0)).reshape(-1, 3)
 
     def move(self, frame: int) -> None:
-        """Takes the places of a frame."""
+        """Moves the layer to its positions in a frame."""
         if len(self.points) > 1:
             self.mesh.points = self._places(frame)
 
@@ -166,7 +166,7 @@ def _mesh(layer: Any, points: FloatArray, cells: Any) -> Any:
     if layer.kind.startswith("slice"):
         solid = pyvista.CellType.HEXAHEDRON if cells.shape[1] == 8 else pyvista.CellType.TETRA
         return pyvista.UnstructuredGrid({solid: cells}, points).slice(normal=layer.plane[0], origin=layer.plane[1])
-    if cells.shape[1] == 2:  # VTK wants the number of points before each line.
+    if cells.shape[1] == 2:  # VTK expects the number of points before each line.
         return pyvista.PolyData(points, lines=np.insert(cells, 0, 2, axis=1).ravel())
     surface = pyvista.PolyData.from_regular_faces(points, cells)
     if layer.paint is not None:
@@ -175,7 +175,7 @@ def _mesh(layer: Any, points: FloatArray, cells: Any) -> Any:
 
 
 def _ball(radius: float) -> tuple[FloatArray, Any]:
-    """Corners (Q, 3) and triangles (S, 3)."""
+    """Corners (Q, 3) and triangles (S, 3) of a ball."""
     import pyvista
 
     ball = pyvista.Sphere(radius=radius, theta_resolution=20, phi_resolution=20)
@@ -183,14 +183,14 @@ def _ball(radius: float) -> tuple[FloatArray, Any]:
 
 
 def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
-    """Corners (Q, 3) towards the viewer and lines (Q, 2)."""
+    """Corners (Q, 3) and lines (Q, 2) of a ring that faces the viewer."""
     angle = 2.0 * np.pi * np.arange(_CORNERS)[:, None] / _CORNERS
     count = np.arange(_CORNERS)
     return radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1]), np.stack([count, np.roll(count, -1)], axis=1)
 
 
 def _add_texts(plotter: Any, scene: Any) -> Any:
-    """The time, which is returned, and the legends beside it, where no player's controls hide them."""
+    """Adds time and legends at the top, where controls of players do not hide them, and returns the time."""
     top = scene.size[1] - 32
     for column, view in enumerate(scene.views):
         plotter.subplot(0, column)

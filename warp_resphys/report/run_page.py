@@ -1,4 +1,4 @@
-"""The page of a run, of a fold or over the folds: its errors, and after them a section of whatever else there is."""
+"""The page of a run, of a fold or over the folds: the errors, then sections on its other results."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -48,41 +48,41 @@ from .verdict import unbroken, verdict
 
 _LOG = logging.getLogger(__name__)
 
-_PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Where these are, they were meant.
+_PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _TIMED: Final = {
     "simulation": "Uncorrected simulation",
     "target": "Simulation with the true parameters",
     "resphys": "Simulation with the learned force",
-    "inference": "of it, the network alone",
+    "inference": "of which the network",
 }
 _WITHOUT_RECORDINGS: Final = (
-    "No recordings are configured (<code>data.folder</code>): what is called measured here is a simulation with a "
-    "finer mesh and step, another material, viscosity{}, and noise on its markers."
+    "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with a finer mesh and "
+    "time step, another material, viscosity{}, and noise on the markers."
 )
 _FOLDS: Final = (
-    "Each trial leads to the page of the fold that is tested on it: its motion, identification and training."
+    "Each trial links to the page of the fold in which it is the test: its motion, identification and training."
 )
-_MOST_LABELS: Final = 6  # That are named one by one.
-_FILTER: Final = 1.0  # [s] of the median filter, as published.
-_LENGTHS: Final = 4.0  # Of the filter, that a roll-out must last for it.
+_MOST_LABELS: Final = 6  # Markers that are named one by one.
+_FILTER: Final = 1.0  # Window of the median filter [s], as published.
+_LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
 
 
 def write_report(path: Path, data: RunReport) -> None:
     """Write the page, with its figures and the video in `figures/` beside it.
 
-    The page is whole or not there: it is written beside its final place first. What cannot be drawn on this machine is
-    replaced by a sentence that says why.
+    The page is written to a temporary file first, so that it is never incomplete. Pictures that cannot be drawn on this
+    machine are replaced by a sentence with the reason.
 
     Args:
         path: The page's file, such as `report.html`; missing folders are made.
-        data: What to show.
+        data: Data of the page.
 
     Raises:
         DataFileError: A file could not be written.
     """
     with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
         canvas = Canvas(folder, start_drawing(data, folder, pool))  # In another process, while this one draws figures.
-        ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for those.
+        ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for the other process.
         made = {section: section(data, canvas) for section in ready}
     seconds = data.metrics.get("seconds_per_test_trajectory", {})
     timed = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
@@ -101,7 +101,7 @@ def write_report(path: Path, data: RunReport) -> None:
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
-    """The errors of the models beside the published ones."""
+    """Return the errors of the models and the published ones."""
     blocks: list[Any] = []
     if data.settings.is_laboratory:
         laboratory = data.settings.laboratory
@@ -115,7 +115,7 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
         means = _numbers({t: {m: e["mean"] for m, e in fold["errors_mm"].items()} for t, fold in rows.items()})
         blocks.append(model_table("Test trial [mm]", means, _FOLDS, data.pages))
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
-        blocks.append(Text("Roll-outs that leave the states of the training", heading=True))
+        blocks.append(Text("Roll-outs outside the training range", heading=True))
         blocks.append(Items(ranges, "ranges"))
     return Part("", blocks)
 
@@ -131,7 +131,7 @@ def _errors_table(data: RunReport) -> PageTable:
         if model not in errors and model not in published:
             continue
         if model in idle:
-            meaning = "no force: none of its training was kept"
+            meaning = "no force: no epoch of its training was kept"
         elif model == "resphys" and "sysid" in errors:
             meaning = "the learned force on the identified simulator"
         cells = [_pair(error_parts(errors[model])) if model in errors else Cell(NONE)]
@@ -150,54 +150,53 @@ def _pair(parts: tuple[str, str]) -> Cell:
 
 
 def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the published errors by the model that they stand beside."""
-    taken = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
-    return {taken.get(model, model): published_parts(each) for model, each in published.items()}
+    """Return the published errors by our model with which they are compared."""
+    renamed = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
+    return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
 
 
 def _what_is_measured(data: RunReport) -> str:
-    """Definition of the errors, with notes on what they contain."""
+    """Definition of the errors, with notes on their contributions."""
     trials, span = data.trials, ""
     if data.settings.trial_seconds is not None:
         span = f", the frames of the first {data.settings.trial_seconds:g} s after the release,"
     if trials is None:
-        said = (
-            "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, in each of "
-            f"which one trial{span} is the test and the others are what the models learn from, ± the standard "
-            "deviation of the folds’ means."  # noqa: RUF001
+        text = (
+            "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, each with "
+            f"one test trial{span} and the others for training, ± the standard deviation of the folds’ means."  # noqa: RUF001
         )
     elif data.sees_markers:
         count, labels = len(trials.names), trials.labels
         length = f" of {trials.times.max():g} s" if not span and trials.moves else ""
         named = f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else _count(len(labels), "marker")
-        said = (
+        text = (
             f"Distance of the simulated markers from the measured ones, in millimetres: mean over "
             f"{_count(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and frames "
-            "of the mean over the markers. Frames in which a marker is hidden do not count for it."
+            "of the mean over the markers. Frames in which a marker is hidden are left out for it."
         )
     else:
         steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
-        said = (
+        text = (
             "Distance of the simulated vertices from those of the target, in millimetres: mean over "
             f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
     reconstructed = data.metrics.get("reconstruction", {})
-    learned = [_reconstruction_text(model, each, _observed(data)) for model, each in reconstructed.items()]
+    learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]
     published = [data.published_note] if data.published else []
-    return unbroken(" ".join([said, *data.notes, *learned, *published]))
+    return unbroken(" ".join([text, *data.notes, *learned, *published]))
 
 
 def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) -> str:
-    said = (
-        f"The reconstruction for {MODELS[model][0]} brings the {of} of the training trials to "
+    text = (
+        f"The reconstruction for {MODELS[model][0]} leaves the {of} of the training trials at a mean distance of "
         f"{mm_text(reconstructed['mean_mm'])} from the observed ones, {mm_text(reconstructed['max_mm'])} at most"
     )
     if "replayed_mm" not in reconstructed:
-        return f"{said}."
+        return f"{text}."
     replayed = reconstructed["replayed_mm"]
-    lead = "make it fail on" if replayed is None else f"lead {mm_text(replayed)} from the {of} of"
-    return f"{said}; replayed in the simulator, its forces {lead} the validation trials."
+    effect = "make it fail" if replayed is None else f"give an error of {mm_text(replayed)}"
+    return f"{text}; replayed in the simulator, its forces {effect} on the validation trials."
 
 
 def _count(number: int, what: str) -> str:
@@ -209,25 +208,28 @@ def _numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[s
 
 
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
-    """Say of each model how many of the trials' roll-outs left the states that it was trained on, and when.
+    """Return a sentence for each model on how many roll-outs left its training range, and when.
 
-    Metrics may have `range`, by model `first_s`: when a trial left [s]; and `scales_range`, by scale of the inputs.
+    Args:
+        metrics: With `range`, by model, whose `first_s` has the times [s] at which trials left; and `scales_range`,
+            the same by scale of the inputs. Both may be missing.
+        trials: Names of the test trials.
     """
-    said = []
+    sentences = []
     left_by, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
     for model in (model for model in MODELS if model in left_by):
         first = left_by[model]["first_s"]
         count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
         never = " never" * (len(trials) == 1 and not first)
-        text = f"{MODELS[model][0]}: {count}{never} left the states of the training{_when(first)}."
+        text = f"{MODELS[model][0]}: {count}{never} left the training range{_when(first)}."
         scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]
         left = {scale: beyond[scale][model]["first_s"] for scale in scales}
         if any(left.values()):
-            each = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
-            earliest = _when({trial: when for some in left.values() for trial, when in some.items()})
-            text += f" At higher inputs it is {', '.join(each)}{earliest}."
-        said.append(unbroken(text))
-    return said
+            counts = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
+            earliest = _when({trial: time for times in left.values() for trial, time in times.items()})
+            text += f" At higher inputs: {', '.join(counts)}{earliest}."
+        sentences.append(unbroken(text))
+    return sentences
 
 
 def _when(first: Mapping[str, float]) -> str:
@@ -238,7 +240,7 @@ def _when(first: Mapping[str, float]) -> str:
 
 
 def error_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """The errors over time, of each trial and of each marker."""
+    """Return the errors over time, of each trial and of each marker."""
     trials, metrics = data.trials, data.metrics
     if trials is None:
         return None
@@ -258,47 +260,47 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         blocks.append(model_table("Each trial [mm]", _numbers(rows)))
     if by_model := metrics.get("per_marker"):
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
-        each = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
-        blocks.append(model_table("Each marker [mm]", _numbers(each)))
+        by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
+        blocks.append(model_table("Each marker [mm]", _numbers(by_label)))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 
 
 def _error_caption(data: RunReport, window: float | None) -> str:
     count = len(data.metrics["per_trajectory"])
-    said = f"Mean over the {'markers that are seen' if data.sees_markers else 'vertices, against the target'}"
+    text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
     if window is not None:
-        said += f" and {_count(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
-        said += largest_filtered(data.metrics)
+        text += f" and {_count(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        text += largest_filtered(data.metrics)
     elif count > 1:
-        said += f": the line is the mean of the {count} test trials, the band"
-        said += " of a solid line" if data.sees_markers else ""
-        said += " spans the smallest to the largest of them."
+        text += f": the line is the mean of the {count} test trials, the band"
+        text += " of a solid line" if data.sees_markers else ""
+        text += " spans the smallest to the largest of them."
     else:
-        said += "."
+        text += "."
     if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
-        said += " A line ends where the first roll-out has diverged."
-    return unbroken(said)
+        text += " A line ends where the first roll-out has diverged."
+    return unbroken(text)
 
 
 def largest_filtered(metrics: Mapping[str, Any]) -> str:
-    """Say how large the error of a single trial becomes with each model that did not diverge; empty where not known."""
+    """Return a sentence on the largest filtered error of single trials, by model; empty if it is not known."""
     largest = metrics.get("median_filtered", {})
     parts = [f"{mm_text(largest[m])} ({MODELS[m][0]})" for m in MODELS if largest.get(m) is not None]
     return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
 
 
 def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """How far the roll-outs are from what the network learns."""
+    """Return the distances of the roll-outs from the reconstructed trajectories, from which the network learns."""
     errors = data.metrics.get("errors_vs_reconstruction_mm", {})
     if not errors:
         return None
     rows = [Row(MODELS[model][0], [_pair(error_parts(errors[model]))]) for model in MODELS if model in errors]
-    said = (
-        "The network learns from reconstructed trajectories. Their own distance from the target is in the first table; "
-        "this is how far the roll-outs are from them."
+    text = (
+        "The network learns from reconstructed trajectories. Their distance from the target is in the first table; "
+        "this is the distance of the roll-outs from them."
     )
     table = PageTable("Error against the reconstruction [mm]", ["This run"], rows)
-    return Part("Against the reconstruction", [Text(said), table])
+    return Part("Against the reconstruction", [Text(text), table])
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

@@ -24,28 +24,29 @@ from .page import (
 )
 from .verdict import published_growth
 
-_MOST_WIDE: Final = 8  # Markers that stand beside each other in a table.
+_MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
 _TRAINED: Final = {
     "training": "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the "
     "lowest.",
     "refinement": "Refinement through the simulator: mean squared distance from the target over windows of a few "
-    "steps, in mm². Epoch 0 is the network as the training above left it.",
+    "steps, in mm². Epoch 0 is the network after the training above.",
 }
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """Return the model that the others are compared with, and by how many per cent each is above or below it."""
+    """Return the model with which others are compared, and their errors relative to its error, in per cent."""
     base = next((m for m in ("sysid_elastic", "sysid") if m in errors and errors[m]["mean"]), "")
     if not base:
         return "", {}
-    ratios = {m: each["mean"] / errors[base]["mean"] - 1.0 for m, each in errors.items() if each["mean"] is not None}
+    means = {m: summary["mean"] for m, summary in errors.items() if summary["mean"] is not None}
+    ratios = {m: mean / means[base] - 1.0 for m, mean in means.items()}
     return base, {m: NONE if m == base else percent_text(ratio) for m, ratio in ratios.items()}
 
 
 def model_table(
     head: str, rows: Mapping[str, Mapping[str, Cell]], note: str = "", pages: Mapping[str, str] | None = None
 ) -> PageTable:
-    """Return cells by what a row is and model; a row may lead to a page."""
+    """Return a table of cells by row and model; `pages` are the links of rows."""
     models = [model for model in MODELS if any(model in row for row in rows.values())]
     addresses = pages or {}
     body = [Row(n, [r.get(m, Cell(NONE)) for m in models], address=addresses.get(n, "")) for n, r in rows.items()]
@@ -60,23 +61,23 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Return the errors over the first seconds of the roll-outs and their growth, with the published ones below them.
+    """Return the errors over the first seconds of the roll-outs and their growth, with published ones below.
 
     Args:
-        metrics: With `horizons` (a summary by seconds and model) and `growth`; there is no table without them.
+        metrics: With `horizons` (a summary by seconds and model) and `growth`; None is returned without them.
         published: Published errors by seconds and model.
     """
     horizons, rows = metrics.get("horizons", {}), {}
     for horizon in sorted(horizons, key=float):
-        theirs = {model: " ".join(published_parts(each)) for model, each in published.get(horizon, {}).items()}
+        theirs = {model: " ".join(published_parts(error)) for model, error in published.get(horizon, {}).items()}
         errors = horizons[horizon]
         rows[f"First {float(horizon):g} s"] = {m: Cell(_error(e), theirs.get(m, "")) for m, e in errors.items()}
     if len(rows) > 1 and metrics.get("growth"):
-        ours = {m: NONE if each is None else percent_text(each, 1) for m, each in metrics["growth"].items()}
+        ours = {m: NONE if growth is None else percent_text(growth, 1) for m, growth in metrics["growth"].items()}
         shares = published_growth(published, min(horizons, key=float), max(horizons, key=float))
-        theirs = {m: percent_text(each, 1) for m, each in shares.items()}
+        theirs = {m: percent_text(share, 1) for m, share in shares.items()}
         rows["Growth"] = {m: Cell(ours.get(m, NONE), theirs.get(m, "")) for m in next(iter(rows.values()))}
-    note = "Growth is that of the mean error from the shortest to the longest part of the same roll-outs."
+    note = "Growth of the mean error is from the shortest to the longest part of the same roll-outs."
     return model_table("Mean error [mm]", rows, note + (" Small: published." if published else "")) if rows else None
 
 
@@ -88,29 +89,29 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
         return None
     from . import figures
 
-    diverged = any(summary["diverged"] for each in scales.values() for summary in each.values())
+    diverged = any(summary["diverged"] for errors in scales.values() for summary in errors.values())
     means = {
         model: {float(s): e[model]["mean"] for s, e in scales.items() if model in e and e[model]["mean"] is not None}
         for model in MODELS
-        if any(model in each for each in scales.values())
+        if any(model in errors for errors in scales.values())
     }
     figure = canvas.figure(
         "error_over_scale",
         partial(figures.error_over_scale, means),
         "Mean marker error of the models against the scale of the inputs, on a logarithmic axis.",
-        f"Mean error over the roll-outs.{' Where a roll-out diverged, a point is missing.' if diverged else ''}",
+        f"Mean error over the roll-outs.{' Points with diverged roll-outs are missing.' if diverged else ''}",
     )
     return Part("Beyond the inputs of the training", [table, figure])
 
 
 def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Return the errors at multiples of the inputs (a summary by scale and model), with how they stand to SysID."""
+    """Return the errors at multiples of the inputs (a summary by scale and model), and relative to SysID."""
     rows = {}
     for scale in sorted(scales, key=float):
         base, shares = against(scales[scale])
         cells = {m: Cell(_error(e), "" if m == base else shares.get(m, "")) for m, e in scales[scale].items()}
         rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
-    note = "The inputs of the test trials, multiplied; below the error, how it stands to that of SysID."
+    note = "Inputs of the test trials times a factor; below the error, its difference from that of SysID."
     return model_table("Inputs; mean error [mm]", rows, note) if rows else None
 
 
@@ -120,65 +121,65 @@ def _error(summary: Mapping[str, Any]) -> str:
 
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return where the markers are on the body at rest."""
+    """Return the picture of the registered markers on the body at rest, and the residuals."""
     recordings = data.recordings
     if recordings is None:
         return None
-    whose = f"The body at rest with the registered markers of the trial {recordings.drawn}"
+    shown = f"The body at rest with the registered markers of the trial {recordings.drawn}"
 
     def picture(path: Path) -> Drawn:
         from .registration_picture import draw_registration
 
         draw_registration(path, recordings, data.fixed)
-        caption = f"{whose}, which fits worst. A ring stands where a marker should be."
-        return drawn_file(path, f"{whose}, from two sides.", caption)
+        caption = f"{shown}, which fits worst. Rings are nominal positions of the markers."
+        return drawn_file(path, f"{shown}, from two sides.", caption)
 
     blocks = canvas.attempt("registration.png", picture)
     return Part("Registration", [*blocks, residual_table(recordings.residuals)])
 
 
 def residual_table(residuals: Mapping[str, Any]) -> PageTable:
-    """Return the residuals of the registration [mm] by trial and marker; many markers stand below each other."""
-    labels = list(dict.fromkeys(label for each in residuals.values() for label in each["residual_mm"]))
+    """Return the residuals of the registration [mm] by trial and marker; many markers are in rows."""
+    labels = list(dict.fromkeys(label for fit in residuals.values() for label in fit["residual_mm"]))
     head, last = "Residual [mm]", "Root mean square"
     note = "Distance of each marker at rest from its nominal position after the rigid motion that fits best."
 
-    def cell(each: Mapping[str, Any], label: str) -> Cell:
-        value = each["residual_mm"].get(label)
-        return Cell(NONE if value is None else f"{value:.2f}", "left out" if label in each["outliers"] else "")
+    def cell(fit: Mapping[str, Any], label: str) -> Cell:
+        value = fit["residual_mm"].get(label)
+        return Cell(NONE if value is None else f"{value:.2f}", "left out" if label in fit["outliers"] else "")
 
-    rms = {trial: Cell(f"{each['rms_mm']:.2f}") for trial, each in residuals.items()}
+    rms = {trial: Cell(f"{fit['rms_mm']:.2f}") for trial, fit in residuals.items()}
     if len(labels) <= _MOST_WIDE:
-        rows = [Row(t, [*(cell(each, label) for label in labels), rms[t]]) for t, each in residuals.items()]
+        rows = [Row(t, [*(cell(fit, label) for label in labels), rms[t]]) for t, fit in residuals.items()]
         return PageTable(head, [*labels, last], rows, note)
-    rows = [Row(label, [cell(each, label) for each in residuals.values()]) for label in labels]
+    rows = [Row(label, [cell(fit, label) for fit in residuals.values()]) for label in labels]
     return PageTable(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
 
 
 def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return how complete and how noisy the recordings are."""
+    """Return tables of completeness and noise of the recordings."""
     if data.recordings is None:
         return None
     quality = data.recordings.quality
-    warnings = [f"{trial}: {said}" for trial, each in quality.items() for said in each["warnings"]]
+    warnings = [f"{trial}: {warning}" for trial, result in quality.items() for warning in result["warnings"]]
     longest = next(iter(quality.values()))["longest_gap_filled"]
     note = (
-        f"Gaps of up to {longest} frames are filled; longer ones, in frames here, are masked: they count in no loss "
-        "and in no error."
+        f"Gaps of up to {longest} frames are filled. Longer ones, given in frames, are masked: they do not count in "
+        "losses and errors."
     )
     columns = ["Seen", "Gaps", "Longest", "Masked", "Jumps", "Noise [mm]", "Drift [mm]"]
     tables = []
-    for trial, each in quality.items():
-        release = each["release_frame"]
-        summary = f"{trial}: {each['frames']} frames at {each['rate_hz']:g} Hz"
-        summary += "" if release is None else f", let go in frame {release:.1f}"
-        tables.append(PageTable("Marker", columns, quality_rows(each), "", summary, len(quality) == 1))
-    said = Items(warnings) if warnings else Text("No warnings.")
-    return Part("Quality of the recordings", [said, *tables, Text(note, note=True)])
+    for trial, result in quality.items():
+        release = result["release_frame"]
+        summary = f"{trial}: {result['frames']} frames at {result['rate_hz']:g} Hz"
+        summary += "" if release is None else f", released in frame {release:.1f}"
+        tables.append(PageTable("Marker", columns, quality_rows(result), "", summary, len(quality) == 1))
+    listed = Items(warnings) if warnings else Text("No warnings.")
+    return Part("Quality of the recordings", [listed, *tables, Text(note, note=True)])
 
 
 def quality_rows(quality: Mapping[str, Any]) -> list[Row]:
-    """Return a row a marker: share seen, gaps, longest, masked, jumps, noise, drift."""
+    """Return a row for each marker: share seen, gaps, longest gap, masked frames, jumps, noise, drift."""
     rows = []
     for marker in quality["markers"]:
         jumps, noise, drift = (marker[key] for key in ("jumps", "noise_mm", "drift_mm"))
@@ -194,7 +195,7 @@ def quality_rows(quality: Mapping[str, Any]) -> list[Row]:
 
 
 def training_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return how the trainings went, and what was kept of them."""
+    """Return the curves of the trainings, and which weights were kept."""
     from . import learning_figures
 
     blocks: list[Any] = []

@@ -1,4 +1,4 @@
-"""The verdict that heads the page of a run: how far its models are from what was observed."""
+"""The verdict on the page of a run: errors of its models, and how they compare with published ones."""
 
 import math
 import re
@@ -13,21 +13,22 @@ from .page import NO_BREAK_SPACE, mm_text, published_parts
 
 
 def verdict(data: RunReport) -> str:
-    """Say how far the models are from what was observed, and how that stands to what was published."""
+    """Return sentences on the errors of the models, compared with published ones."""
     metrics = data.metrics
     without = untrained(epochs_kept(metrics))
-    errors = {model: each for model, each in metrics["errors_mm"].items() if model not in without}
+    errors = {model: summary for model, summary in metrics["errors_mm"].items() if model not in without}
     if not data.sees_markers:
-        said = [vertex_verdict(metrics["errors_mm"], data.published, data.simulator, data.target)]
+        sentences = [vertex_verdict(metrics["errors_mm"], data.published, data.simulator, data.target)]
     else:
         trials = tuple(data.pages) if data.trials is None else data.trials.names
         parted = learned_in_part(data.settings, trials)
-        said = [marker_verdict(errors, trials, data.settings.trial_seconds, folds=data.trials is None, parted=parted)]
+        seconds = data.settings.trial_seconds
+        sentences = [marker_verdict(errors, trials, seconds, folds=data.trials is None, parted=parted)]
     if data.settings.train_fraction < 1.0:
         published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
-        said.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
-    said.append(scale_text(metrics.get("scales", {})))
-    return unbroken(" ".join(each for each in said if each))
+        sentences.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
+    sentences.append(scale_text(metrics.get("scales", {})))
+    return unbroken(" ".join(filter(None, sentences)))
 
 
 def learned_in_part(settings: RunSettings, tested: Collection[str]) -> bool:
@@ -36,55 +37,55 @@ def learned_in_part(settings: RunSettings, tested: Collection[str]) -> bool:
     return settings.train_fraction < 1.0 and isinstance(train, tuple) and {*tested} <= {*train}
 
 
-def unbroken(said: str) -> str:
-    """Return a text whose numbers stay beside their units and symbols."""
-    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, said)  # noqa: RUF001
+def unbroken(text: str) -> str:
+    """Return a text with no-break spaces between numbers and their units or symbols."""
+    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
 
 
 def vertex_verdict(
     errors: Mapping[str, Any], published: Mapping[str, PublishedError], simulator: str, target: str
 ) -> str:
-    """Say in a sentence or two how far the learned force brings the simulator to its target.
+    """Return a sentence or two on the error of the simulator with and without the learned force.
 
     Args:
-        errors: A summary [mm] a model.
-        published: Published errors [mm].
+        errors: Summaries [mm] by model.
+        published: Published errors [mm] by model.
         simulator: The corrected simulator in words.
         target: Its target in words.
     """
     if not {"simulation", "resphys"} <= errors.keys():
-        each = (f"{mm_text(errors[m]['mean'])} with {MODELS[m][0]}" for m in MODELS if m in errors)
-        return f"Mean vertex error: {', '.join(each)}."
+        means = (f"{mm_text(errors[m]['mean'])} with {MODELS[m][0]}" for m in MODELS if m in errors)
+        return f"Mean vertex error: {', '.join(means)}."
     before, after = errors["simulation"]["mean"], errors["resphys"]["mean"]
     count = errors["resphys"]["trajectories"]
     trials, old, new = f"{count} test trial{'s' if count > 1 else ''}", mm_text(before), mm_text(after)
     if after is None:
-        said = (
+        text = (
             f"With the learned residual force, {errors['resphys']['diverged']} of {count} test roll-outs diverged, so "
             f"there is no mean error to report. Without it: {old}."
         )
     elif before is None:
-        said = (
+        text = (
             f"Uncorrected, {errors['simulation']['diverged']} of {count} test roll-outs diverge; with the learned "
             f"residual force, the mean vertex error is {new}."
         )
     elif after >= before:
-        said = (
+        text = (
             f"The learned residual force does not help: the mean vertex error on {trials} is {new} with it and {old} "
             "without."
         )
     else:
-        said = (
+        text = (
             f"The learned residual force brings the simulator ({simulator}) {_closer(before, after)} to its target "
-            f"({target}): on {trials} that it never saw, the mean vertex error falls from {old} to {new}."
+            f"({target}): on {trials} held out from training, the mean vertex error falls from {old} to {new}."
         )
     if "resphys" in published:
-        said += f" The published result is {published_parts(published['resphys'])[0]} mm."
-    return said
+        text += f" The published result is {published_parts(published['resphys'])[0]} mm."
+    return text
 
 
 def _closer(before: float, after: float) -> str:
-    """Two significant digits: a ratio of errors over a few trials is worth no more."""
+    """The ratio of errors with two significant digits, which is all that a few trials justify."""
     if after == 0.0:
         return "all the way"
     digits = 1 - math.floor(math.log10(before / after))
@@ -99,18 +100,18 @@ def marker_verdict(
     folds: bool = False,
     parted: bool = False,
 ) -> str:
-    """Say how far the models are from what was measured.
+    """Return a sentence on the errors of the best model and of those that it extends.
 
     Args:
-        errors: A summary [mm] a model.
+        errors: Summaries [mm] by model.
         trials: Names of the test trials.
-        seconds: How much of them counts.
-        folds: Whether each trial was the test of a fold of its own.
-        parted: Whether each was learned from, but for the part that is the test.
+        seconds: Evaluated duration after the release [s]; None for whole trials.
+        folds: Whether each trial was the test of its own fold.
+        parted: Whether the first part of each trial was used for training, and the rest is the test.
     """
     who = f"trial {trials[0]}" if len(trials) == 1 else f"{len(trials)} trials"
-    held = "each of them kept back once" if folds and len(trials) > 1 else "which no training or identification saw"
-    held = "in the part that no training or identification saw" if parted else held
+    held = "each held out once" if folds and len(trials) > 1 else "held out from training and identification"
+    held = "in the part held out from training and identification" if parted else held
     span = "" if seconds is None else f" over the first {seconds:g} s"
     ranked = ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic", "simulation")
     main = next((m for m in ranked if m in errors), "")
@@ -119,7 +120,7 @@ def marker_verdict(
     if errors[main]["mean"] is None:
         return (
             f"On {who}, {held}, {MODELS[main][0]} diverged in {errors[main]['diverged']} of "
-            f"{errors[main]['trajectories']} roll-outs, so that there is no mean error to report."
+            f"{errors[main]['trajectories']} roll-outs, so there is no mean error to report."
         )
     beside = "".join(
         f", {mm_text(errors[m]['mean'])} {'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
@@ -137,25 +138,25 @@ def growth_text(
     horizons: Sequence[str],
     published: Mapping[str, Mapping[str, PublishedError]],
 ) -> str:
-    """Say how the error of ResPhys grows with the length of the roll-outs; empty where it is not known."""
-    own = growth.get("resphys")
-    if own is None or len(horizons) < 2:
+    """Return a sentence on the growth of ResPhys' error with the length of the roll-outs; empty if it is not known."""
+    ours = growth.get("resphys")
+    if ours is None or len(horizons) < 2:
         return ""
     first, *_, last = sorted(horizons, key=float)
     theirs = published_growth(published, first, last).get("resphys")
     beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} %)"
-    by = f"{'grows' if own >= 0.0 else 'falls'} by {100.0 * abs(own):.1f} %{beside}"
+    by = f"{'grows' if ours >= 0.0 else 'falls'} by {100.0 * abs(ours):.1f} %{beside}"
     return f"From {float(first):g} s to {float(last):g} s the error of ResPhys {by}."
 
 
 def published_growth(published: Mapping[str, Mapping[str, PublishedError]], first: str, last: str) -> dict[str, float]:
-    """Return by which share each published error grows from one length of the roll-outs [s] to another."""
+    """Return the relative growth of published errors from one length of the roll-outs [s] to another, by model."""
     before, after = published.get(first, {}), published.get(last, {})
     return {model: after[model].mean / before[model].mean - 1.0 for model in before if model in after}
 
 
 def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say what the errors are at the highest inputs; empty where there are none higher than in the training."""
+    """Return a sentence on the errors at the highest inputs; empty if none exceed those of the training."""
     if not errors:
         return ""
     largest = max(errors, key=float)

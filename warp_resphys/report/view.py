@@ -1,7 +1,7 @@
-"""The bodies of a trial in space, on the page: to be turned, played and compared in a browser.
+"""An interactive view of the bodies of a trial for the page, to be turned and played in a browser.
 
-Vertices of a motion are kept as in a reduced basis: where they are at rest, and the singular vectors that all models'
-displacements need, with their weights in each frame, so that ten seconds of an arm take a few hundred kilobytes.
+Vertices of a motion are stored in a reduced basis: rest positions, singular vectors of the displacements of all models,
+and their weights in each frame. Ten seconds of an arm take a few hundred kilobytes.
 """
 
 import base64
@@ -23,11 +23,11 @@ from .figures import TONES
 from .page import ViewInSpace
 from .render import COLOUR_MAP, MEASURED, OUTLINE
 
-_TOLERANCE: Final = 2e-4  # Of the body's size, by which a vertex may be drawn elsewhere,
-_MOST_MODES: Final = 96  # unless that takes more than these.
-_DIVERGED: Final = 3.0  # Of the body's size from rest, beyond which a body is not drawn.
+_TOLERANCE: Final = 2e-4  # Largest error of a drawn vertex, over the body's size,
+_MOST_MODES: Final = 96  # unless it takes more modes than these.
+_DIVERGED: Final = 3.0  # Distance from rest beyond which a body is not drawn, over the body's size.
 _STOPS: Final = 32  # Of the colour map.
-_LEVELS: Final = 255  # Of an error, over the model's largest.
+_LEVELS: Final = 255  # Of the errors of a model, from zero to the largest.
 
 
 def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
@@ -35,10 +35,10 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
 
     Args:
         name: Its identifier on the page.
-        motion: What is shown; with a target, bodies are compared with it, without one, markers.
-        shown: Models that are seen at first.
-        caption: What stands below.
-        alt: What it shows, in words.
+        motion: With a target, vertices are compared with it; without one, markers are compared.
+        shown: Models that are shown at first.
+        caption: Below the view.
+        alt: Description of the view.
     """
     surface = surface_vertices(motion.mesh)
     rest, faces = motion.mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(motion.mesh))
@@ -70,9 +70,9 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
             "dark": TONES[model].dark,
             "shown": model in shown,
             "largest": float(f"{most:.4g}"),
-            "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in each],
+            "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in by_frame],
         }
-        for model, most, each in zip(motion.positions, largest, means, strict=True)
+        for model, most, by_frame in zip(motion.positions, largest, means, strict=True)
     ]
     has_markers = motion.target is None
     data = {
@@ -106,35 +106,34 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
 
 
 def _distances(positions: FloatArray, target: FloatArray) -> FloatArray:
-    """(B, F, P) distances of points (B, F, P, 3) from where they should be (F, P, 3)."""
+    """Distances (B, F, P) of points (B, F, P, 3) from their targets (F, P, 3)."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.linalg.norm(positions - target, axis=3))
 
 
 def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[FloatArray, FloatArray]:
-    """Return the fewest singular vectors (K, 3 S) that give displacements, and their weights (B, F, K).
+    """Return the fewest singular vectors (K, 3 S) that represent displacements, and their weights (B, F, K).
 
     Args:
         displacements: (B, F, S, 3) [m] of S points in F frames of B bodies, NaN in frames that are left out.
-        tolerance: By which a coordinate may be off [m],
-        most: unless that takes more than so many.
+        tolerance: Largest error of a coordinate [m], unless it takes more vectors than `most`.
+        most: Largest number of vectors.
 
     Returns:
-        The vectors, of length one, one of zeros where none is needed, and the weights [m], NaN in the frames that were
-        left out.
+        Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames that are left out.
     """
     count, frames, *_ = displacements.shape
     rows = displacements.reshape(count * frames, -1)
     finite = np.isfinite(rows).all(axis=1)
     remaining = rows[finite].copy()
-    _, left = np.linalg.eigh(remaining @ remaining.T)  # There are fewer frames than coordinates, most often.
+    _, left = np.linalg.eigh(remaining @ remaining.T)  # Most often there are fewer frames than coordinates.
     basis = np.empty((0, rows.shape[1]))
     while len(basis) < min(most, left.shape[1]) and np.abs(remaining).max(initial=0.0) > tolerance:
         vector = left[:, -1 - len(basis)] @ remaining
         vector /= np.linalg.norm(vector)
         remaining -= np.outer(remaining @ vector, vector)
         basis = np.concatenate([basis, vector[None]])
-    if not len(basis):  # Of what is at rest, one that is nothing, so that its weights say which frames are finite.
+    if not len(basis):  # At rest, a vector of zeros, whose weights tell which frames are finite.
         basis = np.zeros((1, rows.shape[1]))
     weights = np.full((len(rows), len(basis)), np.nan)
     weights[finite] = rows[finite] @ basis.T
@@ -142,5 +141,5 @@ def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[Flo
 
 
 def _encoded(values: npt.ArrayLike, kind: str) -> str:
-    """Numbers as the script of the page reads them."""
+    """Encodes numbers for the script of the page."""
     return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

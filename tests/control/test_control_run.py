@@ -279,7 +279,7 @@ class TestDriving:
             ),
             (["motion=circle_0.4s", "controllers=[]"], "controllers names none: choose from open_sysid, "),
             (["motion=circle_0.4s", "controllers=[a,b,c,d]"], "controllers names 4: a film shows at most 3 "),
-            (["motion=circle_0.4s", "trial=t000"], "trial is of films of trials, and motion of one of control: "),
+            (["motion=circle_0.4s", "trial=t000"], "trial is for films of trials, and motion for films of control: "),
             (["controllers=[open_sysid]"], "controllers drive motions: name one by motion=, such as "),
         ],
     )

@@ -123,7 +123,7 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
         (["data.trials.fast.labels=[N1,N2,N4]"], "markers.tracked names 'N3', which no trial has"),
         (["data.axes=null"], "markers.plane is set, but data.axes is not"),
         (["markers.frame=free"], "markers.frame is 'free': .* body, own"),
-        (["data.base_motion=recorded"], "markers.frame is own, but a base_motion tells"),
+        (["data.base_motion=recorded"], "markers.frame is own, but a base_motion defines"),
         (["identify.placement={markers: 0.001}"], "identify.placement is set, but with markers.plane"),
         (["+data.trials.slow.base_motion=recorded"], "data.trials.slow.base_motion is 'recorded'"),
         (["markers.frame=body", "identify.placement={turn: 1.0}"], "identify.placement is set, but with markers.plane"),

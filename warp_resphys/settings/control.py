@@ -1,4 +1,4 @@
-"""Settings of control: what is followed, on which models it is planned, and within which limits."""
+"""Settings of control: paths, models for planning, and limits of the inputs."""
 
 from typing import Annotated, Literal
 
@@ -22,72 +22,72 @@ class LimitsOfInputs(Settings):
 
     low: NotNegative = 0.0
     high: Positive = setting(description="at most data.input_limit")
-    rate: Positive = setting(description="largest change in a second")
+    rate: Positive = setting(description="largest rate of change, in its unit a second")
 
 
 class PlanSettings(Settings):
     """Plans of whole motions."""
 
     spacing: Positive = setting(0.05, "between the knots of the inputs", "s")
-    effort: Positive = setting(1.0e-3, "of inputs that are at their upper limits", "mm^2")
-    change: Positive = setting(1.0e-3, "of inputs that change as fast as they may", "mm^2")
+    effort: Positive = setting(1.0e-3, "cost of inputs at their upper limits", "mm^2")
+    change: Positive = setting(1.0e-3, "cost of inputs that change at their largest rate", "mm^2")
     iterations: Natural = setting(6, "on the reduced model")
-    corrections: Count = setting(3, "by the robot's simulator")
+    corrections: Count = setting(3, "with the robot's simulator")
     gradient: Literal["reduced", "adjoint"] = setting(
-        "reduced", "slopes of the corrections: of the reduced model, or of the simulator's adjoint"
+        "reduced", "gradients of the corrections: of the reduced model, or by the simulator's adjoint"
     )
-    reach: Positive = setting(1.0e-3, "that a figure may be out of reach", "m")
+    reach: Positive = setting(1.0e-3, "largest distance of a path from reachable points", "m")
 
 
 class HorizonSettings(Settings):
-    """Plans that are made anew at each step."""
+    """Plans with a receding horizon."""
 
-    seconds: Positive = setting(0.3, "that are planned", "s")
-    pieces: Natural = setting(6, "of the inputs in that time")
-    effort: Positive = setting(1.0e-2, "of inputs that are at their upper limits", "mm^2")
-    change: Positive = setting(1.0e-2, "of inputs that change as fast as they may", "mm^2")
+    seconds: Positive = setting(0.3, "horizon", "s")
+    pieces: Natural = setting(6, "constant pieces of the inputs in the horizon")
+    effort: Positive = setting(1.0e-2, "cost of inputs at their upper limits", "mm^2")
+    change: Positive = setting(1.0e-2, "cost of inputs that change at their largest rate", "mm^2")
     iterations: Natural = setting(1, "at each step")
 
 
 class EstimateSettings(Settings):
-    """Standard deviations that the estimator expects; see `control.estimate.Noise`."""
+    """Standard deviations of the estimator, `control.estimate.Noise`."""
 
     observed: Positive = setting(1.0e-4, "of a coordinate of a marker", "m")
     rate: Positive = setting(
-        0.3, "of what rates change by in a step beside the model, over their spread in a swing of 1 mm"
+        0.3, "of the change of rates in a step beside the model, over their deviation in an oscillation of 1 mm"
     )
-    bias: Positive = setting(5.0e-3, "of what the bias wanders by in a second", "m")
+    bias: Positive = setting(5.0e-3, "of the drift of the bias in a second", "m")
 
 
 class FeedbackSettings(Settings):
     """Feedback by a measured Jacobian."""
 
     gains: Numbers = setting((0.5, 1.0, 2.0), unit="1/s")
-    pressed: Share = setting(0.3, "share of the range by which the Jacobian is measured")
-    settles: Positive = setting(1.5, "time in which it is measured", "s")
+    pressed: Share = setting(0.3, "share of the range by which inputs are changed to measure the Jacobian")
+    settles: Positive = setting(1.5, "time after which it is measured", "s")
 
 
 class ReductionSettings(Settings):
-    """Samples from which reduced models are made; see `control.sampling.Sampling`."""
+    """Samples for reduced models, `control.sampling.Sampling`."""
 
     modes: Annotated[Some[Natural], AfterValidator(different)] = setting(
-        (4, 6, 8), "coordinates of the reduced model, of which the number with the least error is taken"
+        (4, 6, 8), "numbers of coordinates of the reduced model, of which the one with the least error is chosen"
     )
     equilibria: Natural = setting(192, "states at rest")
-    tangents: Natural = setting(96, "of these, about which vibrations are found")
-    motions: Natural = setting(6, "motions, and as many again that tell the error")
+    tangents: Natural = setting(96, "of these, states whose vibrations are computed")
+    motions: Natural = setting(6, "for the model, and as many for its error")
     seconds: Positive = setting(2.5, "of a motion", "s")
-    batch: Natural = setting(32, "equilibria that are found at once")
+    batch: Natural = setting(32, "equilibria that are computed at once")
 
 
 class FigureSettings(Settings):
-    """Figures and letters that the mean of some markers follows."""
+    """Paths, such as figures and letters, for the mean of some markers."""
 
     tracked: Annotated[Some[Word], AfterValidator(different)] = setting(description="names of the markers")
     shapes: Annotated[Some[Shape], AfterValidator(different)] = setting(
         ("eight", "circle", "R", "E", "S"), "circle, eight or capital letters"
     )
-    seconds: Numbers = setting((4.0, 2.0), "that a figure takes, beside a quarter of that before it", "s")
+    seconds: Numbers = setting((4.0, 2.0), "durations of a path, beside a quarter of that before it", "s")
     centre: Vector = setting(description="of the figure", unit="m")
     size: Positive = setting(0.05, "of the larger side", "m")
     right: Direction = setting((1.0, 0.0, 0.0), "of the plane of the figure")
@@ -96,12 +96,12 @@ class FigureSettings(Settings):
 
 
 class ControlSettings(FigureSettings):
-    """How figures are followed."""
+    """Control along paths."""
 
     models: Models = setting(
-        ("simulation", "sysid", "resphys"), "planned on, of whole motions; others are compared with the last"
+        ("simulation", "sysid", "resphys"), "models for plans of whole motions; others are compared with the last"
     )
-    receding: Models = setting(("resphys",), "planned on anew at each step; among models")
+    receding: Models = setting(("resphys",), "those of the models that plan with a receding horizon")
     plan: PlanSettings = PlanSettings()
     horizon: HorizonSettings = HorizonSettings()
     estimate: EstimateSettings = EstimateSettings()

@@ -1,4 +1,4 @@
-"""Settings of what is learned: physical parameters, forces, networks, and how they are trained."""
+"""Settings of identification, reconstruction of forces, networks and their training."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -12,14 +12,14 @@ Size = Annotated[int, Field(ge=1, le=16_384)]
 
 
 class PriorSettings(Settings):
-    """What is known of a parameter beforehand."""
+    """Normal prior of a parameter."""
 
     mean: float = setting(description="in the parameter's unit")
     deviation: Positive = setting(description="in the parameter's unit")
 
 
 class SpanSettings(Settings):
-    """Values of a parameter between two."""
+    """A range of values of a parameter."""
 
     lower: float = setting(description="in the parameter's unit")
     upper: float = setting(description="in the parameter's unit")
@@ -35,9 +35,9 @@ class SpanSettings(Settings):
 
 
 class RangeSettings(SpanSettings):
-    """The range in which a parameter is searched."""
+    """The search range of a parameter."""
 
-    prior: PriorSettings | None = setting(None, "what is known beforehand")
+    prior: PriorSettings | None = setting(None, "prior knowledge")
 
     @model_validator(mode="after")
     def _has_the_prior(self) -> Self:
@@ -50,29 +50,29 @@ class RangeSettings(SpanSettings):
 
 
 class GridSettings(SpanSettings):
-    """Points at which a landscape is drawn."""
+    """Points of a loss landscape along a parameter."""
 
     points: Natural = setting(description="number of points")
 
 
 class GridTable(Settings):
-    """The landscape in the report."""
+    """The loss landscape of the report."""
 
-    youngs_modulus: GridSettings = setting(description="points along it", unit="Pa")
-    poissons_ratio: GridSettings | None = setting(None, "points along it")
+    youngs_modulus: GridSettings = setting(description="points along Young's modulus", unit="Pa")
+    poissons_ratio: GridSettings | None = setting(None, "points along Poisson's ratio")
 
 
 class PlacementSettings(Settings):
-    """Standard deviations of where markers sit and how recordings lie, to identify both."""
+    """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
 
-    markers: Positive | None = setting(None, "of each coordinate of a marker's place", "m")
+    markers: Positive | None = setting(None, "of each coordinate of a marker's position", "m")
     shift: Positive | None = setting(None, "of each coordinate of the recordings' origin", "m")
     turn: Positive | None = setting(None, "of each component of the recordings' rotation", "degrees")
 
 
 def _without_null(values: Any) -> Any:
-    """Takes out the parameters whose range or first guess is null."""
-    return {key: each for key, each in values.items() if each is not None} if isinstance(values, dict) else values
+    """Removes the parameters whose range or first guess is null."""
+    return {key: value for key, value in values.items() if value is not None} if isinstance(values, dict) else values
 
 
 Ranges = Annotated[
@@ -83,12 +83,12 @@ Guesses = Annotated[dict[str, float], BeforeValidator(_without_null, json_schema
 
 
 class IdentifiedSettings(Settings):
-    """What makes an identified simulator another one than the uncorrected one."""
+    """Differences of the identified from the uncorrected simulator."""
 
     integrator: Integrator | None = setting(None, "of the identified simulator; null: that of the uncorrected one")
-    substeps: Natural = setting(1, "of a time step, where it has an integrator of its own")
+    substeps: Natural = setting(1, "of a time step, with an integrator of its own")
     elastic: Ranges | None = setting(
-        None, "ranges of youngs_modulus and poissons_ratio for the published identification, of these alone"
+        None, "ranges of youngs_modulus and poissons_ratio for the published identification of these two"
     )
 
 
@@ -96,41 +96,41 @@ class IdentifySettings(IdentifiedSettings):
     """Physical parameters to identify."""
 
     parameters: Ranges = setting(
-        {}, "ranges by name; null, or ~identify.parameters.NAME, takes one out; docs/identification has the names"
+        {}, "ranges by name, listed in docs/identification; null, or ~identify.parameters.NAME, takes one out"
     )
-    placement: PlacementSettings | None = setting(None, "identify where markers sit and how recordings lie")
-    first_guess: Guesses = setting({}, "where the data sheet says nothing; null takes one out")
-    trials: Natural | None = setting(None, "of the training, evenly picked; null: all")
-    seconds: Positive | None = setting(None, "of each; null: all that counts", "s")
-    starts: Natural = setting(1, "searches: from the first guess, and the best of random candidates")
+    placement: PlacementSettings | None = setting(None, "identify positions of markers and pose of the recordings")
+    first_guess: Guesses = setting({}, "of parameters without a value in the data sheet; null takes one out")
+    trials: Natural | None = setting(None, "training trials, evenly chosen; null: all")
+    seconds: Positive | None = setting(None, "duration of each that is used; null: all", "s")
+    starts: Natural = setting(1, "searches: from the first guess, and from the best random candidates")
     candidates: Count = setting(4, "random candidates")
-    max_evaluations: Natural = setting(10, "of the loss and its gradient, a start")
-    tolerance: Positive = setting(1.0e-3, "relative decrease of the loss that is still worth a step")
-    grid: GridTable | None = setting(None, "landscape in the report")
+    max_evaluations: Natural = setting(10, "of the loss and its gradient, for each start")
+    tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
+    grid: GridTable | None = setting(None, "loss landscape of the report")
 
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:
         for name, value in self.first_guess.items():
-            range_ = self.parameters.get(name)
-            if range_ is not None and not range_.lower <= value <= range_.upper:
+            bounds = self.parameters.get(name)
+            if bounds is not None and not bounds.lower <= value <= bounds.upper:
                 raise ValueError(
-                    f"first_guess.{name} is {value:g}: it must be a number from {range_.lower:g} to {range_.upper:g}, "
+                    f"first_guess.{name} is {value:g}: it must be a number from {bounds.lower:g} to {bounds.upper:g}, "
                     "its range."
                 )
         return self
 
 
 class ReconstructionSettings(Settings):
-    """Forces that bring the simulator to what was observed: min |q+ - target|^2 + regularisation |f|^2."""
+    """Forces that fit the simulator to observations: min |q+ - target|^2 + regularisation |f|^2."""
 
     method: Literal["gauss_newton", "levenberg_marquardt", "lbfgsb"] = setting(
-        "gauss_newton", "levenberg_marquardt takes smaller steps, for markers; lbfgsb is the published, slow one"
+        "gauss_newton", "levenberg_marquardt takes smaller steps, for markers; lbfgsb is the published, slow method"
     )
     regularisation: NotNegative = setting(
         1.0e-10, "weight of the forces; the published 1e-4 leaves up to 0.3 mm", "m^2/N^2"
     )
-    tolerance: Positive = setting(1.0e-10, "last change of any position [m]; of lbfgsb, relative change of the loss")
-    max_iterations: Natural = setting(20, "after which a step has failed")
+    tolerance: Positive = setting(1.0e-10, "last change of any position [m]; for lbfgsb, relative change of the loss")
+    max_iterations: Natural = setting(20, "after which a step fails")
     modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")
 
 
@@ -138,13 +138,13 @@ class NetworkSettings(Settings):
     """The network of the residual force, or of the next state."""
 
     kind: Literal["reduced", "nodal"] = setting(
-        "reduced", "in- and output in a reduced basis, stable in closed loop; nodal: of every vertex, as published"
+        "reduced", "input and output in a reduced basis, stable in closed loop; nodal: of every vertex, as published"
     )
-    position_modes: Count = setting(6, "modes of the positions that it sees")
-    velocity_modes: Count = setting(6, "modes of the velocities that it sees")
+    position_modes: Count = setting(6, "modes of the positions in the input")
+    velocity_modes: Count = setting(6, "modes of the velocities in the input")
     force_modes: Natural = setting(12, "modes of the force")
     force_basis: Literal["force", "displacement"] = setting(
-        "force", "modes of the forces themselves; displacement: of what they would cause"
+        "force", "modes of the forces; displacement: of the displacements that they cause"
     )
     blocks: Annotated[int, Field(ge=1, le=100)] = setting(1, "residual blocks")
     layers: Annotated[int, Field(ge=0, le=100)] = setting(3, "hidden layers of a block")
@@ -153,14 +153,14 @@ class NetworkSettings(Settings):
         "normalised_elu", "layer normalisation and ELU, as published; silu, without, is smoother"
     )
     recurrent: Annotated[int, Field(ge=1, le=1_024)] | None = setting(
-        None, "size of a hidden state that goes with the roll-out; it takes trainer=sequences"
+        None, "size of a hidden state that is kept over the roll-out; it needs trainer=sequences"
     )
 
 
 class EpochSettings(Settings):
-    """What every way of training has."""
+    """Settings of all kinds of training."""
 
-    epochs: Natural = setting(300, "at most")
+    epochs: Natural = setting(300, "largest number")
     rollout_every: Natural = setting(30, "epochs between roll-outs of the validation split")
 
 
@@ -168,7 +168,7 @@ class TrainerSettings(EpochSettings):
     """Training on reconstructed steps."""
 
     batch_size: Natural = setting(64, "steps")
-    learning_rate: Positive = setting(2.0e-3, "at first")
+    learning_rate: Positive = setting(2.0e-3, "initial")
     schedule: Literal["cosine", "step"] = setting(
         "cosine", "of the learning rate: to final_learning_rate, or times gamma every step_epochs"
     )
@@ -176,17 +176,17 @@ class TrainerSettings(EpochSettings):
     gamma: Share = setting(0.83, "of schedule=step")
     step_epochs: Natural = setting(100, "of schedule=step")
     weight_decay: NotNegative = setting(0.0, "of Adam")
-    noise: NotNegative = setting(1.0e-3, "standard deviation added to the standardised inputs")
+    noise: NotNegative = setting(1.0e-3, "standard deviation of noise on the standardised inputs")
     linear_noise: Positive | None = setting(
-        1.0e-3, "the linear part is fitted as if the inputs had this noise; null leaves it out"
+        1.0e-3, "noise of the inputs for which the linear part is fitted; null: no linear part"
     )
     scale_weight: NotNegative = setting(
-        0.0, "power of their deviation by which outputs weigh in the loss: 0 all alike, 1 as in the field itself"
+        0.0, "power of the deviation of an output that is its weight in the loss: 0 equal, 1 as in the force field"
     )
     selection: Literal["rollout", "validation_loss"] = setting(
-        "rollout", "weights that are kept: of the least validation roll-out error, or loss"
+        "rollout", "weights that are kept: those of the least validation roll-out error, or of the least loss"
     )
-    sequence: Natural | None = setting(None, "steps that the gradient of a recurrent network reaches back")
+    sequence: Natural | None = setting(None, "steps of back-propagation through time, for recurrent networks")
 
 
 class FullBatchSettings(EpochSettings):
@@ -198,19 +198,19 @@ class FullBatchSettings(EpochSettings):
 class InTheLoopSettings(FullBatchSettings):
     """Training of the residual force on whole trials, through the simulator."""
 
-    epochs: Natural = setting(5, "iterations of L-BFGS, at most")
+    epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
     rollout_every: Natural = setting(1, "epochs between measurements of the error by which the weights are chosen")
     hold_out: bool = setting(
-        True, "without validation trials, hold out each training trial once, and train as long as that serves it"
+        True, "without validation trials, choose the number of epochs by holding out each training trial once"
     )
-    patience: Natural = setting(3, "epochs without any gain for the trials held out, after which that search ends")
+    patience: Natural = setting(3, "epochs without improvement on held-out trials, after which training ends")
     penalty: NotNegative = setting(1.0e-2, "on the squared weights")
 
 
 class RefinementSettings(FullBatchSettings):
     """Further training of the residual force through the simulator, over windows."""
 
-    kind: Literal["solver_in_the_loop"] = setting("solver_in_the_loop", "way of refinement")
+    kind: Literal["solver_in_the_loop"] = setting("solver_in_the_loop", "kind of refinement")
     epochs: Natural = setting(12, "iterations of L-BFGS")
     rollout_every: Natural = setting(1, "epochs between roll-outs of the validation split, by which weights are chosen")
     window: Natural = setting(10, "steps that the simulator takes from each start on the target trajectory")
@@ -218,7 +218,7 @@ class RefinementSettings(FullBatchSettings):
 
 
 class TrainingSettings(Settings):
-    """Everything that a model is trained with."""
+    """Settings of the training of a model."""
 
     network: NetworkSettings
     trainer: TrainerSettings
@@ -233,46 +233,46 @@ class TrainingSettings(Settings):
 
 
 class BaselineSettings(Settings):
-    """What the data-driven baseline has; keys that are left out are as in the groups network and trainer."""
+    """Settings of the data-driven baseline; keys that are left out are those of the groups network and trainer."""
 
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()
 
 
 class ActuationSettings(Settings):
-    """What networks see beside the state."""
+    """Inputs of networks beside the state."""
 
     filter_time_constants: Many[Positive] = setting(
         (), "of exponential means of the inputs, for bodies that creep", "s"
     )
-    sees_payload: bool = setting(False, "whether the residual force may depend on the payload, with many to learn from")
+    sees_payload: bool = setting(False, "whether the payload is an input of the network, for trials with many payloads")
 
 
 class ReleaseSettings(Settings):
-    """How a motion begins that is let go: the body that is held by its markers, and how."""
+    """Estimation of the state at a release from the markers of the held body."""
 
     hold_modes: Count = setting(
-        6, "vibration modes whose inertial forces hold it; 0 lets it go from where gravity and payload leave it"
+        6, "vibration modes whose inertial forces hold it; 0 starts from equilibrium under gravity and payload"
     )
     velocity_modes: Count = setting(0, "vibration modes of a velocity at the release")
     window: Positive = setting(
-        0.13, "after the release, that tells delay, velocity and sideways displacement: about a period", "s"
+        0.13, "after the release, for estimating delay, velocity and sideways displacement: about a period", "s"
     )
-    noise: Positive = setting(3.0e-4, "that a marker may be off for reasons that no release explains", "m")
+    noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
     delay: NotNegative = setting(
-        0.0, "expected deviation of the release from the one found in the frames; 0 takes that one", "s"
+        0.0, "expected deviation of the release from the detected one; 0 uses the detected one", "s"
     )
     speed: Positive = setting(0.05, "expected speed of the fastest vertex", "m/s")
     sideways: NotNegative = setting(
-        0.0, "expected displacement, across gravity, of a body that is held undeformed only to the eye; 0 for none", "m"
+        0.0, "expected displacement, across gravity, of a body that is held nearly undeformed; 0 for none", "m"
     )
     iterations: Natural = setting(4, "Levenberg-Marquardt steps")
 
 
 class AblationSettings(Settings):
-    """How many markers a reconstruction needs."""
+    """Study of the number of markers for a reconstruction."""
 
     counts: Annotated[Some[Natural], AfterValidator(different)] = setting(description="numbers of markers")
     draws: Natural = setting(10, "random sets of each number")
-    processes: Natural | None = setting(None, "that share the numbers; null: one a core, and one where a GPU simulates")
+    processes: Natural | None = setting(None, "that share the numbers; null: one for each core, and one on a GPU")
     modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")

@@ -1,4 +1,4 @@
-"""Writes what the classes of settings say, for readers and for editors.
+"""Writes a reference of all settings, as a page and as a JSON Schema for editors.
 
     python -m warp_resphys.settings.reference docs/settings.md
     python -m warp_resphys.settings.reference configs/settings.schema.json
@@ -19,7 +19,7 @@ from .run import RunSettings
 
 _HEAD: Final = """# Settings
 
-Every key of a run, as the classes in `warp_resphys/settings` have it. Units are SI. `warp-resphys --cfg job` shows the
+Every key of a run, from the classes in `warp_resphys/settings`. Units are SI. `warp-resphys --cfg job` shows the
 values of a run, and `key=value` on the command line or in a file of `configs/experiment` sets one. `NAME` stands for
 any name. In `simfree`, keys that are left out are as in the groups `network` and `trainer`.
 
@@ -30,40 +30,40 @@ made by `python -m warp_resphys.settings.reference docs/settings.md`.
 
 
 def page() -> str:
-    """The page of all keys, in Markdown."""
+    """Returns the page of all keys, in Markdown."""
     schema = RunSettings.model_json_schema()
     return "\n".join([_HEAD, *_sections(schema, schema, "", {})])
 
 
 def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) -> Iterator[str]:
-    """A section for each kind of a group and for the groups in it; keys of a whole run come first.
+    """Yields a section for each kind of a group and for the groups in it, after the keys of the group.
 
     Args:
-        schema: JSON Schema of the class of the whole.
-        node: that of the group.
+        schema: JSON Schema of the run.
+        node: JSON Schema of the group.
         path: dotted key of the group.
-        shown: keys of the groups that have a section, by their content.
+        shown: keys of the groups with a section, by their content.
     """
-    kinds = [each for each in options(schema, node) if "properties" in each]
+    kinds = [kind for kind in options(schema, node) if "properties" in kind]
     for kind in kinds:
         words = [f"`kind: {kind['properties']['kind']['const']}`"] if len(kinds) > 1 else []
         yield f"## {' '.join([f'`{path}`' if path else 'The run', *words])}\n"
         if path:
             yield f"{kind.get('description', '')}\n"
-        groups = {name: each for name, each in kind["properties"].items() if _groups_of(schema, each)}
-        rows = [_row(schema, kind, name, each) for name, each in kind["properties"].items() if name not in groups]
+        groups = {name: key for name, key in kind["properties"].items() if _groups_of(schema, key)}
+        rows = [_row(schema, kind, name, key) for name, key in kind["properties"].items() if name not in groups]
         if rows:
             yield "\n".join(["| key | it must be | default | meaning |", "|---|---|---|---|", *rows, ""])
-        for name, each in groups.items():
+        for name, group in groups.items():
             at = f"{path}.{name}" if path else name
-            null = "null" if each.get("default", {}) is None else "default" if "default" in each else "required"
-            found = _groups_of(schema, each)
-            assert found is not None
-            inner, suffix = found
+            null = "null" if group.get("default", {}) is None else "default" if "default" in group else "required"
+            keys = _groups_of(schema, group)
+            assert keys is not None
+            inner, suffix = keys
             if path or null != "default":
-                meaning = each.get("description", "")
+                meaning = group.get("description", "")
                 yield f"`{at}` is a group, {null}{f': {meaning}' if meaning else ''}.\n"
-            content = json.dumps([each.get("title") for each in options(schema, inner)])
+            content = json.dumps([option.get("title") for option in options(schema, inner)])
             if shown.setdefault(content, f"{at}{suffix}") != f"{at}{suffix}":
                 yield f"`{at}{suffix}` has the keys of `{shown[content]}`.\n"
                 continue
@@ -71,12 +71,12 @@ def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) ->
 
 
 def _groups_of(schema: Schema, node: Schema) -> tuple[Schema, str] | None:
-    """The part of a JSON Schema that has keys, and what follows the key of the group: .NAME for groups by name."""
+    """The part of a JSON Schema with keys, and a suffix of the key of the group: .NAME for groups by name."""
     choices = options(schema, node)
-    if any("properties" in each for each in choices):
+    if any("properties" in choice for choice in choices):
         return node, ""
-    for each in choices:
-        inner = each.get("additionalProperties")
+    for choice in choices:
+        inner = choice.get("additionalProperties")
         if isinstance(inner, Mapping) and _groups_of(schema, inner):
             return inner, ".NAME"
     return None
@@ -85,21 +85,21 @@ def _groups_of(schema: Schema, node: Schema) -> tuple[Schema, str] | None:
 def _row(schema: Schema, kind: Schema, name: str, node: Schema) -> str:
     default = "" if name in kind.get("required", ()) else f"`{json.dumps(node.get('default'))}`"
     cells = (f"`{name}`", in_words(node, schema), default, node.get("description", ""))
-    return f"| {' | '.join(each.replace('|', '/') for each in cells)} |"
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def editor_schema() -> dict[str, Any]:
-    """JSON Schema of a file of settings, which may leave out what the options that it builds on say."""
+    """Returns the JSON Schema of a file of settings, in which keys may be missing, as it extends other options."""
     schema: dict[str, Any] = _partial(RunSettings.model_json_schema())
     schema["properties"] |= {"defaults": {"type": "array"}, "hydra": {"type": "object"}}
     return schema
 
 
 def _partial(node: Any) -> Any:
-    """The same without required keys, but for the kind of a group that has several."""
+    """A JSON Schema without lists of required keys."""
     if isinstance(node, Mapping):
-        return {key: _partial(each) for key, each in node.items() if key != "required" or not isinstance(each, list)}
-    return [_partial(each) for each in node] if isinstance(node, list) else node
+        return {key: _partial(value) for key, value in node.items() if key != "required" or not isinstance(value, list)}
+    return list(map(_partial, node)) if isinstance(node, list) else node
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""`RunSettings`: the whole configuration of a run, and the relations between its groups.
+"""`RunSettings`: the whole configuration of a run, and the checks of relations between its groups.
 
-What needs a mesh, the trials or their files is checked where these are made; see `experiment.checks`.
+Checks that need the mesh, the trials or their files are in `experiment.checks`.
 """
 
 from collections.abc import Mapping
@@ -37,24 +37,24 @@ from .trials import (
 
 Name = Annotated[
     str,
-    Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as a folder is named so"}),
+    Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"}),
 ]
-_LEAST_STEPS = 20  # of a figure that is followed
+_LEAST_STEPS = 20  # of a path that is followed
 
 
 class ParallelSettings(Settings):
     """Processes that share the work."""
 
-    processes: Natural | None = setting(1, "that share the trials; null: one a core")
+    processes: Natural | None = setting(1, "number of processes; null: one for each core")
     backend: Literal["local", "ray", "dask"] = setting(
-        "local", "processes of this machine; or of a cluster with the same folders"
+        "local", "processes of this machine, or of a cluster with the same folders"
     )
-    address: Word | None = setting(None, "of the cluster, as ray://head:10001; null: one on this machine")
+    address: Word | None = setting(None, "of the cluster, such as ray://head:10001; null: a cluster on this machine")
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
 
 
 class PublishedSettings(Settings):
-    """A simulation to compare with."""
+    """A published simulation, for comparison."""
 
     simulation: MaterialSettings = setting(description="its material")
     physics: PhysicsSettings = setting(description="its masses and volumes")
@@ -67,14 +67,14 @@ class RunSettings(SimulatorSettings):
     name: Name = setting(description="of the experiment; the folder of its runs")
     title: Word = setting(description="of the report")
     seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
-        0, "of all that is drawn"
+        0, "of all random numbers"
     )
-    tip: PlaceSettings = setting(description="vertices whose mean the report follows, where there are no markers")
+    tip: PlaceSettings = setting(description="vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
     target: MaterialSettings | None = setting(None, "material of the simulation that plays the real body")
     data: DataSettings
     markers: MarkerSettings | None = setting(
-        None, "what is seen of the body; null: every vertex, as a simulation knows"
+        None, "observed markers; null: every vertex is observed, as in simulations"
     )
     laboratory: LaboratorySettings | None = setting(None, "plays the real body where there are no recordings")
     published: PublishedSettings | None = setting(None, "simulation to compare with")
@@ -89,35 +89,36 @@ class RunSettings(SimulatorSettings):
     refinement: RefinementSettings | None = setting(None, "further training through the simulator; null: none")
     actuation: ActuationSettings = ActuationSettings()
     release: ReleaseSettings = ReleaseSettings()
-    control: ControlSettings | None = setting(None, "figures that the robot follows; null: none")
-    ablation: AblationSettings | None = setting(None, "how many markers it takes, in place of learning")
+    control: ControlSettings | None = setting(None, "paths that the robot follows; null: none")
+    ablation: AblationSettings | None = setting(None, "study of the number of markers, in place of learning")
     correct_uncorrected: bool = setting(
-        False, "whether a force is learned for the simulator without identification, too"
+        False, "whether a force is learned for the simulator without identification as well"
     )
     force_frame: Literal["corotated", "world"] = setting(
         "world",
-        "residual forces keep their directions, as published; corotated: they turn with the body at each vertex",
+        "world: residual forces keep their directions, as published; corotated: they rotate with the body at each "
+        "vertex",
     )
     range_guard: bool = setting(
-        True, "roll-outs hold what a network sees within what it saw in training, and say when it would leave that"
+        True, "inputs of networks are limited to their range in training, and roll-outs record when they exceed it"
     )
     mesh_check: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(
-        None, "so many times as many cells, 1.5 or 2, tell what the mesh changes in the markers of the test trials"
+        None, "refinement, such as 1.5 or 2, of a mesh that shows the discretisation error of the test trials"
     )
     timing: bool = setting(True, "whether models are timed, one trial at a time")
     parallel: ParallelSettings = ParallelSettings()
     budget: Word = setting("full", "full or quick")
-    tuned: Word = setting("none", "settings that a search found; files of configs/tuned")
-    tune: dict[str, Any] = setting({}, "the search of warp-resphys tune; see there")
+    tuned: Word = setting("none", "settings found by a search; files of configs/tuned")
+    tune: dict[str, Any] = setting({}, "the search of warp-resphys tune, whose keys are in conf/tune")
 
     @property
     def recorded(self) -> RecordedData | None:
-        """Data of bodies that are seen through markers; None where every vertex is."""
+        """Data of bodies that are observed through markers; None where every vertex is observed."""
         return self.data if isinstance(self.data, RecordedData) else None
 
     @property
     def is_laboratory(self) -> bool:
-        """Whether there are no recordings, so that a simulated laboratory makes them."""
+        """Whether a simulated laboratory generates the recordings."""
         return isinstance(self.data, RecordedData) and self.data.folder is None
 
     @property
@@ -127,17 +128,17 @@ class RunSettings(SimulatorSettings):
 
     @property
     def train_fraction(self) -> float:
-        """Share of each trial, from its start, that is learned from."""
+        """Share of each trial, from its start, that is used for training."""
         return 1.0 if self.recorded is None else self.recorded.train_fraction
 
     @property
     def trial_seconds(self) -> float | None:
-        """How much of a trial counts after its release [s]."""
+        """Evaluated duration of a trial after its release [s]; None for all of it."""
         return None if self.recorded is None else self.recorded.seconds
 
     @property
     def horizons(self) -> tuple[float, ...]:
-        """Times for which errors are given [s]."""
+        """Durations over which errors are reported [s]."""
         return () if self.recorded is None else self.recorded.horizons
 
     @property
@@ -147,17 +148,17 @@ class RunSettings(SimulatorSettings):
 
     @property
     def input_scales(self) -> tuple[float, ...]:
-        """Factors of the inputs at which test trials are run as well."""
+        """Factors of the inputs for additional test trials."""
         return () if self.recorded is None else self.recorded.input_scales
 
     @property
     def identified(self) -> IdentifiedSettings | None:
-        """What makes the identified simulator another one; None where nothing is identified."""
+        """Differences of the identified simulator; None where nothing is identified."""
         return None if self.identify is None else IdentifiedSettings.of(self.identify)
 
     @property
     def binding(self) -> BindingSettings:
-        """Where markers are and how they are bound."""
+        """Positions of markers, and how they are bound to the body."""
         assert self.markers is not None
         return BindingSettings.of(self.markers)
 
@@ -172,15 +173,15 @@ class RunSettings(SimulatorSettings):
         return models_of(self.published, self.identify, self.correct_uncorrected)
 
     def training(self, model: str) -> TrainingSettings:
-        """What a model is trained with; of ``simfree``, which is trained on steps, the groups of its own.
+        """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.
 
         Raises:
-            InputError: settings that do not fit each other.
+            InputError: settings that contradict each other.
         """
-        own, at = (self, "") if model != "simfree" else (self.simfree, "simfree")
+        groups, key = (self, "") if model != "simfree" else (self.simfree, "simfree")
         in_the_loop = self.in_the_loop if model != "simfree" else None
-        values = {"network": own.network, "trainer": own.trainer, "in_the_loop": in_the_loop, "seed": self.seed}
-        return parse(TrainingSettings, values, at)
+        values = {"network": groups.network, "trainer": groups.trainer, "in_the_loop": in_the_loop, "seed": self.seed}
+        return parse(TrainingSettings, values, key)
 
     @model_validator(mode="before")
     @classmethod
@@ -194,7 +195,9 @@ class RunSettings(SimulatorSettings):
         if (self.markers is None) != (self.recorded is None):
             if self.markers is None:
                 raise ValueError("markers is null, but data.kind is recorded: name the markers, with their places.")
-            raise ValueError(f"data.kind is {self.data.kind!r}, whose vertices are all known: leave markers null.")
+            raise ValueError(
+                f"data.kind is {self.data.kind!r}, in which all vertices are observed: leave markers null."
+            )
         if self.recorded is None and self.target is None:
             raise ValueError("target is null: give the material of the simulation that plays the real body.")
         if self.is_laboratory and self.laboratory is None:
@@ -202,7 +205,7 @@ class RunSettings(SimulatorSettings):
         if self.mesh_check is not None and self.markers is None:
             raise ValueError("mesh_check compares markers, but markers is null: leave it null, too.")
         if self.reconstruction.modes is not None and self.markers is None:
-            raise ValueError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
+            raise ValueError("reconstruction.modes is for bodies that are observed through markers: leave it out.")
         if self.ablation is not None:
             weights = self.data.weights_g.observed if isinstance(self.data, ReleaseFromLoad) else ()
             if len(weights) != 1:
@@ -219,7 +222,7 @@ class RunSettings(SimulatorSettings):
         driven = [group for group, is_driven in commanded.items() if is_driven]
         if len(driven) > 1:
             raise ValueError(
-                f"{driven[0]} and {driven[1]} are two inputs of the body, and recordings drive one: take one out."
+                f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
             )
         if self.fibres is not None and self.chambers is None:
             raise ValueError("fibres are wound around chambers, but chambers is null: leave the fibres out.")
@@ -235,8 +238,9 @@ class RunSettings(SimulatorSettings):
         used |= {} if self.identify is None else {"identify.integrator": self.identify.integrator or self.integrator}
         if self.is_laboratory and self.laboratory is not None:
             used["laboratory.integrator"] = self.laboratory.integrator
-        for key in [key for key, each in used.items() if self.rigid and each == "midpoint"]:
-            raise ValueError(f"{key} is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
+        for key, integrator in used.items():
+            if self.rigid and integrator == "midpoint":
+                raise ValueError(f"{key} is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2.")
         return self
 
     @model_validator(mode="after")
@@ -248,12 +252,12 @@ class RunSettings(SimulatorSettings):
             return self
         if self.payload_string is not None:
             raise ValueError(
-                "refinement begins anew in every window, where nothing tells how a weight on a string swings: set "
+                "refinement starts anew in every window, where the state of a weight on a string is not known: set "
                 "refinement to none, or payload_string to null."
             )
         if self.network.recurrent is not None:
             raise ValueError(
-                "refinement begins anew in every window, and network.recurrent lives on what was before: set one of "
+                "refinement starts anew in every window, but network.recurrent needs the steps before it: set one of "
                 "them to none, or null."
             )
         if self.data.steps is not None and refinement.window >= self.data.steps:
@@ -268,7 +272,7 @@ class RunSettings(SimulatorSettings):
             for name, swing in (motion.swings or {}).items():
                 if 2.0 * swing.frequency * self.time_step >= 1.0:
                     raise ValueError(
-                        f"{key}.swings.{name}.frequency is {swing.frequency:g}: steps of {self.time_step:g} s follow "
+                        f"{key}.swings.{name}.frequency is {swing.frequency:g}: steps of {self.time_step:g} s resolve "
                         f"less than {0.5 / self.time_step:g} Hz."
                     )
         data = self.recorded
@@ -279,19 +283,20 @@ class RunSettings(SimulatorSettings):
         return self
 
     def motions(self) -> dict[str, MotionSettings]:
-        """Motions of the base that are given beforehand, by their dotted key."""
+        """Returns the configured motions of the base by dotted key."""
         common = self.data.base_motion
-        found = {"data.base_motion": common} if isinstance(common, MotionSettings) else {}
+        motions = {"data.base_motion": common} if isinstance(common, MotionSettings) else {}
         tables = {} if self.recorded is None or self.is_laboratory else {"data": self.recorded.trials}
         tables |= {} if self.laboratory is None or not self.is_laboratory else {"laboratory": self.laboratory.trials}
         for group, trials in tables.items():
-            own = {f"{group}.trials.{name}.base_motion": each.base_motion for name, each in trials.items()}
-            found |= {key: motion for key, motion in own.items() if motion is not None}
-        return found
+            for name, trial in trials.items():
+                if trial.base_motion is not None:
+                    motions[f"{group}.trials.{name}.base_motion"] = trial.base_motion
+        return motions
 
     @model_validator(mode="after")
     def _view(self) -> Self:
-        """What can be had of markers whose places recordings do not tell."""
+        """Checks settings that need more than the recordings tell about the positions of markers."""
         data, markers = self.recorded, self.markers
         if data is None or markers is None:
             return self
@@ -302,15 +307,15 @@ class RunSettings(SimulatorSettings):
         if markers.plane is not None and data.axes is None:
             raise ValueError(
                 "markers.plane is set, but data.axes is not: name the axes of the recordings along which the body's x, "
-                "y and z are, so that it is known which one is not seen."
+                "y and z are, which define the axis that is not observed."
             )
         if markers.frame == "own" and (data.base_motion is not None or self.motions()):
-            raise ValueError("markers.frame is own, but a base_motion tells where the body is: take one of them out.")
+            raise ValueError("markers.frame is own, but a base_motion defines where the body is: take one of them out.")
         whole = markers.plane is None and markers.frame == "body"
         if not whole and self.identify is not None and self.identify.placement is not None:
             raise ValueError(
-                "identify.placement is set, but with markers.plane, or markers.frame own, recordings do not tell where "
-                "markers sit and how the body lies: set it to null."
+                "identify.placement is set, but with markers.plane, or markers.frame own, recordings do not determine "
+                "positions of markers and pose of the body: set it to null."
             )
         return self
 
@@ -324,36 +329,33 @@ class RunSettings(SimulatorSettings):
                 "control is for a robot with markers and inputs, of one split of its trials: set control=none, or "
                 "data.folds=null."
             )
-        known: list[str] = [model for model in self.models if model != "simfree"]
+        simulated: list[str] = [model for model in self.models if model != "simfree"]
         for key, models in (("models", control.models), ("receding", control.receding)):
-            unknown = [model for model in models if model not in known]
-            if unknown:
-                raise ValueError(f"control.{key} has {unknown[0]}: this experiment has {', '.join(known)}.")
+            if unknown := [model for model in models if model not in simulated]:
+                raise ValueError(f"control.{key} has {unknown[0]}: this experiment has {', '.join(simulated)}.")
         if not {*control.receding} <= {*control.models}:
             raise ValueError(f"control.receding must be among control.models, which are {', '.join(control.models)}.")
-        odd = [label for label in control.tracked if label not in self.markers.tracked]
-        if odd:
+        if missing := [label for label in control.tracked if label not in self.markers.tracked]:
             tracked = ", ".join(self.markers.tracked)
-            raise ValueError(f"control.tracked names '{odd[0]}': markers.tracked has {tracked}.")
+            raise ValueError(f"control.tracked names '{missing[0]}': markers.tracked has {tracked}.")
         limits = control.limits
         if not limits.low < limits.high or (data.input_limit is not None and limits.high > data.input_limit):
             raise ValueError(
                 f"control.limits are from {limits.low:g} to {limits.high:g}: they must rise, to data.input_limit of "
-                f"{data.input_limit:g} at most, which is what was learned from."
+                f"{data.input_limit:g} at most, the largest input of the training."
             )
-        short = [seconds for seconds in control.seconds if seconds < _LEAST_STEPS * self.time_step]
-        if short:
-            raise ValueError(f"control.seconds has {short[0]:g}: a figure takes {_LEAST_STEPS} steps at least.")
+        if short := [seconds for seconds in control.seconds if seconds < _LEAST_STEPS * self.time_step]:
+            raise ValueError(f"control.seconds has {short[0]:g}: a path takes {_LEAST_STEPS} steps at least.")
         return self
 
 
 def models_of(published: Any, identified: IdentifiedSettings | None, correct_uncorrected: bool) -> list[str]:
-    """Names of the models that an experiment compares.
+    """Returns the names of the models that an experiment compares.
 
     Args:
-        published: settings of the published simulation; None for none.
-        identified: settings of the identified simulator; None for none.
-        correct_uncorrected: whether a force is learned for the uncorrected simulator, too.
+        published: settings of the published simulation, or None.
+        identified: settings of the identified simulator, or None.
+        correct_uncorrected: whether a force is learned for the uncorrected simulator as well.
     """
     absent = {
         "published": published is None,
@@ -365,19 +367,19 @@ def models_of(published: Any, identified: IdentifiedSettings | None, correct_unc
 
 
 def with_baseline(values: Any) -> Any:
-    """Plain values of a run in which the group simfree has what it leaves out of the groups network and trainer."""
-    own = _mapping(values.get("simfree", {})) if isinstance(values, Mapping) else None
-    if own is None or not {*own} <= {"network", "trainer"}:
+    """Returns the plain values of a run, with keys that simfree leaves out copied from network and trainer."""
+    simfree = _mapping(values.get("simfree", {})) if isinstance(values, Mapping) else None
+    if simfree is None or not {*simfree} <= {"network", "trainer"}:
         return values
     merged: dict[str, Any] = {}
     for key in ("network", "trainer"):
-        common, different = _mapping(values.get(key, {})), _mapping(own.get(key, {}))
-        merged[key] = own.get(key) if common is None or different is None else {**common, **different}
+        common, changes = _mapping(values.get(key, {})), _mapping(simfree.get(key, {}))
+        merged[key] = simfree.get(key) if common is None or changes is None else {**common, **changes}
     return {**values, "simfree": merged}
 
 
 def _mapping(values: Any) -> Mapping[str, Any] | None:
-    """Nested settings as a mapping; None for what is none."""
+    """Returns a group as a mapping; None for any other value."""
     if isinstance(values, Settings):
         return values.plain()
     return values if isinstance(values, Mapping) else None

@@ -1,8 +1,7 @@
-"""What each stage of a run depends on: a class with a field for every group or key that it may read.
+"""Settings of the stages of a run: a class for each, with a field for every group or key that it may read.
 
-A stage is given an object of its class, whose content is its fingerprint. What the class does not have, the stage
-cannot read, so that nothing a file depends on can be forgotten. `Settings.of` fills the fields that a `RunSettings` has
-by the same name; the pipeline adds the others.
+The fingerprint of a stage is that of its settings. A stage cannot read other settings, so that no dependency of a file
+is forgotten. `Settings.of` copies the fields that `RunSettings` has by the same name; the pipeline adds the others.
 """
 
 from typing import Annotated, Any
@@ -49,14 +48,14 @@ from .trials import (
 
 
 class SimulationStage(SimulatorSettings):
-    """What every simulation of a run depends on."""
+    """Settings of every simulation of a run."""
 
     payload_at: PlaceSettings | None
     files: dict[str, str]  # SHA-256 of the files that bodies and their motions are read from, by path
 
 
 class SimulateStage(SimulationStage):
-    """Trials of a simulation that plays the real body, whose vertices are all known."""
+    """Trials of a simulation that plays the real body, with all vertices observed."""
 
     target: MaterialSettings
     data: Annotated[SimulatedData, Field(discriminator="kind")]
@@ -98,7 +97,7 @@ class LaboratoryStage(PlayedSettings):
 
 
 class ImportStage(SimulationStage):
-    """Recordings that are brought into the frame of the body."""
+    """Recordings that are transformed into the frame of the body."""
 
     simulation: MaterialSettings
     markers: MarkerSettings
@@ -108,7 +107,7 @@ class ImportStage(SimulationStage):
 
 
 class LearningStage(SimulationStage):
-    """What all stages of a split depend on."""
+    """Settings of all stages of a split."""
 
     simulation: MaterialSettings
     markers: MarkerSettings | None
@@ -139,7 +138,7 @@ class ReconstructStage(LearningStage):
 
 
 class NetworkStage(LearningStage):
-    """What all stages with networks depend on."""
+    """Settings of all stages with networks."""
 
     actuation: ActuationSettings
     range_guard: bool
@@ -161,7 +160,7 @@ class RefineStage(NetworkStage):
 
 
 class TestStage(NetworkStage):
-    """What all stages that roll models out depend on."""
+    """Settings of all stages with roll-outs of models."""
 
     groups: dict[str, Many[str]]  # names of the test trials by scale of the inputs, ``1`` first
     refined: bool  # whether networks were trained further through the simulator
@@ -183,7 +182,7 @@ class TimeStage(TestStage):
 
 
 class MeshCheckStage(TestStage):
-    """What a finer mesh changes."""
+    """Comparison with a finer mesh."""
 
     mesh_check: float
 
@@ -206,7 +205,7 @@ class PlanStage(LearningStage):
 
 
 class BaselinesStage(LearningStage):
-    """Controllers that know no simulator."""
+    """Controllers without a simulator."""
 
     model: str  # of the robot
     figures: FigureSettings
@@ -230,7 +229,7 @@ class MotionStage(SimulationStage):
 
 
 class DrawSettings(Settings):
-    """Sets of markers that are drawn."""
+    """Random sets of markers."""
 
     counts: Many[int]
     draws: int
@@ -247,7 +246,7 @@ class AblationStage(SimulationStage):
 
 
 class ReportStage(Settings):
-    """A report; it shows the whole configuration."""
+    """A report, which shows the whole configuration."""
 
     config: RunSettings
 

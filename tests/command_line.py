@@ -37,6 +37,13 @@ def outcome(*arguments: object) -> Outcome:
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
+def refusal(*arguments: object) -> str:
+    """The sentence with which a command refuses its arguments."""
+    ended = outcome(*arguments)
+    assert ended.code == 2, ended.out
+    return ended.err
+
+
 def configuration(name: str, *overrides: str) -> dict:
     """A configuration of the package as plain data."""
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):

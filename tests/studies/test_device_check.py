@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from command_line import outcome, settings_of
+from command_line import outcome, refusal, settings_of
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.device_check import DeviceCheck, bounded, experiment_checks, trajectory_checks
@@ -42,9 +42,8 @@ def test_an_experiment_that_fails_is_a_failed_check(folder):
     settings = settings_of(DeviceCheck, "verify_device", *overrides)
     (check,) = experiment_checks(settings.check, "cpu", folder)
     assert not check.passed
-    assert "trainer.epochs is 0" in check.found
+    assert "trainer.epochs is 0" in check.result
 
 
 def test_a_device_that_is_not_there(folder):
-    ended = outcome("verify", "device", "device=tpu")
-    assert (ended.code, ended.err) == (2, "error: device is 'tpu': choose auto, cpu or cuda.\n")
+    assert refusal("verify", "device", "device=tpu") == "error: device is 'tpu': choose auto, cpu or cuda.\n"

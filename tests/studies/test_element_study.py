@@ -1,7 +1,7 @@
 """The table of elements."""
 
 import pytest
-from command_line import outcome
+from command_line import outcome, refusal
 
 
 def test_table(folder):
@@ -18,6 +18,4 @@ def test_table(folder):
 
 
 def test_too_fine(folder):
-    ended = outcome("benchmark", "elements", "finest=9")
-    assert ended.code == 2
-    assert "finest is 9" in ended.err
+    assert "finest is 9" in refusal("benchmark", "elements", "finest=9")

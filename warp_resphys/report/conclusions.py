@@ -117,17 +117,15 @@ def gains(
         if model not in errors or base is None:
             continue
         compared = model in _LEARNED and {model, base} <= theirs.keys()
-        beside = _beside(theirs[base].mean, theirs[model].mean) if compared else ""
+        beside = ""
+        if compared:
+            ratio = theirs[model].mean / theirs[base].mean
+            beside = f"; published: {100.0 * abs(1.0 - ratio):.1f} % {'less' if ratio <= 1.0 else 'more'}"
         sentence = _gain(name, _BASES[base], errors[model], errors[base], list(epochs.get(model, ())), beside)
         sentences.append(sentence[0].upper() + sentence[1:])
     if sentences and all(len(values) == 1 for values in errors.values()):
         sentences.append("These gains rest on one held-out trial, and others may differ: test on more.")
     return sentences
-
-
-def _beside(before: float, after: float) -> str:
-    """The published gain."""
-    return f"; published: {100.0 * abs(1.0 - after / before):.1f} % {'less' if after <= before else 'more'}"
 
 
 def _gain(

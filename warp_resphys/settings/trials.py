@@ -172,6 +172,12 @@ class _Simulated(Settings):
     folds: Literal["leave_one_out"] | None = setting(None, "cross-validation in place of the split")
     limit: LimitSettings | None = setting(None, "fewer trials, evenly chosen")
 
+    @property
+    def amounts(self) -> AmountSettings:
+        """Parameters of the trials, by split."""
+        (amounts,) = (value for _, value in self if isinstance(value, AmountSettings))
+        return amounts
+
 
 class ReleaseFromLoad(_Simulated):
     """Bodies that are released from rest under weights."""
@@ -179,11 +185,6 @@ class ReleaseFromLoad(_Simulated):
     kind: Literal["release_from_load"]
     load: PlaceSettings = setting(description="vertices that carry the weights, in equal shares")
     weights_g: AmountSettings = setting(description="weights", unit="g")
-
-    @property
-    def amounts(self) -> AmountSettings:
-        """Configured values, by split."""
-        return self.weights_g
 
 
 class ReleaseFromTwist(_Simulated):
@@ -193,11 +194,6 @@ class ReleaseFromTwist(_Simulated):
     twist_axis: Axis = setting(description="along which the angle grows linearly, from zero at the low end")
     angles_deg: AmountSettings = setting(description="of the high end", unit="degrees")
 
-    @property
-    def amounts(self) -> AmountSettings:
-        """Configured values, by split."""
-        return self.angles_deg
-
 
 class MovingBase(_Simulated):
     """Bodies whose base moves."""
@@ -205,11 +201,6 @@ class MovingBase(_Simulated):
     kind: Literal["moving_base"]
     base_motion: MotionSettings = setting(description="motion that is multiplied by the amplitudes")
     amplitudes: AmountSettings = setting(description="factors of the motion")
-
-    @property
-    def amounts(self) -> AmountSettings:
-        """Configured values, by split."""
-        return self.amplitudes
 
 
 SimulatedData = ReleaseFromLoad | ReleaseFromTwist | MovingBase

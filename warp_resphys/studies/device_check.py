@@ -58,8 +58,8 @@ class Check(NamedTuple):
     """A comparison and its outcome."""
 
     name: str
-    found: str
-    asked: str
+    result: str
+    expected: str
     passed: bool
 
 
@@ -78,9 +78,9 @@ class CheckGroup:
 
     def sheet(self, title: str) -> Sheet:
         """The checks as a table."""
-        rows = [[check.name, check.found, check.asked, "passed" if check.passed else "FAILED"] for check in self.checks]
+        rows = [[c.name, c.result, c.expected, "passed" if c.passed else "FAILED"] for c in self.checks]
         failed = [number for number, check in enumerate(self.checks) if not check.passed]
-        return Sheet(title, ["check", "found", "asked", ""], rows, failed, note=f"{self.seconds:.0f} s")
+        return Sheet(title, ["check", "result", "expected", ""], rows, failed, note=f"{self.seconds:.0f} s")
 
 
 def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "") -> Check:

@@ -136,7 +136,9 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         errors = result.errors_mm
         cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
         cells += [Cell(_gain_text(gain)) for gain in result.gains.values()]
-        cells += [Cell(_coverage(result.intervals)), Cell(duration_text(result.seconds))]
+        held = result.intervals
+        coverage = f"{100.0 * held['coverage']:.0f} % (± {held['half_width_mm']:.2g} mm)" if held is not None else NONE
+        cells += [Cell(coverage), Cell(duration_text(result.seconds))]
         small = [robots[name].actuation, *result.beyond, *([f"failed since {result.day}"] if name in failed else [])]
         rows.append(Row(robots[name].title, cells, small="; ".join(small)))
     note = (
@@ -156,13 +158,6 @@ def _gain_text(gain: Share | None) -> str:
         return NONE
     share, *ends = (f"{100.0 * value:.0f}".replace("-", MINUS) for value in (gain.share, gain.lower, gain.upper))
     return f"{share} %" if gain.trials == 1 else f"{share} % ({' to '.join(ends)})"
-
-
-def _coverage(intervals: Mapping[str, Any] | None) -> str:
-    """Coverage of the prediction intervals of the learned force, and their mean half-width."""
-    if intervals is None:
-        return NONE
-    return f"{100.0 * intervals['coverage']:.0f} % (± {intervals['half_width_mm']:.2g} mm)"
 
 
 def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -> Part:

@@ -117,14 +117,12 @@ class Reproduction(Settings):
         """
         wanted = set(self.only or ())
         chosen = [name for name in self.robots if {ROBOTS, name} & wanted]
-        absent = [name for name in chosen if not self._can_run(name)]
+        recorded = [name for name in chosen if self.robots[name].recordings is not None]
+        absent = [name for name in recorded if self.data is None or not self._place(name).is_dir()]
         if chosen and len(absent) == len(chosen):
             where = ", ".join(str(self.robots[name].recordings) for name in absent)
             raise InputError(f"data is {self.data}, where there is none of {where}: give the folder with recordings.")
         return [name for name in chosen if name not in absent], absent
-
-    def _can_run(self, name: str) -> bool:
-        return self.robots[name].recordings is None or (self.data is not None and self._place(name).is_dir())
 
     def _place(self, name: str) -> Path:
         return Path(str(self.data)).expanduser() / str(self.robots[name].recordings)

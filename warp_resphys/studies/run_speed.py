@@ -1,4 +1,4 @@
-"""Speed of what a run was made for, for the benchmark: its environments, and its controllers that plan at each step."""
+"""Speed of the environments and of the receding-horizon controllers of a run, for the benchmark."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -29,19 +29,21 @@ from .timing import median_seconds
 if TYPE_CHECKING:
     from ..environments.vector import RobotVectorEnv
 
-_ACTIONS: Final = 5  # of environments, in a repeat
-_WARM_UP: Final = 5  # commands that are not counted
-_COMMANDS: Final = 60  # of a repeat, at most
+_ACTIONS: Final = 5  # in a repeat
+_WARM_UP: Final = 5  # commands that are not timed
+_COMMANDS: Final = 60  # largest number in a repeat
 
 
 def time_environments(run: Path, counts: Sequence[int], repeats: int, device: str) -> list[dict[str, Any]]:
-    """Rows with ``world``, ``robots``, ``ms`` of an action of all of them, and ``actions_s`` and ``steps_s`` a second.
+    """Times environments with random actions of the task reach, where an action is several steps of the simulation.
 
-    Robots do the task reach, their actions are random, and an action is several steps of the simulation. The reduced
-    world is timed where the run has a reduced model, the laboratory where there is one.
+    The reduced world and the laboratory are timed if the run has them.
+
+    Returns:
+        Rows with ``world``, ``robots``, ``ms`` of an action of all robots, and ``actions_s`` and ``steps_s`` a second.
 
     Raises:
-        InputError: Gymnasium is not installed, or the folder has no run that is driven.
+        InputError: Gymnasium is not installed, or the folder has no run of a driven robot.
         DataFileError: the folder has no run that can be loaded.
     """
     try:
@@ -58,8 +60,7 @@ def time_environments(run: Path, counts: Sequence[int], repeats: int, device: st
             robots = make_vector("reach", run, count, world=world, spread=0.0, seconds=100.0, device=place)
             robots.reset(seed=0)
             robots.step(np.zeros((count, robots.world.parts), dtype=np.float32))  # loads kernels and makes buffers
-            act = partial(_act, robots, np.random.default_rng(0))
-            seconds = median_seconds(act, repeats) / _ACTIONS
+            seconds = median_seconds(partial(_act, robots, np.random.default_rng(0)), repeats) / _ACTIONS
             rate = count / seconds
             speeds = {"ms": 1e3 * seconds, "actions_s": rate, "steps_s": rate * robots.frames}
             rows.append({"world": world, "robots": count, **speeds})
@@ -83,13 +84,14 @@ def environment_sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
 
 
 def time_commands(run: Path, repeats: int) -> list[dict[str, Any]]:
-    """Rows with ``controller``, ``horizon_s``, and ``ms`` and ``largest_of_20_ms`` of a command, all on one thread.
+    """Times commands of the receding-horizon controllers on one thread, with markers as predicted by the model.
 
-    The controllers follow the motions of the run in turn; the markers that they see are where the model predicts them.
-    The last row, ``full simulator``, is one simulation of the horizon, under the planned inputs, for comparison.
+    Returns:
+        Rows with ``controller``, ``horizon_s``, and ``ms`` and ``largest_of_20_ms`` of a command. The last row, ``full
+        simulator``, is a simulation of the horizon under the planned inputs, for comparison.
 
     Raises:
-        DataFileError: the folder has no run whose stage drive is done.
+        DataFileError: the folder has no run with a finished stage drive.
     """
     settings = driven_settings(run)
     control = settings.control
@@ -111,15 +113,15 @@ def time_commands(run: Path, repeats: int) -> list[dict[str, Any]]:
         {
             "controller": name,
             "horizon_s": horizon,
-            "ms": 1e3 * float(np.median(taken)),
-            "largest_of_20_ms": 1e3 * float(np.quantile(taken, 0.95)),
+            "ms": 1e3 * float(np.median(durations)),
+            "largest_of_20_ms": 1e3 * float(np.quantile(durations, 0.95)),
         }
-        for name, taken in seconds.items()
+        for name, durations in seconds.items()
     ]
 
 
 def _command_seconds(controller: Controller, plan: PlannedMotion) -> list[float]:
-    """Seconds of each command of a motion, once the controller is warm."""
+    """Durations [s] of the commands of a motion, without the first ones."""
     seen = plan.markers.reshape(len(plan.markers), -1, 3)
     count = min(len(plan.inputs), _WARM_UP + _COMMANDS)
     return [timed_command(controller, number, seen[number])[1] for number in range(count)][_WARM_UP:]
@@ -127,7 +129,7 @@ def _command_seconds(controller: Controller, plan: PlannedMotion) -> list[float]
 
 @torch.no_grad()
 def _rollout_seconds(robot: Robot, inputs: NDArray[np.float64]) -> float:
-    """Seconds that the full simulator takes for a motion under inputs (T, n)."""
+    """Duration [s] of a simulation of the full model under inputs (T, n)."""
     state, given = robot.begin(), dict[str, Any]({driven_input(robot).name: inputs})
     began = time.perf_counter()
     robot.rollout(state, len(inputs), **given)

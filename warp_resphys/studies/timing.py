@@ -1,7 +1,7 @@
-"""Clocks for the studies of speed: medians over repeats, roll-outs with their gradients, steps, and new processes.
+"""Timing for the studies of speed: medians over repeats, roll-outs with gradients, steps, and new processes.
 
-Machines differ, and so does one machine from minute to minute. Cases therefore take turns, medians are reported, and a
-fixed task of LAPACK, the *yardstick*, takes its turn with them: times divided by the yardstick's can be compared.
+The speed of a machine varies with time. Cases therefore take turns, medians are reported, and a fixed task of LAPACK,
+the *yardstick*, is timed with them, so that times relative to the yardstick can be compared between machines.
 """
 
 import json
@@ -35,14 +35,14 @@ print(json.dumps([imported, {name}(json.load(sys.stdin))]))
 
 
 def now(device: torch.device = CPU) -> float:
-    """Seconds on a clock, once the device has finished its work."""
+    """Time [s] after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def median_seconds(task: Callable[[], object], repeats: int, device: torch.device = CPU) -> float:
-    """Median of the seconds that a task takes on a device."""
+    """Median duration [s] of a task on a device."""
     seconds = []
     for _ in range(repeats):
         began = now(device)
@@ -52,7 +52,7 @@ def median_seconds(task: Callable[[], object], repeats: int, device: torch.devic
 
 
 def yardstick_seconds() -> float:
-    """Seconds of a product and a Cholesky factor of 480 x 480 matrices in NumPy on one thread, the median of five."""
+    """Median duration [s] of a product and a Cholesky factor of 480 x 480 matrices in NumPy, on one thread."""
     n = _YARDSTICK_SIZE
     random = np.random.default_rng(0).standard_normal((n, n))
     with threadpool_limits(1):
@@ -61,7 +61,7 @@ def yardstick_seconds() -> float:
 
 @dataclass
 class TimedRollout:
-    """A roll-out that is repeated, with the gradient of its last state's squares."""
+    """A repeated roll-out, with the gradient of the sum of squares of its last state."""
 
     simulator: Simulator
     start: State
@@ -69,44 +69,44 @@ class TimedRollout:
     inputs: Inputs = field(default_factory=Inputs)
     forward: list[float] = field(default_factory=list)  # [s] of each roll-out
     backward: list[float] = field(default_factory=list)  # [s] of each gradient
-    iterations: float = 0.0  # mean a step, in the last roll-out
-    factorisations: float = 0.0  # mean a step, in the last roll-out
+    iterations: float = 0.0  # mean over the steps of the last roll-out
+    factorisations: float = 0.0  # mean over the steps of the last roll-out
 
     def measure(self, parameters: Mapping[str, torch.Tensor] | None = None) -> None:
-        """Times one more roll-out and gradient, by the start and by those inputs and parameters that require one."""
-        device, given = self.start.q.device, [*self.inputs.fields.values(), *(parameters or {}).values()]
+        """Times a roll-out and its gradient with respect to the start, and inputs and parameters that require one."""
+        device, others = self.start.q.device, [*self.inputs.fields.values(), *(parameters or {}).values()]
         q, v = (tensor.clone().requires_grad_(True) for tensor in (self.start.q, self.start.v))
         began = now(device)
         trajectory = self.simulator.rollout(State(q, v), self.steps, self.inputs, parameters)
         self.forward.append(now(device) - began)
         loss = trajectory.q[-1].square().sum() + trajectory.v[-1].square().sum()
         began = now(device)
-        torch.autograd.grad(loss, [q, v, *(tensor for tensor in given if tensor.requires_grad)])
+        torch.autograd.grad(loss, [q, v, *(tensor for tensor in others if tensor.requires_grad)])
         self.backward.append(now(device) - began)
         self.iterations = float(np.mean([r.iterations.double().mean().item() for r in trajectory.reports]))
         self.factorisations = float(np.mean([r.factorisations.double().mean().item() for r in trajectory.reports]))
 
     @property
     def unknowns(self) -> int:
-        """Coordinates of the free vertices of one environment."""
+        """Number of coordinates of the free vertices of one environment."""
         return 3 * (self.simulator.body.n_vertices - len(self.simulator.fixed))
 
     def a_step(self, statistic: Callable[[list[float]], float]) -> tuple[float, float]:
-        """A statistic of the seconds forward and backward, of one step of the whole batch."""
+        """A statistic of the durations [s] of a step of the whole batch, forward and backward."""
         return statistic(self.forward) / self.steps, statistic(self.backward) / self.steps
 
 
 def step_time(simulator: Simulator, start: State, inputs: Sequence[Inputs], repeats: int) -> dict[str, float]:
-    """Processor time and solver iterations of a step, in the mean over a roll-out.
+    """Mean processor time and solver iterations of the steps of a roll-out.
 
     Args:
-        simulator: that steps.
+        simulator: of one environment.
         start: of the roll-out.
         inputs: of each step.
-        repeats: of the roll-out, after a first one that is not timed.
+        repeats: number of roll-outs, after a first one that is not timed.
 
     Returns:
-        ``step_ms``, the mean over the steps of their medians over the repeats [ms], and ``iterations``.
+        ``step_ms``, the mean over steps of the median over repeats [ms], and ``iterations``.
     """
     times = np.empty((1 + repeats, len(inputs)))  # [ms]
     iterations = []
@@ -125,20 +125,20 @@ def step_time(simulator: Simulator, start: State, inputs: Sequence[Inputs], repe
 def run_in_new_process(
     function: Callable[[Any], Any], argument: Any, timeout: float | None = None, environment: Mapping[str, str] = {}
 ) -> tuple[float, Any]:
-    """Calls a function of a module in a process of its own, so that its imports, kernels and memory are its own.
+    """Calls a function in a new process, with its own imports, kernels and memory.
 
     Args:
         function: of a module.
-        argument: plain data that JSON can write.
-        timeout: seconds after which the process is ended.
-        environment: variables that the process has beside those of this one.
+        argument: plain data for JSON.
+        timeout: after which the process is killed [s].
+        environment: additional environment variables.
 
     Returns:
-        Seconds that importing the module took, and what the function returned, as JSON reads it.
+        Duration of importing the module [s], and the returned value, converted through JSON.
 
     Raises:
-        TimeoutError: it took longer than ``timeout``.
-        RuntimeError: the process failed; the message is that of its error.
+        TimeoutError: the process took longer than ``timeout``.
+        RuntimeError: the process failed, with the message of its error.
     """
     code = _CHILD.format(module=function.__module__, name=function.__name__)
     try:

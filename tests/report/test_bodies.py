@@ -96,7 +96,7 @@ def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
     left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))
     assert middle == 0
     assert min(left, right) > 500
-    inked = [int((each[: int(0.9 * len(each))].min(axis=2) < 0.95).sum()) for each in (longer, plain)]
+    inked = [int((picture[: int(0.9 * len(picture))].min(axis=2) < 0.95).sum()) for picture in (longer, plain)]
     assert inked[0] < 0.9 * inked[1]  # the picture reaches as far, so that the body is smaller in it
 
 

@@ -15,7 +15,7 @@ X, Y, Z = np.eye(3)
 def test_letters_can_be_read_and_what_is_up_is_above(plane, gravity):
     axes = path_axes(np.stack(plane), gravity)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    right, up = (axes[:2] @ each for each in plane)
+    right, up = (axes[:2] @ direction for direction in plane)
     assert right[0] > 0.9  # Neither mirrored nor turned:
     assert up[1] > 0.5
     assert right[0] * up[1] - right[1] * up[0] > 0.5
@@ -55,8 +55,8 @@ def test_a_trail_ends_where_the_point_is(step, slower, frames, fps):
         assert (np.diff(trail.points[..., 0], axis=1) >= 0.0).all()  # Nothing beyond where the point is.
         np.testing.assert_allclose(trail.points[-1, -2:], points[[-1, -1]])
         np.testing.assert_allclose(body.points[:, 0], every)
-        for each in (path, trail, *drawing):
-            seen = (each.points.reshape(-1, 3) - view.focus) @ view.axes[:2].T
+        for layer in (path, trail, *drawing):
+            seen = (layer.points.reshape(-1, 3) - view.focus) @ view.axes[:2].T
             assert np.abs(seen[:, 0]).max() < view.half_height * scene.size[0] / scene.size[1]
             assert np.abs(seen[:, 1]).max() < view.half_height
 
@@ -65,7 +65,7 @@ def test_the_drawing_is_the_path_enlarged_beside_the_body():
     shown = bodies(0.01, 101)
     for view in shown.film().views:
         body, _, path, trail, ball, larger_path, larger_trail, larger_ball = (
-            each.points.reshape(-1, 3) @ view.axes[:2].T for each in view.layers
+            layer.points.reshape(-1, 3) @ view.axes[:2].T for layer in view.layers
         )
         factors = [
             np.ptp(large, axis=0)[0] / np.ptp(small[:, 0])

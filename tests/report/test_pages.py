@@ -201,10 +201,10 @@ class TestArms:
         write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
         monkeypatch.setattr(stage, "write_report", lambda _, data: shown.append(data))
         stage.make_report(StageContext("report", tmp_path, "", ReportStage(config=settings)))
-        (found,) = shown
-        sagged = found.mesh.vertices[:, 2].min() - found.recordings.mesh.vertices[:, 2].min()
+        (page_data,) = shown
+        sagged = page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()
         assert sagged == pytest.approx(0.004, abs=1e-6)
-        nominal = dict(zip(found.recordings.labels, found.recordings.nominal[:, 2], strict=True))
+        nominal = dict(zip(page_data.recordings.labels, page_data.recordings.nominal[:, 2], strict=True))
         assert nominal["Base - 1"] == BASE["Base - 1"][2]
         for label, moved in (("Ring 3 - 1", -0.004), ("Ring 1 - 1", -0.001)):
             assert nominal[label] - settings.markers.tracked[label][2] == pytest.approx(moved, abs=3e-4)
@@ -263,7 +263,7 @@ class TestBeams:
         write_recordings(tmp_path)
         write_split(tmp_path, ["bare", "load52"], models=("simulation", "sysid_elastic", "sysid", "resphys"))
         errors = read_json(tmp_path / "errors.json")
-        for row in (errors["errors_mm"], *(each["errors_mm"] for each in errors["per_trajectory"])):
+        for row in (errors["errors_mm"], *(trial["errors_mm"] for trial in errors["per_trajectory"])):
             row["resphys"] = row["sysid"]
         write_json(tmp_path / "errors.json", errors)
         history = read_json(tmp_path / "training_resphys.json")
@@ -319,17 +319,17 @@ class TestBeams:
 
     def test_the_trial_that_fits_worst_is_drawn(self, tmp_path):
         write_recordings(tmp_path)
-        found = read_recordings(tmp_path, BEAM, box_hexahedra(divisions=(3, 1, 1)), {})
-        assert found.drawn == "load101"
-        assert found.outliers == ("Base - 3",)
-        assert found.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
-        assert found.nominal[0].tolist() == TRACKED["Tip - 1"]
-        np.testing.assert_allclose(found.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
+        recordings = read_recordings(tmp_path, BEAM, box_hexahedra(divisions=(3, 1, 1)), {})
+        assert recordings.drawn == "load101"
+        assert recordings.outliers == ("Base - 3",)
+        assert recordings.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
+        assert recordings.nominal[0].tolist() == TRACKED["Tip - 1"]
+        np.testing.assert_allclose(recordings.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
 
     def test_trials_in_order_of_their_errors(self, tmp_path):
         write_recordings(tmp_path)
         write_split(tmp_path, list(TRIALS), models=("simulation", "resphys"))
         trials = read_trials(tmp_path, BEAM)
-        assert [trials.names[each] for each in best_and_worst(trials)] == ["load101", "bare"]
+        assert [trials.names[row] for row in best_and_worst(trials)] == ["load101", "bare"]
         write_split(tmp_path, list(TRIALS), models=("simulation", "resphys"), diverged=("resphys",))
         assert best_and_worst(read_trials(tmp_path, BEAM))[0] == 0

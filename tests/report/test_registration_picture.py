@@ -35,8 +35,8 @@ def test_markers_are_drawn_where_labels_and_rings_are_put():
         colours = matplotlib.colors.rgb_to_hsv(pixels / 255.0)
         rows, columns = np.nonzero((np.abs(colours[..., 0] - ball[0]) < 0.03) & (colours[..., 1] > 0.6))
         expected = (panel.project(marker[0]) - low) / (high - low) * [width, height]
-        found = np.array([columns.mean() + 0.5, height - rows.mean() - 0.5])
-        np.testing.assert_allclose(found, expected, rtol=0, atol=2.0)
+        drawn = np.array([columns.mean() + 0.5, height - rows.mean() - 0.5])
+        np.testing.assert_allclose(drawn, expected, rtol=0, atol=2.0)
         assert np.ptp(columns) == pytest.approx(2 * 0.003 * width / (high - low)[0], rel=0.25)
 
 
@@ -45,9 +45,9 @@ def test_picture_with_an_outlier_and_a_marker_that_was_not_seen(tmp_path):
     measured = POINTS.copy()
     measured[1] += [0.02, 0.0, 0.03]
     measured[4] = np.nan
-    found = register_markers(measured, POINTS, NAMES, source="swing.c3d", largest_residual=0.002)
+    registered = register_markers(measured, POINTS, NAMES, source="swing.c3d", largest_residual=0.002)
     fixed = select_vertices(MESH, x=0.0)
-    drawn = (found.names, found.positions, 1e3 * found.residual, found.outliers)
+    drawn = (registered.names, registered.positions, 1e3 * registered.residual, registered.outliers)
     draw_registration(tmp_path / "beam.png", Recordings({}, {}, "Beam", *drawn, POINTS, POINTS, MESH), fixed)
     picture = imread(tmp_path / "beam.png")[..., :3]
     blue = np.all(np.abs(picture - matplotlib.colors.to_rgb(registration_picture.NOMINAL)) < 0.05, -1)

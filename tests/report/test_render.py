@@ -22,7 +22,7 @@ VIEWER = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
 def draw(mesh: Mesh, errors: np.ndarray, count: int = 1) -> list[np.ndarray]:
     """(H, W, 4) pictures of the undeformed body, with (N,) errors [m] along x."""
     target = mesh.vertices - errors[:, None] * [1.0, 0.0, 0.0]
-    bodies = {str(each): mesh.vertices for each in range(count)}
+    bodies = {str(number): mesh.vertices for number in range(count)}
     assert [*largest_distances(mesh, bodies, target).values()] == pytest.approx([errors.max()] * count, rel=1e-6)
     return drawn(mesh, bodies, target)
 

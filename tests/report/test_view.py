@@ -61,9 +61,9 @@ def test_what_the_script_reads_are_the_bodies(every_vertex):
     for place, q in zip(places, motion.positions.values(), strict=True):
         np.testing.assert_allclose(place, q[:, surface], atol=2.5e-4 * 0.1)
     expected = target if every_vertex else motion.measured
-    found = motion.positions if every_vertex else motion.markers
+    compared = motion.positions if every_vertex else motion.markers
     for model, name in zip(data["models"], motion.positions, strict=True):
-        away = 1e3 * np.linalg.norm(found[name] - expected, axis=2)
+        away = 1e3 * np.linalg.norm(compared[name] - expected, axis=2)
         drawn = np.isfinite(motion.positions[name]).all(axis=(1, 2))
         assert model["largest"] == pytest.approx(away[drawn].max(), rel=1e-3)
         means = np.array([np.nan if mean is None else mean for mean in model["means"]])
@@ -80,20 +80,20 @@ def test_a_basis_is_as_small_as_it_may_be():
     shapes, weights = random.normal(size=(3, 30)), random.normal(size=(2, 20, 3))
     displacements = (weights @ shapes).reshape(2, 20, 10, 3)
     displacements[1, 7:] = np.nan
-    basis, found = reduced(displacements, 1e-9, 20)
+    basis, weights = reduced(displacements, 1e-9, 20)
     assert basis.shape == (3, 30)
-    np.testing.assert_allclose((found @ basis).reshape(2, 20, 10, 3), displacements, atol=1e-9)
-    basis, found = reduced(displacements, 1e9, 20)  # Whatever moves so little still says where it is known.
+    np.testing.assert_allclose((weights @ basis).reshape(2, 20, 10, 3), displacements, atol=1e-9)
+    basis, weights = reduced(displacements, 1e9, 20)  # Whatever moves so little still says where it is known.
     np.testing.assert_array_equal(basis, np.zeros((1, 30)))
-    assert np.isfinite(found[0]).all()
-    assert np.isnan(found[1, 7:]).all()
+    assert np.isfinite(weights[0]).all()
+    assert np.isnan(weights[1, 7:]).all()
     assert reduced(displacements, 0.0, 2)[0].shape == (2, 30)
 
 
 @pytest.fixture(scope="module")
 def browser():
-    with browser_of_tests() as found:
-        yield found
+    with browser_of_tests() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module", params=RUNS)
@@ -217,6 +217,6 @@ def test_a_browser_without_webgl_says_so(browser, page):
 
 
 def test_the_page_stays_small(page):
-    found = Page(page)
-    assert sum(len(data) for data in found.data) < 1_000_000
-    assert len(found.scripts[0]) < 25_000
+    written = Page(page)
+    assert sum(len(data) for data in written.data) < 1_000_000
+    assert len(written.scripts[0]) < 25_000

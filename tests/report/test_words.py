@@ -44,7 +44,7 @@ def summary(mean, diverged=0):
 
 def said_of(model, sentences):
     name = {"sysid": "Identification (SysID)", "resphys": "The learned force (ResPhys)"}[model]
-    (only,) = [each for each in sentences if each.startswith(name)]
+    (only,) = [sentence for sentence in sentences if sentence.startswith(name)]
     return only
 
 
@@ -167,7 +167,7 @@ def test_conclusions_of_folds_and_of_one_split():
     assert "leaves 45 % (90 %: 40 to 50) less" in said_of("sysid", sentences)
     assert "In 1 of 2 folds no epoch of its training was kept." in said_of("resphys", sentences)
     for said in ("In 1 of 2 folds, youngs_modulus", "In 2 of 2 folds, poissons_ratio"):
-        assert any(each.startswith(said) for each in sentences)
+        assert any(sentence.startswith(said) for sentence in sentences)
     alone = conclusions(metrics["folds"]["a"], SETTINGS)
     assert "leaves 50 % less" in said_of("sysid", alone)
     assert "adds nothing to SysID" in said_of("resphys", alone)
@@ -176,12 +176,12 @@ def test_conclusions_of_folds_and_of_one_split():
 
 def test_intervals_are_those_of_the_best_model():
     own = {"half_width_mm": 3.0, "coverage": 0.87}
-    found = {"level": 0.9, "calibrated_on": "validation", "models": {"sysid": own}}
-    (said,) = intervals_text({"intervals": found})
+    intervals = {"level": 0.9, "calibrated_on": "validation", "models": {"sysid": own}}
+    (said,) = intervals_text({"intervals": intervals})
     assert "± 3 mm" in said
     assert "SysID" in said
     assert said.endswith("87 % do.")
-    assert intervals_text({"intervals": {**found, "models": {}}}) == intervals_text({}) == []
+    assert intervals_text({"intervals": {**intervals, "models": {}}}) == intervals_text({}) == []
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_trials_out_of_range_are_counted_where_they_belong():
             "1.25": {"resphys": none, "simfree": none},
         },
     }
-    free, force = (each.replace(NO_BREAK_SPACE, " ") for each in range_texts(metrics, ["a", "b", "c"]))
+    free, force = (text.replace(NO_BREAK_SPACE, " ") for text in range_texts(metrics, ["a", "b", "c"]))
     assert free.startswith("SimFree: none of 3 roll-outs")
     assert "higher" not in free
     assert "ResPhys: 2 of 3 roll-outs left the training range, the first after 1.00 s (a)." in force
@@ -297,11 +297,11 @@ def test_what_of_the_errors_is_mesh():
 
 
 def test_numbers_have_sensible_digits():
-    shown = [number_text(each) for each in (4.48812, 0.000721, 0.0, None)]
+    shown = [number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
     assert shown == ["4.488", "0.00072", "0.000", "diverged"]
     assert number_text(2.14e-9) == "2.1 \N{MULTIPLICATION SIGN} 10⁻⁹"
     deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
     assert error_parts(deviating) == ("0.00072", "± 0.00031")
     assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
-    shown = [duration_text(each) for each in (0.421, 12.34, 59.97, 184.6)]
+    shown = [duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]

@@ -57,8 +57,8 @@ def swing_of(recording, tip=TIP, largest_residual=1e-3, release_frame=None):
 
 def recorded(displacement, release):
     """A recording, in the laboratory's frame, of tip markers held still, then displaced (T, 3, 3) [m]."""
-    tip = np.array([each.position for each in TIP])
-    base = np.array([each.position for each in BASE])
+    tip = np.array([marker.position for marker in TIP])
+    base = np.array([marker.position for marker in BASE])
     moved = np.concatenate([np.zeros((release, 3, 3)), displacement])
     positions = np.concatenate([tip + moved, np.broadcast_to(base, moved.shape)], axis=1)
     noise = np.random.default_rng(0).normal(scale=5e-6, size=positions.shape)
@@ -145,7 +145,7 @@ def test_markers_in_the_wrong_order_are_noticed():
 def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch):
     """Release, registration, binding and estimators leave nothing of their own: the two swings are one."""
     config = configured("recording.path=swing.c3d", "simulation.time_step=0.01", "comparison.tail_seconds=0.5")
-    tip = np.array([each.position for each in TIP])
+    tip = np.array([marker.position for marker in TIP])
     truth = simulate_swing(config, tip, 2.2)
     recording = recorded(truth.displacement, release=50)
     labels = [marker.name for marker in (*config.markers.tip, *config.markers.base)]

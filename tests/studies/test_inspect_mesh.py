@@ -66,18 +66,18 @@ class TestOpenCavities:
 
     def test_an_arm_without_its_last_cap(self, arm):
         mesh, _ = arm
-        found = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
-        assert len(found) == 3
-        assert sorted(np.degrees(np.arctan2(each.centre[1], each.centre[0])) for each in found) == pytest.approx(
-            [-120.0, 0.0, 120.0], abs=1.0
-        )
-        assert all(3e-3 < each.area < 6e-3 for each in found)
+        cavities = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
+        assert len(cavities) == 3
+        assert sorted(
+            np.degrees(np.arctan2(cavity.centre[1], cavity.centre[0])) for cavity in cavities
+        ) == pytest.approx([-120.0, 0.0, 120.0], abs=1.0)
+        assert all(3e-3 < cavity.area < 6e-3 for cavity in cavities)
 
     def test_a_hole_in_a_wall(self, arm):
         mesh, _ = arm
         centres = mesh.vertices[mesh.cells].mean(axis=1)
-        (found,) = open_cavities(without(mesh, np.arange(len(centres)) == np.argmax(centres @ [1.0, 0.1, 0.0])))
-        assert found.centre == pytest.approx([0.014, 0.0, -0.065], abs=0.01)
+        (cavity,) = open_cavities(without(mesh, np.arange(len(centres)) == np.argmax(centres @ [1.0, 0.1, 0.0])))
+        assert cavity.centre == pytest.approx([0.014, 0.0, -0.065], abs=0.01)
 
 
 class TestNamedSurfaces:
@@ -120,8 +120,8 @@ class TestNamedSurfaces:
         cells = [("hexahedron", box.cells + 1), ("quad", left[::-1, ::-1] + 1)]
         sets = {"clamp": [np.empty(0, dtype=int), np.arange(len(left))]}
         meshio.write(tmp_path / "box.inp", meshio.Mesh(points, cells, cell_sets=sets))
-        found = read_surfaces(tmp_path / "box.inp", drop_unreferenced=True)
-        np.testing.assert_array_equal(found["clamp"], left)
+        surfaces = read_surfaces(tmp_path / "box.inp", drop_unreferenced=True)
+        np.testing.assert_array_equal(surfaces["clamp"], left)
         assert len(read_vertices(tmp_path / "box.inp")) == len(box.vertices) + 1
 
     def test_a_surface_within_the_body_is_refused(self, tmp_path, arm):

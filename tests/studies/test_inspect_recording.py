@@ -50,9 +50,9 @@ def test_table_and_files(tmp_path, path):
     assert any("tip is hidden for up to 20 frames; 20 frames are masked." in row for row in rows)
     assert any("base 1 jumps once, by 1.73 mm, in frame 90." in row for row in rows)
     assert "Released in frame 60." in text
-    found = json.loads((tmp_path / "out" / "quality.json").read_text())
-    assert found["release_frame"] == pytest.approx(60.4, abs=0.25)
-    assert found["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]
+    written = json.loads((tmp_path / "out" / "quality.json").read_text())
+    assert written["release_frame"] == pytest.approx(60.4, abs=0.25)
+    assert written["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]
     assert (tmp_path / "out" / "quality.png").read_bytes().startswith(b"\x89PNG")
 
 

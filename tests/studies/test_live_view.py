@@ -166,8 +166,8 @@ def test_a_command_serves_it(finished, folder, monkeypatch):
     pages = []
 
     def show(said):
-        if found := re.search(r"http://\S+", said):
-            pages.append(urlopen(found[0], timeout=30).read())
+        if address := re.search(r"http://\S+", said):
+            pages.append(urlopen(address[0], timeout=30).read())
 
     monkeypatch.setattr("warp_resphys.studies.view.show", show)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
@@ -196,25 +196,25 @@ def test_a_browser_drives_and_pulls_it(finished):
                 hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(0, -40)
                 hand.move_by_offset(0, -60).perform()
                 until(lambda: live.is_pulled)
-                found["pulled"] = True
+                observed["pulled"] = True
                 webdriver.ActionChains(browser).release().perform()
                 until(lambda: not live.is_pulled)
-                severe = [each["message"] for each in browser.get_log("browser") if each["level"] == "SEVERE"]
-                found["severe"] = [each for each in severe if "passive event listener" not in each]  # viser's own
+                severe = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+                observed["severe"] = [entry for entry in severe if "passive event listener" not in entry]  # viser's own
                 browser.find_element(By.XPATH, "//button[.='Pause']").click()
                 until(lambda: browser.find_elements(By.XPATH, "//button[.='Go on']"))
                 before = live.time
                 time.sleep(0.5)
-                found["paused"] = live.time == before
+                observed["paused"] = live.time == before
                 browser.find_element(By.XPATH, "//button[.='Reset']").click()
                 until(lambda: live.time == 0.0)
-                found["reset"] = True
+                observed["reset"] = True
             finally:
                 page.stop()
 
-        found = {}
+        observed = {}
         thread = threading.Thread(target=look)
         thread.start()
         page.run(120.0)  # In this thread, as from the command line.
         thread.join()
-    assert found == {"pulled": True, "severe": [], "paused": True, "reset": True}
+    assert observed == {"pulled": True, "severe": [], "paused": True, "reset": True}

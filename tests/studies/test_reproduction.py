@@ -52,9 +52,9 @@ def finished(tmp_path_factory):
 
 
 def metrics(root, experiment, variant):
-    found = root / "runs" / experiment
-    published = [path for path in found.iterdir() if "network=published" in path.name]
-    other = [path for path in found.iterdir() if path not in published]
+    folder = root / "runs" / experiment
+    published = [path for path in folder.iterdir() if "network=published" in path.name]
+    other = [path for path in folder.iterdir() if path not in published]
     (chosen,) = published if variant == "published_network" else other
     return json.loads((chosen / "metrics.json").read_text())
 
@@ -83,7 +83,7 @@ class TestPage:
             ("simfree", "SimFree", "0.035 ± 0.070"),
             ("resphys", r"\*\*ResPhys\*\*", "0.004 ± 0.010"),
         ):
-            cells = [" ".join(error_parts(each[model])).strip() for each in (ours, network)]
+            cells = [" ".join(error_parts(errors[model])).strip() for errors in (ours, network)]
             assert re.search(
                 rf"^\| {label} \| {published} \| {re.escape(cells[0])} \| {re.escape(cells[1])} \|$", text, re.M
             )
@@ -124,7 +124,7 @@ class TestPage:
 
 class TestPlan:
     def test_the_folders_are_those_of_the_ordinary_command(self):
-        runs = {each.name: each for each in plan('overrides=["seed=1"]', "runs=elsewhere")}
+        runs = {beam.name: beam for beam in plan('overrides=["seed=1"]', "runs=elsewhere")}
         assert runs["beam_twist/published_physics"].folder == Path("elsewhere/beam_twist/physics=published,seed=1")
         assert runs["beam_twist/published_physics"].arguments == (
             "experiment=beam_twist",
@@ -134,7 +134,7 @@ class TestPlan:
         assert plan()[0].folder == Path("runs/beam_oscillation/default")
 
     def test_every_configured_run_is_a_configuration(self):
-        assert [each.name for each in plan()] == [
+        assert [beam.name for beam in plan()] == [
             *(
                 f"{beam}/{variant}"
                 for beam in ("beam_oscillation", "beam_twist")
@@ -146,7 +146,7 @@ class TestPlan:
         assert all(configuration("config", *run.arguments)["budget"] == "quick" for run in runs)
 
     def test_only(self):
-        names = [each.name for each in plan("only=[marker_ablation,beam_twist/default]")]
+        names = [beam.name for beam in plan("only=[marker_ablation,beam_twist/default]")]
         assert names == ["beam_twist/default", "marker_ablation/default"]
 
     @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     """The signal reaches the reproduction alone; it hands it on to the run, which is out of reach of the terminal."""
     program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     program += "from warp_resphys.cli import main\nmain()"
-    arguments = [each for each in TINY if not each.startswith("overrides")]
+    arguments = [override for override in TINY if not override.startswith("overrides")]
     command = [sys.executable, "-c", program, "reproduce", *arguments, "only=[beam_oscillation/default]"]
     child = subprocess.Popen(
         command,
@@ -204,10 +204,10 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
         stderr=subprocess.PIPE,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
-    found = []
-    while not found and child.poll() is None:
+    checkpoints = []
+    while not checkpoints and child.poll() is None:
         time.sleep(0.01)
-        found = [*DEFAULT.glob("*/**/*.frames_*.safetensors")]
+        checkpoints = [*DEFAULT.glob("*/**/*.frames_*.safetensors")]
     child.send_signal(signal.SIGINT)
     err = child.communicate(timeout=100)[1]
     assert child.returncode == 130, err
@@ -215,4 +215,4 @@ def test_ctrl_c_stops_the_run_and_keeps_what_it_has(folder):
     assert "Traceback" not in err
     assert not Path("outputs/reproduce/beams/reproduction.html").exists()
     assert "interrupted in stage 'simulate'" in Path("outputs/reproduce/logs/beam_oscillation-default.log").read_text()
-    assert found[0].stat().st_size > 0
+    assert checkpoints[0].stat().st_size > 0

@@ -87,9 +87,9 @@ def searched(tmp_path_factory):
 
 class TestSearch:
     def test_what_it_leaves(self, searched):
-        found = {str(path.relative_to(searched / FOLDER)) for path in (searched / FOLDER).rglob("*") if path.is_file()}
+        names = {str(path.relative_to(searched / FOLDER)) for path in (searched / FOLDER).rglob("*") if path.is_file()}
         pages = {"tune.html", "tune.json", "trials.csv", "history.png", "importance.png", "settings.png"}
-        assert found == pages | {"study.journal", "study.lock", "results.lock"}
+        assert names == pages | {"study.journal", "study.lock", "results.lock"}
         rows = table(searched / FOLDER)
         assert [row["state"] for row in rows] == TRIALS * ["complete"]
         assert all(row["network.width"] in ("8", "16") for row in rows)
@@ -132,10 +132,10 @@ class TestSearch:
     def test_simfree_is_tuned_by_itself(self, folder, no_pictures):
         assert run(*SEARCH, IN_RUN, "tune.model=simfree", "tune.trials=2")[0] == 0
         assert not Path("run/reconstruction_resphys.h5").exists()
-        found = OmegaConf.load("configs/tuned/beam_oscillation_simfree.yaml")
-        assert set(found) == {"tuned", "simfree"}
+        option = OmegaConf.load("configs/tuned/beam_oscillation_simfree.yaml")
+        assert set(option) == {"tuned", "simfree"}
         best = json.loads(Path("run/tune/simfree/tune.json").read_text())["best"]
-        assert found.simfree.network.width == best["settings"]["network.width"]
+        assert option.simfree.network.width == best["settings"]["network.width"]
         assert run(*TINY, IN_RUN, "tuned=beam_oscillation_simfree", "network.width=12", "trainer.epochs=2")[0] == 0
         architectures = {
             name: read_checkpoint(f"run/{name}.safetensors", kind)
@@ -262,7 +262,7 @@ def at_work():
     journal = FOLDER / JOURNAL
     lines = journal.read_text().splitlines() if journal.exists() else []
     processes = [json.loads(line).get("user_attr", {}).get("process") for line in lines if line.endswith("}")]
-    return [int(each.partition(":")[2]) for each in processes if each]
+    return [int(process.partition(":")[2]) for process in processes if process]
 
 
 def table_has(count):
@@ -316,7 +316,7 @@ while (claim := study.claim()) is not None:
         assert study.claim() is None
         study.end(taken, 7.0, 1.0)
         study_in(tmp_path).end(left, 5.0, 1.0)  # a process that was only taken for dead changes nothing
-        assert [(each.number, each.state, each.error) for each in study.outcomes()] == [
+        assert [(trial.number, trial.state, trial.error) for trial in study.outcomes()] == [
             (0, "complete", 7.0),
             (1, "running", None),
             (2, "running", None),
@@ -330,8 +330,8 @@ while (claim := study.claim()) is not None:
         study.end(pruned, None, 1.0, TrialState.PRUNED)
         study.end(study.claim(), math.inf, 1.0)
         assert study.claim() is None
-        found = [(each.state, each.error) for each in study.outcomes()]
-        assert found == [("failed", None), ("pruned", 0.5), ("complete", math.inf)]
+        outcomes = [(trial.state, trial.error) for trial in study.outcomes()]
+        assert outcomes == [("failed", None), ("pruned", 0.5), ("complete", math.inf)]
         assert study_in(tmp_path, trials=3).claim().number == 3  # more can be asked for later
 
     def test_the_same_seed_tries_the_same_and_importance_finds_what_matters(self, tmp_path):

@@ -235,19 +235,19 @@ class RigidSettings(Settings):
 
 
 class PartSettings(Settings):
-    """Another mesh of the body, with cells of the same kind, which are a region of the part's name."""
+    """A further mesh of the body, with cells of the same kind, which form a region with the name of the part."""
 
     mesh: MeshSettings
     shift: Vector = setting((0.0, 0.0, 0.0), "from the coordinates of its own mesh", "m")
 
 
 class GlueSettings(Settings):
-    """Vertices that stay where they are in another region, whose cells theirs need not match; see `fem.rigid.Glue`."""
+    """Glue between regions whose cells do not match: vertices that follow another region, by `fem.rigid.Glue`."""
 
-    region: Word = setting(description="whose vertices follow")
-    at: PlaceSettings = setting(description="which of its vertices")
+    region: Word = setting(description="region with the glued vertices")
+    at: PlaceSettings = setting(description="vertices of this region")
     to: Word = setting(description="region that they follow")
-    tolerance: Positive = setting(1.0e-3, "distance from that region that still counts", "m")
+    tolerance: Positive = setting(1.0e-3, "largest distance from that region", "m")
 
 
 class ChamberSettings(Settings):
@@ -368,7 +368,7 @@ class BodySettings(Settings):
     mesh: MeshSettings
     physics: PhysicsSettings = PhysicsSettings()
     parts: dict[str, PartSettings] = setting({}, "further meshes; the cells of the first one are the region 'body'")
-    glued: Many[GlueSettings] = setting((), "what holds meshes that do not match together")
+    glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
     fixed: PlaceSettings = setting(description="fixed vertices")

@@ -1,6 +1,6 @@
 """Times the simulator: forward and backward steps, the parts of a step, the cold start, environments, controllers.
 
-The cases of a refinement take turns, and so does a yardstick: see `timing`.
+The cases of a refinement and the yardstick of `timing` take turns.
 """
 
 import tempfile

@@ -88,7 +88,7 @@ class Measured(Settings):
 
 
 def read_kept(path: Path | None) -> dict[str, Measured]:
-    """Results of earlier runs, by robot; nothing where there is no file.
+    """Results of earlier runs, by robot; empty without a file.
 
     Raises:
         InputError: the file was written by another version.

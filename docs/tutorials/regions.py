@@ -119,10 +119,10 @@ both = wr.Simulator(
     time_step=0.01,
 )
 fall = both.rollout(both.rest_state(), 10)
-height = fall.q[-1, 0, scene.place("cube"), 2].mean().item() - 0.01
+height = fall.q[-1, 0, scene.vertex_slice("cube"), 2].mean().item() - 0.01
 print(
     f"after 0.1 s the cube has fallen {-1e3 * height:.1f} mm, the tip of the beam "
-    f"{-1e3 * (fall.q[-1, 0, scene.place('beam'), 2][cap].mean().item() - mesh.vertices[cap, 2].mean()):.1f} mm"
+    f"{-1e3 * (fall.q[-1, 0, scene.vertex_slice('beam'), 2][cap].mean().item() - mesh.vertices[cap, 2].mean()):.1f} mm"
 )
 
 # %% [markdown]

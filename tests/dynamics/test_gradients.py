@@ -108,7 +108,7 @@ def test_every_parameter_at_every_pose(kind, start, poissons_ratio, device):
 
 
 @pytest.mark.parametrize("start", ["bent", "twisted"])
-@pytest.mark.parametrize("integrator", INTEGRATORS[1:])
+@pytest.mark.parametrize("integrator", [*INTEGRATORS][1:])
 def test_every_parameter_with_every_integrator(integrator, start):
     assert_equal(check_gradients(simulator(integrator=integrator), start, steps=3))
 

@@ -66,12 +66,12 @@ def bricks(n):
     return box_hexahedra(BEAM, (4 * n, n, n))
 
 
-def quadratic_tetrahedra(n):
-    return box_tetrahedra(BEAM, (2 * n, n, n), order=2)
-
-
 def quadratic_bricks(n, nodes):
     return box_hexahedra(BEAM, (2 * n, n, n), nodes=nodes)
+
+
+def quadratic_tetrahedra(n):
+    return box_tetrahedra(BEAM, (2 * n, n, n), order=2)
 
 
 @pytest.mark.parametrize("nodes", [20, 27])
@@ -149,13 +149,13 @@ def test_small_strains_are_linear_elasticity(model):
     settings = SolverSettings("newton", relative_tolerance=1e-6)
     body = Body(mesh, fixed=fixed, volume_integration="full")
     simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)
-    found = simulator.static_equilibrium(Inputs(torch.as_tensor(force)[None])).q[0] - simulator.rest_positions
+    displacement = simulator.static_equilibrium(Inputs(torch.as_tensor(force)[None])).q[0] - simulator.rest_positions
     mu = youngs_modulus / (2 * (1 + poissons_ratio))
     lame_lambda = youngs_modulus * poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
     if model == "corotated":
         lame_lambda /= 3
     expected = linear_elasticity(mesh, fixed, mu, lame_lambda, force)
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(displacement, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_distorted_meshes_give_the_same_deflection():

@@ -6,7 +6,7 @@ import torch
 from regions import beam, two_boxes
 
 from warp_resphys import Body, Mesh, box_tetrahedra, select_vertices
-from warp_resphys.fem.coordinates import Coordinates, barycentric, control_vertices
+from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
 from warp_resphys.fem.rigid import Glue, Rigid
 from warp_resphys.io.errors import InputError
 
@@ -20,11 +20,11 @@ def test_weights_of_a_rigid_part_are_small_and_give_its_vertices(mesh):
     assert np.abs(weights).max() < 1.0 + 1e-6
 
 
-def test_composed_points_see_what_all_vertices_show():
+def test_composed_points_give_the_same_deformation_gradients():
     body = Body(beam(), rigid={"cap": Rigid()})
     random = np.random.default_rng(0)
     control = torch.as_tensor(random.normal(size=(1, body.n_vertices, 3)))
-    device = body.coordinates.on(control)
+    device = DeviceCoordinates(body.coordinates, control)
     x = device.expand(control)[0].numpy()
     np.testing.assert_allclose(body.coordinates.matrix @ control[0].numpy(), x, atol=1e-12)
     for points in body.discretisation.point_sets:
@@ -70,6 +70,6 @@ FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np
         (lambda: Rigid(stiffness=0.0), "must be positive, in Pa"),
     ],
 )
-def test_what_cannot_be_rigid_or_glued_is_refused(make, key):
+def test_invalid_rigid_parts_and_glue_are_refused(make, key):
     with pytest.raises(InputError, match=key):
         make()

@@ -31,7 +31,7 @@ SHAPES |= {f"face of {nodes}": face.shape for nodes, face in FACES.items()}
 
 
 def distorted(mesh, amount=0.12):
-    """Every vertex moved by up to that fraction of an element, the boundary too."""
+    """Returns a mesh with every vertex, also on the boundary, moved by up to a fraction of an element."""
     cell = SIZE[0] / DIVISIONS[0]
     rng = np.random.default_rng(0)
     return Mesh(mesh.vertices + amount * cell * rng.uniform(-1, 1, mesh.vertices.shape), mesh.cells)
@@ -190,7 +190,7 @@ def test_faces_look_outwards_and_lie_on_the_cell(element):
 @pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
 @pytest.mark.parametrize("name", PATCH_MESHES)
 def test_patch(name, model, integration):
-    """A linear displacement of the boundary is that of the interior too."""
+    """A linear displacement of the boundary extends linearly to the interior."""
     mesh = MESHES[name]
     boundary = surface_vertices(mesh)
     material = MATERIALS[model](1e5, 0.45, density=1000.0)
@@ -198,10 +198,10 @@ def test_patch(name, model, integration):
     body = Body(mesh, fixed=boundary, volume_integration=integration)
     simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)
     f = np.eye(3) + 0.05 * np.random.default_rng(4).normal(size=(3, 3))
-    wanted = simulator.tensor(mesh.vertices @ f.T)[None]
-    found = simulator.static_equilibrium(Inputs(fixed_positions=wanted[:, simulator.fixed])).q
+    expected = simulator.tensor(mesh.vertices @ f.T)[None]
+    q = simulator.static_equilibrium(Inputs(fixed_positions=expected[:, simulator.fixed])).q
     assert len(boundary) < len(mesh.vertices)
-    assert float((found - wanted).abs().max()) <= 1e-10
+    assert float((q - expected).abs().max()) <= 1e-10
 
 
 @pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
@@ -218,16 +218,12 @@ def test_rigid_motions_give_no_force(name, model, device):
     for state in (State(q, torch.zeros_like(q)), bent):
         simulator.step(state)
         potential.positions.copy_(state.q)
-        potential.set_terms(stateless_terms(potential))
+        terms = potential.terms
+        inertia, force = torch.zeros_like(terms.inertia), torch.zeros_like(terms.force)
+        potential.set_terms(StepTerms(terms.target, inertia, force, terms.values))
         potential.evaluate()
         forces.append(float(potential.residual.abs().max()))
     assert forces[0] < 1e-11 * forces[1]
-
-
-def stateless_terms(potential):
-    """The last terms without inertia and loads."""
-    terms = potential.terms
-    return StepTerms(terms.target, torch.zeros_like(terms.inertia), torch.zeros_like(terms.force), terms.values)
 
 
 def test_unknown_integration_is_refused():

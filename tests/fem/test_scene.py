@@ -43,7 +43,7 @@ def test_bodies_of_a_scene_move_as_each_alone():
     for name, body, material, inputs in (("finger", finger(), SOFT, weight), ("ball", ball(), {}, Inputs())):
         alone = Simulator(body, material)
         own = alone.rollout(alone.rest_state(), 6, inputs)
-        torch.testing.assert_close(motion.q[:, :, scene.place(name)], own.q, rtol=0.0, atol=1e-9)
+        torch.testing.assert_close(motion.q[:, :, scene.vertex_slice(name)], own.q, rtol=0.0, atol=1e-9)
         for key, value in own.final.memory.items():
             torch.testing.assert_close(motion.final.memory[f"{name}_{key}"], value, rtol=0.0, atol=1e-9)
 
@@ -53,8 +53,8 @@ def test_forces_and_clamps_go_to_the_body_that_is_named():
     scene = Scene({"a": two, "b": finger()})
     force = torch.ones(1, two.n_vertices, 3, dtype=torch.float64)
     inputs = scene.inputs({"a": Inputs(external_force=force)})
-    assert float(inputs.external_force[:, scene.place("a")].min()) == 1.0
-    assert float(inputs.external_force[:, scene.place("b")].abs().max()) == 0.0
+    assert float(inputs.external_force[:, scene.vertex_slice("a")].min()) == 1.0
+    assert float(inputs.external_force[:, scene.vertex_slice("b")].abs().max()) == 0.0
     clamp = torch.zeros(1, 2, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="fixed_positions of b are missing"):
         scene.inputs({"a": Inputs(fixed_positions=clamp)})

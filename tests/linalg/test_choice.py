@@ -1,4 +1,4 @@
-"""The linear solver that `auto` takes, and what it refuses."""
+"""Selection of the linear solver by `auto`, and refused choices."""
 
 import numpy as np
 import pytest

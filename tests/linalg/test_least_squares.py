@@ -34,8 +34,8 @@ class Valley:
 
 def descend(valley, start, matrix, max_iterations):
     problem = UnitBox(valley, matrix)
-    found = minimise(problem, problem.evaluate(torch.tensor([start], dtype=torch.float64)), 1e-6, max_iterations).point
-    return found.x[0].numpy(), float(found.value)
+    point = minimise(problem, problem.evaluate(torch.tensor([start], dtype=torch.float64)), 1e-6, max_iterations).point
+    return point.x[0].numpy(), float(point.value)
 
 
 def test_the_descent_follows_a_bent_valley():
@@ -84,7 +84,7 @@ STARTS = torch.tensor([[-1.2, 1.0], [0.9, 0.8], [2.0, -3.0], [1.0, 1.0]], dtype=
 def test_problems_of_a_batch_do_not_see_each_other(wall):
     problem = Rosenbrock(wall)
     together = minimise(problem, problem.evaluate(STARTS), 1e-10, 100)
-    assert together.settled
+    assert together.converged
     torch.testing.assert_close(together.point.x, torch.ones_like(STARTS), rtol=0.0, atol=1e-8)
     counts = []
     for start, x in zip(STARTS, together.point.x, strict=True):
@@ -97,25 +97,25 @@ def test_problems_of_a_batch_do_not_see_each_other(wall):
     assert counts[3] == 1  # It is there already.
 
 
-def test_one_that_has_settled_is_left_alone():
+def test_a_converged_problem_is_no_longer_updated():
     problem = Rosenbrock()
     minimise(problem, problem.evaluate(STARTS), 1e-10, 100)
     assert all(torch.equal(x[3], STARTS[3]) for x in problem.evaluated)
 
 
-def test_it_says_how_far_the_last_step_led():
+def test_the_solution_has_the_length_of_the_last_step():
     problem = Rosenbrock()
-    found = minimise(problem, problem.evaluate(STARTS[:1]), 1e-10, 2)
-    assert (found.settled, found.iterations) == (False, 2)
-    assert found.moved > 1e-3
+    solution = minimise(problem, problem.evaluate(STARTS[:1]), 1e-10, 2)
+    assert (solution.converged, solution.iterations) == (False, 2)
+    assert solution.last_step > 1e-3
     assert minimise(problem, problem.evaluate(STARTS), 1e-10, 0).iterations == 0
 
 
 def test_a_start_that_fails_everywhere_stays():
     problem = Rosenbrock(wall=np.inf)
-    found = minimise(problem, problem.evaluate(STARTS), 1e-10, 5)
-    assert not found.settled
-    assert torch.equal(found.point.x, STARTS)
+    solution = minimise(problem, problem.evaluate(STARTS), 1e-10, 5)
+    assert not solution.converged
+    assert torch.equal(solution.point.x, STARTS)
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (7, 3)])
@@ -124,5 +124,5 @@ def test_ridge(shape):
     matrix, right = random.normal(size=shape), random.normal(size=shape[0])
     stacked = np.vstack([matrix, 0.3 * np.eye(shape[1])])
     expected = np.linalg.lstsq(stacked, np.concatenate([right, np.zeros(shape[1])]), rcond=None)[0]
-    found = ridge(torch.tensor(matrix)[None], torch.tensor(right)[None, :, None], 0.09)
-    np.testing.assert_allclose(found[0, :, 0], expected, rtol=1e-10)
+    solution = ridge(torch.tensor(matrix)[None], torch.tensor(right)[None, :, None], 0.09)
+    np.testing.assert_allclose(solution[0, :, 0], expected, rtol=1e-10)

@@ -73,8 +73,8 @@ def test_solutions_equal_numpy(block, definite, device, cholespy):
         solver = make(kind, block, device)
         factor = solver.factor(values_of(solver, dense), definite=definite)
         assert not factor.failed.any()
-        found = factor.solve(torch.as_tensor(right, device=device))
-        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
+        solution = factor.solve(torch.as_tensor(right, device=device))
+        np.testing.assert_allclose(solution.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
 
 
 def test_one_factor_serves_the_whole_batch(device, cholespy):
@@ -82,8 +82,8 @@ def test_one_factor_serves_the_whole_batch(device, cholespy):
     right = torch.randn(BATCH, NODES, 3, dtype=torch.float64).to(device)
     for kind in layouts(device):
         solver = make(kind, 1, device)
-        found = solver.factor(values_of(solver, dense)).solve(right)
-        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-9, atol=1e-9)
+        solution = solver.factor(values_of(solver, dense)).solve(right)
+        np.testing.assert_allclose(solution.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-9, atol=1e-9)
 
 
 def test_matrices_that_are_not_positive_definite_are_reported_one_by_one(device, cholespy):
@@ -105,8 +105,8 @@ def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
         solver = make(kind, 3, device)
         factor = solver.factor(values_of(solver, dense), definite, idle=idle)
         assert not factor.failed[[0, 2]].any()
-        found = factor.solve(right).cpu()[[0, 2]]
-        np.testing.assert_allclose(found, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
+        solution = factor.solve(right).cpu()[[0, 2]]
+        np.testing.assert_allclose(solution, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
 
 
 def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
@@ -128,11 +128,11 @@ def test_idle_matrices_keep_the_factor_they_have(device, cholespy):
             if extra is not None:
                 scale = np.array([2.0, 1.0, 1.0])[:, None, None] * extra.cpu().numpy()
                 expected = expected + scale @ scale.transpose(0, 2, 1)
-            found = after.solve(right).cpu()
-            np.testing.assert_allclose(found, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9)
+            solution = after.solve(right).cpu()
+            np.testing.assert_allclose(solution, np.linalg.solve(expected, right.cpu()), rtol=1e-9, atol=1e-9)
             in_place = right[:, solver.dofs, 0].contiguous()
             after.solve_in_place(in_place)
-            np.testing.assert_allclose(in_place.cpu(), found[:, solver.dofs.cpu(), 0], rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(in_place.cpu(), solution[:, solver.dofs.cpu(), 0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("unknown", [0, 15, 16, 35])
@@ -172,18 +172,18 @@ def test_float32_values_give_float32_solutions(device):
     dense, right = matrices(3, 20.0), torch.ones(BATCH, NODES * 3, 1, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device, torch.float32)
-        found = solver.factor(values_of(solver, dense)).solve(right)
-        assert found.dtype == torch.float32
-        np.testing.assert_allclose(found.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-3, atol=1e-5)
+        solution = solver.factor(values_of(solver, dense)).solve(right)
+        assert solution.dtype == torch.float32
+        np.testing.assert_allclose(solution.cpu(), np.linalg.solve(dense, right.cpu()), rtol=1e-3, atol=1e-5)
 
 
 def test_indefinite_matrices_in_float32(device, cholespy):
     dense, right = matrices(3, 0.3), torch.ones(BATCH, NODES * 3, 1, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device, torch.float32)
-        found = solver.factor(values_of(solver, dense), definite=False).solve(right)
+        solution = solver.factor(values_of(solver, dense), definite=False).solve(right)
         expected = np.linalg.solve(dense, right.cpu().numpy())
-        np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(solution.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
 
 
 def test_a_correction_of_low_rank_is_as_accurate_in_place(device):
@@ -195,8 +195,8 @@ def test_a_correction_of_low_rank_is_as_accurate_in_place(device):
         solver = make(kind, 3, device)
         in_place = columns[:, solver.dofs, 0].contiguous()
         solver.factor(values_of(solver, dense), columns=columns).solve_in_place(in_place)
-        wanted = expected[:, solver.dofs.cpu().numpy(), 0]
-        np.testing.assert_allclose(in_place.cpu(), wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
+        reference = expected[:, solver.dofs.cpu().numpy(), 0]
+        np.testing.assert_allclose(in_place.cpu(), reference, rtol=0, atol=1e-6 * np.abs(reference).max())
 
 
 def test_band_is_as_narrow_as_the_order_allows():

@@ -61,12 +61,12 @@ def test_solutions_and_directions(quadratic, poissons_ratio):
     assert not factor.failed.any()
     right = np.random.default_rng(0).normal(size=(1, solver.n, 3))
     expected = np.linalg.solve(matrix, right)
-    found = factor.solve(torch.as_tensor(right)).numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    solution = factor.solve(torch.as_tensor(right)).numpy()
+    np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     direction = torch.as_tensor(right[:, :, 0].copy())
     factor.solve_in_place(direction)
-    error, wanted = direction[0].numpy() - expected[0, :, 0], expected[0, :, 0]
-    assert error @ matrix @ error < 0.03**2 * (wanted @ matrix @ wanted)
+    error, exact = direction[0].numpy() - expected[0, :, 0], expected[0, :, 0]
+    assert error @ matrix @ error < 0.03**2 * (exact @ matrix @ exact)
     assert direction[0].numpy() @ right[0, :, 0] > 0.0
 
 
@@ -74,7 +74,7 @@ def test_iterations_hardly_grow_with_the_mesh():
     counts = []
     for refinement in (1, 2):
         solver, values = system(beam(refinement))
-        (cycle,) = (each.cycle for each in solver.factor(values).factors)
+        cycle = solver.factor(values).factors[0].cycle
         matrix = torch.as_tensor(dense(solver, values))
         right = torch.as_tensor(np.random.default_rng(1).normal(size=(1, solver.n)))
         counts.append(conjugate_gradients(lambda x, a=matrix: x @ a, cycle.apply, right, 1e-8).iterations)
@@ -84,7 +84,7 @@ def test_iterations_hardly_grow_with_the_mesh():
 
 def test_the_cycle_is_symmetric_and_positive_definite():
     solver, values = system(beam(poissons_ratio=0.499))
-    (cycle,) = (each.cycle for each in solver.factor(values).factors)
+    cycle = solver.factor(values).factors[0].cycle
     assert cycle._levels
     operator = cycle.apply(torch.eye(solver.n, dtype=torch.float64)).numpy()
     np.testing.assert_allclose(operator, operator.T, rtol=0, atol=1e-10 * np.abs(operator).max())
@@ -110,11 +110,11 @@ def test_an_indefinite_matrix_is_reported_or_solved_all_the_same():
     right = torch.ones(1, solver.n, 1, dtype=torch.float64)
     expected = np.linalg.solve(dense(solver, values), right.numpy())
     assert solver.factor(values).failed.all()
-    found = solver.factor(values, definite=False).solve(right)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    solution = solver.factor(values, definite=False).solve(right)
+    np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
 
 
-def test_a_cycle_serves_later_matrices_until_it_is_worn():
+def test_a_cycle_serves_later_matrices_until_it_is_stale():
     """And a matrix that turns out to be indefinite only then is solved exactly, and never goes uphill."""
     solver, values = system(beam())
     right = torch.as_tensor(np.random.default_rng(2).normal(size=(1, solver.n, 1)))
@@ -136,7 +136,7 @@ def test_a_cycle_serves_later_matrices_until_it_is_worn():
     stiffer[:, diagonal] *= torch.as_tensor(10.0 ** np.random.default_rng(3).uniform(0, 4, size=int(diagonal.sum())))
     later = solver.factor(stiffer)
     later.solve(right)
-    assert later.factors[0].cycle.worn
+    assert later.factors[0].cycle.stale
     assert solver.factor(stiffer).factors[0].cycle is not first.factors[0].cycle
 
 

@@ -115,6 +115,6 @@ def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: floa
     if values[low] < quantity.lower - NO_INPUT * limit:
         raise DataFileError(
             f"{source}: the {words} of {per} {low[1] + 1} is {quantity.shown(float(values[low]))} in frame {low[0]}: "
-            f"it must be {quantity.wanted}, so check the zero of the gauge."
+            f"it must be {quantity.valid_range}, so check the zero of the gauge."
         )
     return np.maximum(values, quantity.lower)

@@ -83,7 +83,7 @@ class EnergySet:
             values |= each.named(bound.prepare(own))
             if (mass := bound.mass(own)) is not None:
                 masses.append(mass)
-        return values, masses[0] if len(masses) == 1 else Mass.joined(masses)
+        return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
     @property
     def _pairs(self) -> Iterable[tuple[Placed, BoundEnergy]]:

@@ -20,6 +20,7 @@ from ..energies.potential import StepTerms
 from ..energies.rigid import PointInertia, rigid_energies
 from ..energies.solid import solids_of
 from ..fem.body import Body
+from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
 from ..io.files import atomic_hdf5, create
 from ..linalg.threads import shards_of
@@ -250,7 +251,7 @@ class Simulator:
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
-        self._coordinates = body.coordinates.on(self.rest_positions)
+        self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
         placed = self._place_energies()
         self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
         own = self._set

@@ -14,11 +14,10 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.surface_elements import face_rule
 from ..io.errors import InputError, MeshError
 from ..kernels.axial import axial_kernels
 from ..kernels.laws import thread as law
-from ..mesh.chambers import Chamber
+from ..mesh.chambers import Chamber, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PartPoints, PointSet, ReadingTerm, Values

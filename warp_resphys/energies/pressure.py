@@ -15,10 +15,9 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ..fem.surface_elements import face_rule
 from ..io.errors import InputError
 from ..kernels import pressure as kernels
-from ..mesh.chambers import Chamber, check_chambers
+from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import Energy, PartPoints, PartTerm, PointSet, Values

@@ -1,4 +1,4 @@
-"""Finite elements as points: shape functions, integration rules, and the body that they make of a mesh.
+"""Finite elements as integration points, and the bodies made of them.
 
-From outside: `body.Body` and `body.PointMass`; `elements.discretise` and `elements.Points` for new energies.
+Public: `body.Body` and `body.PointMass`; `elements.discretise` and `elements.Points` for new energies.
 """

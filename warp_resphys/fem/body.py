@@ -1,4 +1,4 @@
-"""A body: the constant part of a simulation, in NumPy on the host."""
+"""Body: the constant data of a simulation, as NumPy arrays on the host."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,27 +19,23 @@ from .rigid import Glue, Rigid
 MASS_MODES = ("row_sum", "per_vertex")
 
 
-class OnBody(Protocol):
-    """What a body needs to know of an energy (`energies.base.Energy`)."""
+class BodyEnergy(Protocol):
+    """The part of `energies.base.Energy` that a body uses."""
 
     @property
     def parameters(self) -> Sequence[Any]:
-        """Its constants."""
+        """Parameters of the energy."""
 
     @property
     def inputs(self) -> Sequence[Any]:
-        """What acts through it."""
+        """Inputs of the energy."""
 
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
-        """Its sets of points on a body's rest shape."""
+        """Sets of integration points on the rest shape."""
 
 
 def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
-    """(n,) indices of vertices that the mesh has.
-
-    Raises:
-        InputError: values that are no whole numbers, such as a mask, or that no vertex has.
-    """
+    """Returns vertex indices (n,), or raises InputError for a mask, non-integers or indices out of range."""
     indices = np.asarray(values).ravel()
     if indices.size and indices.dtype.kind not in "iu":
         raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
@@ -50,14 +46,14 @@ def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np
 
 @dataclass(frozen=True)
 class PointMass:
-    """A weight that moves with the body: it has inertia, and hangs in gravity."""
+    """A weight attached to the body, with inertia and gravity."""
 
     mass: float  # [kg]
-    vertices: Sequence[int]  # (n,) the vertices that carry it
-    weights: Sequence[float] | None = None  # (n,) the share of each, summing to one; equal shares where left out
+    vertices: Sequence[int]  # (n,) vertices that carry the weight
+    weights: Sequence[float] | None = None  # (n,) share of each vertex, summing to one; equal shares if omitted
 
     def per_vertex(self, n_vertices: int) -> NDArray[np.float64]:
-        """(N,) mass at each vertex [kg].
+        """Returns the mass at each vertex, (N,) [kg].
 
         Raises:
             InputError: a negative mass, a vertex that the mesh does not have, or weights that do not sum to one.
@@ -81,31 +77,27 @@ class Body:
     """A mesh with its boundary conditions, masses and integration rule."""
 
     mesh: Mesh  # the rest shape
-    # vertices with prescribed positions (Dirichlet); they rest where they are unless moved. Their positions are
-    # given in the order of ``fixed_vertices``
+    # vertices with prescribed positions (Dirichlet), at rest unless `Inputs.fixed_positions` moves them
     fixed: ArrayLike = ()
-    # ``row_sum`` lumps each element's own mass on its vertices (HRZ for 10-node tetrahedra). ``per_vertex`` gives
-    # every vertex the density times the mean element volume, which is wrong by a factor of two on the published
-    # beam and serves for comparison with the published code alone
+    # ``row_sum`` lumps the mass of each element on its vertices (HRZ for 10-node tetrahedra). ``per_vertex`` gives
+    # every vertex the density times the mean element volume: wrong by a factor of two on the published beam, and meant
+    # only for comparison with the published code
     mass: str = "row_sum"
     volume_integration: str = "centre"  # ``centre`` or ``full`` (see `elements.discretise`)
     point_masses: Sequence[PointMass] = field(default=())  # attached weights
-    # what acts in or on the body beside its material: pressure, fibres (`energies.base.Energy`)
-    energies: Sequence[OnBody] = field(default=())
-    # regions of the mesh that move as rigid parts, by name
-    rigid: Mapping[str, Rigid] = field(default_factory=dict)
-    # vertices that follow a region whose mesh does not match theirs
-    glued: Sequence[Glue] = field(default=())
-    # the sets of points of each of the energies
+    energies: Sequence[BodyEnergy] = field(default=())  # energies besides the material: pressure, fibres
+    rigid: Mapping[str, Rigid] = field(default_factory=dict)  # rigid parts, by region of the mesh
+    glued: Sequence[Glue] = field(default=())  # vertices that follow a region with a non-matching mesh
+    # sets of integration points of each energy
     energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Checks the fixed vertices, the mass mode and the energies.
 
         Raises:
-            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or two energies that depend on
-                a quantity of the same name.
-            MeshError: a mesh that an energy does not fit, such as an open chamber.
+            InputError: an unknown mass mode, fixed vertices that the mesh does not have, or two energies with a
+                parameter or an input of the same name.
+            MeshError: a mesh that an energy cannot use, such as one with an open chamber.
         """
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
@@ -113,17 +105,17 @@ class Body:
         if len(fixed) == self.n_vertices:
             raise InputError("every vertex is fixed: leave some free to move.")
         object.__setattr__(self, "fixed", fixed)
-        names = [quantity.name for each in self.energies for quantity in (*each.parameters, *each.inputs)]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise InputError(f"two energies of the body depend on {twice[0]}: put them into one.")
-        object.__setattr__(self, "energy_points", tuple(each.points(self.mesh) for each in self.energies))
+        names = [quantity.name for energy in self.energies for quantity in (*energy.parameters, *energy.inputs)]
+        duplicates = [name for name in names if names.count(name) > 1]
+        if duplicates:
+            raise InputError(f"two energies of the body depend on {duplicates[0]}: put them into one.")
+        object.__setattr__(self, "energy_points", tuple(energy.points(self.mesh) for energy in self.energies))
         if self.rigid or self.glued:
-            self.coordinates  # noqa: B018  # What cannot move so is refused here.
+            self.coordinates  # noqa: B018  # Checks the rigid parts and the glue.
 
     @property
     def members(self) -> "Iterator[tuple[str, Body, int]]":
-        """The body itself, as a scene of one: an empty name, the body, and the number of its first vertex."""
+        """Name, body and index of the first vertex of each body of a scene: here of this body alone, without a name."""
         yield "", self, 0
 
     @property
@@ -133,7 +125,7 @@ class Body:
 
     @property
     def n_vertices(self) -> int:
-        """N."""
+        """Number of vertices N."""
         return len(self.mesh.vertices)
 
     @property
@@ -143,12 +135,16 @@ class Body:
 
     @cached_property
     def discretisation(self) -> Discretisation:
-        """Integration points and volumes."""
-        return discretise(self.mesh, self.volume_integration, cracks=bool(self.glued))
+        """Integration points and volumes of the whole mesh."""
+        return self.discretised()
+
+    def discretised(self, cells: NDArray[np.int64] | None = None) -> Discretisation:
+        """Returns integration points and volumes of some cells, or of all."""
+        return discretise(self.mesh, self.volume_integration, cells, cracks=bool(self.glued))
 
     @cached_property
     def soft_cells(self) -> NDArray[np.int64] | None:
-        """(m,) cells of no rigid part; None where all cells are soft."""
+        """(m,) cells outside the rigid parts; None without rigid parts."""
         if not self.rigid:
             return None
         rigid = np.concatenate([self.mesh.region(name) for name in self.rigid])
@@ -156,7 +152,7 @@ class Body:
 
     @property
     def controls(self) -> dict[str, NDArray[np.int64]]:
-        """Four control vertices of each rigid part that is free to move, by name."""
+        """Four control vertices of each movable rigid part, by name."""
         return self._dependence[0]
 
     @property
@@ -166,39 +162,39 @@ class Body:
 
     @cached_property
     def _dependence(self) -> tuple[dict[str, NDArray[np.int64]], Coordinates]:
-        """Control vertices of the rigid parts, and the map from control vertices to all.
+        """Control vertices of the rigid parts, and the map from control vertices to all vertices.
 
         Raises:
-            InputError: a part of which some vertices are fixed and others are not, two parts that share vertices, a
-                flat part, or glued vertices that are fixed, rigid, or too far from what they are glued to.
+            InputError: a rigid part with only some vertices fixed, two parts that share vertices, a flat part, or
+                glued vertices that are fixed, rigid, or too far from the region they are glued to.
             MeshError: an unknown region.
         """
         weights: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
         controls: dict[str, NDArray[np.int64]] = {}
-        taken: dict[int, str] = {}
+        part_of_vertex: dict[int, str] = {}
         for name in self.rigid:
-            members = np.unique(self.mesh.cells[self.mesh.region(name)])
-            held = int(np.isin(members, self.fixed_vertices).sum())
-            if held == len(members):
+            vertices = np.unique(self.mesh.cells[self.mesh.region(name)])
+            n_fixed = int(np.isin(vertices, self.fixed_vertices).sum())
+            if n_fixed == len(vertices):
                 continue
-            if held:
+            if n_fixed:
                 raise InputError(
-                    f"{held} of the {len(members)} vertices of the rigid part {name!r} are fixed: fix all of them, or "
-                    "none."
+                    f"{n_fixed} of the {len(vertices)} vertices of the rigid part {name!r} are fixed: fix all of them, "
+                    "or none."
                 )
-            if shared := next((taken[i] for i in members.tolist() if i in taken), None):
-                raise InputError(f"the rigid parts {shared!r} and {name!r} share vertices: make them one region.")
-            taken |= dict.fromkeys(members.tolist(), name)
-            controls[name], own = rigid_weights(self.mesh.vertices, members, name)
-            weights |= own
+            if other := next((part_of_vertex[i] for i in vertices.tolist() if i in part_of_vertex), None):
+                raise InputError(f"the rigid parts {other!r} and {name!r} share vertices: make them one region.")
+            part_of_vertex |= dict.fromkeys(vertices.tolist(), name)
+            controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name)
+            weights |= part_weights
         for glue in self.glued:
-            weights |= self._glued_weights(glue, taken)
+            weights |= self._glued_weights(glue, part_of_vertex)
         return controls, Coordinates.of(self.n_vertices, weights)
 
     def _glued_weights(
         self, glue: Glue, rigid: Mapping[int, str]
     ) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Returns control vertices and weights of glued vertices: the shape functions of the cells they lie in."""
+        """Returns control vertices and weights of glued vertices, from the shape functions of the containing cells."""
         vertices = np.unique(_vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
         cells = self.mesh.cells[self.mesh.region(glue.to)]
         for what, others in (("fixed", self.fixed_vertices), ("part of a rigid part", np.array(list(rigid)))):
@@ -207,27 +203,24 @@ class Body:
         if np.isin(vertices, cells).any():
             raise InputError(f"a vertex that is glued to {glue.to!r} belongs to it: glue vertices of another region.")
         used, renumbered = np.unique(cells, return_inverse=True)
-        found = locate(Mesh(self.mesh.vertices[used], renumbered.reshape(cells.shape)), self.mesh.vertices[vertices])
-        if float(found.outside.max()) > glue.tolerance:
-            far = int(found.outside.argmax())
+        region = Mesh(self.mesh.vertices[used], renumbered.reshape(cells.shape))
+        places = locate(region, self.mesh.vertices[vertices])
+        if float(places.outside.max()) > glue.tolerance:
+            far = int(places.outside.argmax())
             raise InputError(
-                f"vertex {vertices[far]} is {found.outside[far]:.3g} m from the region {glue.to!r} that it is glued "
+                f"vertex {vertices[far]} is {places.outside[far]:.3g} m from the region {glue.to!r} that it is glued "
                 f"to, farther than the tolerance of {glue.tolerance:g} m: move the meshes together, or raise it."
             )
-        return {int(i): (cells[c], w) for i, c, w in zip(vertices, found.cells, found.weights, strict=True)}
-
-    def discretised(self, cells: NDArray[np.int64]) -> Discretisation:
-        """Returns integration points and volumes of some cells."""
-        return discretise(self.mesh, self.volume_integration, cells, cracks=bool(self.glued))
+        return {int(i): (cells[c], w) for i, c, w in zip(vertices, places.cells, places.weights, strict=True)}
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:
-        """(N, M) volume of each element that each vertex carries as mass [m^3]."""
+        """(N, M) share of each vertex in the volume of each element, for the mass [m^3]."""
         return self._per_vertex_volume if self.mass == "per_vertex" else self.discretisation.lumped_volume
 
     @cached_property
     def load_volume(self) -> scipy.sparse.csr_array:
-        """(N, M) volume of each element whose weight acts on each vertex [m^3]."""
+        """(N, M) share of each vertex in the volume of each element, for gravity [m^3]."""
         return self._per_vertex_volume if self.mass == "per_vertex" else self.discretisation.load_volume
 
     @cached_property

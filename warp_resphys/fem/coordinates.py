@@ -1,13 +1,13 @@
 """Vertices as weighted sums of control vertices, x = W r.
 
-A free vertex is its own control vertex. One that is glued to a face has the shape functions of that face as weights.
-A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): four of its own vertices control it, and the
-weights of the others are their barycentric coordinates. As W acts on each component alike, a point's operator
-F = sum_a x_a g_a^T stays of that form, F = sum_c r_c (sum_a W_ac g_a)^T: energies see control vertices only, and the
-Hessian in r is W^T H W without ever forming H.
+A free vertex is its own control vertex. A glued vertex has the shape functions of the face it is glued to as weights.
+A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is controlled by four of its vertices, and
+the weights of the others are their barycentric coordinates. As W acts on each component alike, the operator
+F = sum_a x_a g_a^T of a point keeps its form, F = sum_c r_c (sum_a W_ac g_a)^T: energies use control vertices only, and
+the Hessian in r, W^T H W, is assembled without forming H.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -29,39 +29,38 @@ _FLAT = 1e-3  # smallest height of the tetrahedron that controls a rigid part, o
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The map W of a body; the identity where nothing depends on other vertices."""
+    """The map W of a body; the identity without dependent vertices."""
 
     n_vertices: int  # N
-    dependent: IntArray  # (S,) vertices that others determine, ascending
-    weights: scipy.sparse.csr_array  # (S, N) of the control vertices in each of them
+    dependent: IntArray  # (S,) vertices determined by control vertices, ascending
+    weights: scipy.sparse.csr_array  # (S, N) weights of the control vertices in each dependent vertex
 
     @classmethod
     def of(cls, n_vertices: int, weights: Mapping[int, tuple[IntArray, FloatArray]]) -> "Coordinates":
         """Builds the map from the control vertices and weights of each dependent vertex.
 
-        A dependent vertex may be a weighted sum of others that are dependent too; these are resolved.
+        A dependent vertex may be a weighted sum of other dependent vertices; these are substituted.
 
         Raises:
             InputError: two vertices determine each other.
         """
         dependent = np.array(sorted(weights), dtype=np.int64)
-        own = np.ones(n_vertices)
-        own[dependent] = 0.0
-        rows = [np.full(len(weights[i][0]), i) for i in dependent]
-        if rows:
-            columns, values = (np.concatenate([weights[i][k] for i in dependent]) for k in (0, 1))
-            given = scipy.sparse.csr_array((values, (np.concatenate(rows), columns)), (n_vertices, n_vertices))
-        else:
-            given = scipy.sparse.csr_array((n_vertices, n_vertices))
-        whole = scipy.sparse.csr_array(scipy.sparse.diags_array(own) + given)
+        if not len(dependent):
+            return cls(n_vertices, dependent, scipy.sparse.csr_array((0, n_vertices)))
+        free = np.ones(n_vertices)
+        free[dependent] = 0.0
+        rows = np.repeat(dependent, [len(weights[i][0]) for i in dependent])
+        columns, values = (np.concatenate([weights[i][k] for i in dependent]) for k in (0, 1))
+        given = scipy.sparse.csr_array((values, (rows, columns)), (n_vertices, n_vertices))
+        matrix = scipy.sparse.csr_array(scipy.sparse.diags_array(free) + given)
         for _ in range(len(dependent)):
-            if not whole[:, dependent].nnz:
+            if not matrix[:, dependent].nnz:
                 break
-            whole = scipy.sparse.csr_array(whole @ whole)
-            whole.eliminate_zeros()
-        if len(dependent) and whole[:, dependent].nnz:
+            matrix = scipy.sparse.csr_array(matrix @ matrix)
+            matrix.eliminate_zeros()
+        if matrix[:, dependent].nnz:
             raise InputError("glued vertices determine each other: glue one side of an interface to the other only.")
-        return cls(n_vertices, dependent, scipy.sparse.csr_array(whole[dependent]))
+        return cls(n_vertices, dependent, scipy.sparse.csr_array(matrix[dependent]))
 
     def __bool__(self) -> bool:
         """Whether any vertex depends on others."""
@@ -70,15 +69,14 @@ class Coordinates:
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """(N, N) W; columns of dependent vertices are empty."""
-        own = np.ones(self.n_vertices)
-        own[self.dependent] = 0.0
-        rows = np.arange(len(self.dependent)), self.dependent
-        place = scipy.sparse.csr_array((np.ones(len(self.dependent)), rows[::-1]), (self.n_vertices, len(rows[0])))
-        return scipy.sparse.csr_array(scipy.sparse.diags_array(own) + place @ self.weights)
+        identity = scipy.sparse.eye_array(self.n_vertices, format="csc")
+        free = np.ones(self.n_vertices)
+        free[self.dependent] = 0.0
+        return scipy.sparse.csr_array(scipy.sparse.diags_array(free) + identity[:, self.dependent] @ self.weights)
 
     @cached_property
     def _rows(self) -> dict[int, tuple[IntArray, FloatArray]]:
-        """Control vertices and weights of every dependent vertex."""
+        """Control vertices and weights of each dependent vertex."""
         w = self.weights
         return {
             int(vertex): (w.indices[w.indptr[k] : w.indptr[k + 1]], w.data[w.indptr[k] : w.indptr[k + 1]])
@@ -101,7 +99,7 @@ class Coordinates:
             lists.append((np.array(list(sums), dtype=np.int64), np.stack(list(sums.values()), axis=1)))
         width = max(points.nodes.shape[1], *(len(nodes) for nodes, _ in lists))
         cells, per_cell, old, components = points.gradients.shape
-        # What pads a cell repeats its first vertex with an operator of zero, which contributes nothing.
+        # Cells are padded with their first vertex and a zero operator.
         nodes = np.repeat(points.nodes[:, :1], width, axis=1)
         operators = np.zeros((cells, per_cell, width, components))
         nodes[:, :old], operators[:, :, :old] = points.nodes, points.gradients
@@ -112,7 +110,7 @@ class Coordinates:
 
     @cached_property
     def points(self) -> Points:
-        """One point per dependent vertex, which sees the vertex's position."""
+        """One point per dependent vertex, whose operator gives the vertex's position."""
         width = int(np.diff(self.weights.indptr).max())
         nodes = np.zeros((len(self.dependent), width), dtype=np.int64)
         operators = np.zeros((len(self.dependent), 1, width, 1))
@@ -121,16 +119,12 @@ class Coordinates:
             operators[row, 0, : len(controls), 0] = weights
         return Points(nodes, operators)
 
-    def on(self, like: torch.Tensor) -> "DeviceCoordinates":
-        """Returns the map on the device and in the type of a tensor."""
-        return DeviceCoordinates(self, like)
-
 
 class DeviceCoordinates:
-    """`Coordinates` on a device.
+    """`Coordinates` with the device and dtype of a tensor.
 
     Attributes:
-        dependent: (S,) vertices that others determine.
+        dependent: (S,) vertices determined by control vertices.
     """
 
     def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
@@ -149,27 +143,27 @@ class DeviceCoordinates:
         return torch.sparse.mm(matrix, columns).reshape(matrix.shape[0], *rest).movedim(0, 1)
 
     def expand(self, r: torch.Tensor) -> torch.Tensor:
-        """Returns a field (B, N, ...) with its values at dependent vertices set from the control vertices."""
+        """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
         if not len(self.dependent):
             return r
         kept = r.index_fill(1, self.dependent, 0.0)
         return r.index_copy(1, self.dependent, self._times(self._weights, kept))
 
     def reduce(self, forces: torch.Tensor) -> torch.Tensor:
-        """Returns W^T f of forces (B, N, ...): those at dependent vertices act on the control vertices."""
+        """Returns W^T f of forces (B, N, ...): forces at dependent vertices are moved to their control vertices."""
         if not len(self.dependent):
             return forces
-        moved = self._times(self._transposed, forces.index_select(1, self.dependent))
-        return forces.index_fill(1, self.dependent, 0.0) + moved
+        on_controls = self._times(self._transposed, forces.index_select(1, self.dependent))
+        return forces.index_fill(1, self.dependent, 0.0) + on_controls
 
 
 def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> IntArray:
-    """Returns four vertices that span a large tetrahedron, by which the others are controlled with small weights.
+    """Returns four vertices that span a large tetrahedron, so that the weights of the others are small.
 
     Args:
-        vertices: (N, 3) at rest [m].
+        vertices: (N, 3) rest positions [m].
         candidates: vertices to choose from.
-        name: of the part, for messages.
+        name: name of the part, for messages.
 
     Raises:
         InputError: all candidates lie in a plane.
@@ -185,7 +179,7 @@ def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> I
         chosen.append(int(heights.argmax()))
         if not heights.max() > _FLAT * size:
             raise InputError(f"the rigid part {name!r} is flat: it needs vertices that do not lie in a plane.")
-    for _ in range(10):  # Exchanges that make the tetrahedron larger: then no weight is greater than one.
+    for _ in range(10):  # Exchange corners to enlarge the tetrahedron, until no weight exceeds one.
         weights = barycentric(places[chosen], places)
         point, corner = np.unravel_index(int(np.abs(weights).argmax()), weights.shape)
         if abs(weights[point, corner]) < 1.0 + 1e-9:
@@ -195,16 +189,15 @@ def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> I
 
 
 def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
-    """Returns the weights (n, 4) of four corners in places (n, 3): they sum to one and give the places."""
+    """Returns the barycentric coordinates (n, 4) of places (n, 3) with respect to four corners."""
     system = np.vstack([corners.T, np.ones(len(corners))])
     return np.linalg.solve(system, np.vstack([places.T, np.ones(len(places))])).T
 
 
 def rigid_weights(
-    vertices: FloatArray, members: Sequence[int] | IntArray, name: str
+    vertices: FloatArray, members: IntArray, name: str
 ) -> tuple[IntArray, dict[int, tuple[IntArray, FloatArray]]]:
     """Returns the four control vertices of a rigid part, and control vertices and weights of its other vertices."""
-    members = np.unique(np.asarray(members, dtype=np.int64))
     controls = control_vertices(vertices, members, name)
     others = np.setdiff1d(members, controls)
     weights = barycentric(vertices[controls], vertices[others])

@@ -1,8 +1,8 @@
-"""Finite elements as points: every integration rule is a list of points with a gradient operator and a weight.
+"""Finite elements as points: every integration rule is a list of points with a gradient operator and weights.
 
-A *point* holds the rest-space gradients of the shape functions of its cell's nodes, so that the deformation gradient
-there is ``F = sum_a x_a (grad N_a)^T``, and says how much of each element's volume it carries for the shape and for the
-volume term of the energy. Gauss points, element centres and averages over vertex patches are all of this form.
+A *point* has the rest-space gradients of the shape functions of its cell's nodes, which give the deformation gradient
+``F = sum_a x_a (grad N_a)^T``, and its share of each element's volume in the shape term and in the volume term of the
+energy. Gauss points, element centres and averages over vertex patches all have this form.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ VOLUME_INTEGRATIONS: tuple[VolumeIntegration, ...] = get_args(VolumeIntegration)
 
 @dataclass(frozen=True)
 class Points:
-    """Cells with the same number of nodes and of points, each point with the matrix F = sum_a x_a g_a^T."""
+    """Cells with K nodes and Q points each; at a point, F = sum_a x_a g_a^T."""
 
     nodes: NDArray[np.int64]  # (C, K) vertex of each node of a cell
     # (C, Q, K, 3) operators g_a; in a solid, gradients of the shape functions in rest space [1/m]. (C, Q, K, 1) where
@@ -31,12 +31,12 @@ class Points:
 
     @property
     def points_per_cell(self) -> int:
-        """Q."""
+        """Number of points per cell Q."""
         return self.gradients.shape[1]
 
     @property
     def n_points(self) -> int:
-        """P = C Q."""
+        """Number of points P = C Q."""
         return self.gradients.shape[0] * self.gradients.shape[1]
 
 
@@ -44,14 +44,14 @@ class Points:
 class SolidPoints(Points):
     """Points of a solid."""
 
-    # (C Q, M) sparse; volume of each element that the point carries for the shape term [m^3]
+    # (C Q, M) sparse; volume of each element that the point carries, in the shape term and in the volume term [m^3]
     shape_volume: scipy.sparse.csr_array
-    volume_volume: scipy.sparse.csr_array  # (C Q, M) sparse; the same for the volume term [m^3]
+    volume_volume: scipy.sparse.csr_array
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """All that a body's mesh and integration rule determine."""
+    """Integration points and volumes of a mesh."""
 
     point_sets: tuple[SolidPoints, ...]  # where the energy is evaluated
     element_volumes: Array  # (M,) [m^3]
@@ -61,42 +61,41 @@ class Discretisation:
 
 
 def physical_gradients(vertices: Array, cells: NDArray[np.int64], reference_gradients: Array) -> tuple[Array, Array]:
-    """Gradients in rest space (C, Q, K, 3) [1/m] and Jacobian determinants (C, Q) [m^3] of isoparametric cells."""
+    """Returns rest-space gradients (C, Q, K, 3) [1/m] and Jacobian determinants (C, Q) [m^3] of isoparametric cells."""
     jacobian = np.einsum("cki,qkj->cqij", vertices[cells], reference_gradients)
     return np.einsum("qkj,cqji->cqki", reference_gradients, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
 
 
 def _one_hot(volumes: Array) -> scipy.sparse.csr_array:
-    """(C Q, C) matrix whose row c Q + q holds volumes[c, q] in column c."""
+    """Returns the (C Q, C) matrix whose row c Q + q holds volumes[c, q] in column c."""
     c, q = volumes.shape
     rows = np.arange(c * q)
     return scipy.sparse.csr_array((volumes.ravel(), (rows, rows // q)), shape=(c * q, c))
 
 
 def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> scipy.sparse.csr_array:
-    """(N, M) matrix that sums values[m, a] into row cells[m, a], column m."""
+    """Returns the (N, M) matrix that sums values[m, a] into row cells[m, a], column m."""
     columns = np.repeat(np.arange(len(cells)), cells.shape[1])
-    matrix = scipy.sparse.coo_array((values.ravel(), (cells.ravel(), columns)), shape=(n_vertices, len(cells)))
-    return matrix.tocsr()
+    return scipy.sparse.csr_array((values.ravel(), (cells.ravel(), columns)), shape=(n_vertices, len(cells)))
 
 
 def discretise(
     mesh: Mesh, volume_integration: str = "centre", cells: NDArray[np.int64] | None = None, cracks: bool = False
 ) -> Discretisation:
-    """The points, masses and loads of a mesh, or of some of its cells.
+    """Returns the points, masses and loads of a mesh, or of some of its cells.
 
-    The shape term takes the points of the element's rule. The volume term is under-integrated against locking
-    (``centre``), on deformation gradients that are projected on few polynomials of each element (Simo and Hughes 1998,
-    section 4.4): on constants, the volume-weighted mean, for 8-node hexahedra and 10-node tetrahedra, on linear ones
-    for quadratic hexahedra; or on the mean over the cells around each vertex, for 4-node tetrahedra (Bonet and Burton
-    1998). Projections pass the patch test on distorted elements too (Flanagan and Belytschko 1981). ``full`` takes the
-    shape term's points.
+    The shape term uses the points of the element's rule. With ``centre``, the volume term is under-integrated against
+    locking, on deformation gradients projected on few polynomials per element (Simo and Hughes 1998, section 4.4):
+    constants, that is the volume-weighted mean, for 8-node hexahedra and 10-node tetrahedra, linear polynomials for
+    quadratic hexahedra; or on their mean over the cells around each vertex, for 4-node tetrahedra (Bonet and Burton
+    1998). Projections pass the patch test on distorted elements too (Flanagan and Belytschko 1981). With ``full``, the
+    volume term uses the points of the shape term.
 
     Args:
         mesh: the rest shape.
         volume_integration: ``centre`` or ``full``.
-        cells: (M',) numbers of the cells; all where left out. Averages over patches stay within these cells.
-        cracks: whether vertices may coincide, as those of parts that are glued together do.
+        cells: (M',) cell indices, all cells if omitted. Averages over patches are restricted to these cells.
+        cracks: whether vertices may coincide, like those of glued parts.
 
     Raises:
         InputError: an unknown volume integration.
@@ -116,11 +115,11 @@ def discretise(
 
 
 def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int64], cracks: bool) -> Discretisation:
-    """Discretises the mesh that some cells alone would be, and numbers its vertices as the whole mesh does."""
+    """Returns the discretisation of a submesh, with the vertex numbers of the whole mesh."""
     used, renumbered = np.unique(mesh.cells[cells], return_inverse=True)
     part = Mesh(mesh.vertices[used], renumbered.reshape(-1, mesh.cells.shape[1]))
     own = discretise(part, volume_integration, cracks=cracks)
-    spread = scipy.sparse.csr_array((np.ones(len(used)), (used, np.arange(len(used)))), (len(mesh.vertices), len(used)))
+    spread = scipy.sparse.eye_array(len(mesh.vertices), format="csc")[:, used]
     return Discretisation(
         tuple(replace(points, nodes=used[points.nodes]) for points in own.point_sets),
         own.element_volumes,
@@ -130,7 +129,7 @@ def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int
 
 
 def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
-    """The rule's points for the shape term; the same, or those of projected gradients, for the volume term."""
+    """Returns a discretisation with one rule for both terms, or projected gradients for the volume term."""
     element = mesh.element
     points, weights = element.rule
     values, reference = element.shape(points)
@@ -156,17 +155,17 @@ def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
 
 
 def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> tuple[Array, Array]:
-    """Gradients (M, Q', K, 3) of the volume term [1/m], projected on the element's modes, and (M, Q') volumes [m^3].
+    """Returns projected gradients (M, Q', K, 3) [1/m] and volumes (M, Q') [m^3] of the points of the volume term.
 
-    The projection is the least-squares one in the volume at the points of the shape term: sum_n phi_n(x) M^-1_nm sum_q
-    v_q phi_m(x_q) g_q with M_nm = sum_q v_q phi_n(x_q) phi_m(x_q). The volumes are those of the rule, changed as little
-    as it takes to integrate the modes as the shape term's points do, which the patch test asks for.
+    The least-squares projection on the element's modes phi_n, by volume at the points of the shape term, is sum_n
+    phi_n(x) M^-1_nm sum_q v_q phi_m(x_q) g_q with M_nm = sum_q v_q phi_n(x_q) phi_m(x_q). The volumes of the rule are
+    corrected (smallest change) to integrate the modes as the points of the shape term do, which the patch test needs.
 
     Args:
-        mesh: of the elements.
-        points: (Q, 3) of the shape term.
-        volumes: (M, Q) of these [m^3].
-        gradients: (M, Q, K, 3) there [1/m].
+        mesh: the mesh.
+        points: (Q, 3) points of the shape term, in the reference element.
+        volumes: (M, Q) volumes of these points [m^3].
+        gradients: (M, Q, K, 3) gradients at these points [1/m].
     """
     element = mesh.element
     assert element.volume_modes is not None
@@ -186,9 +185,9 @@ def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> t
 
 
 def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
-    """(M, K) volumes in proportion to the consistent mass matrix's diagonal (Hinton, Rock, Zienkiewicz 1976).
+    """Returns volumes (M, K) in proportion to the diagonal of the consistent mass (Hinton, Rock, Zienkiewicz 1976).
 
-    Row sums of quadratic elements may be negative at corners; these are positive and keep the volume.
+    Row sums of quadratic elements may be negative at corners; these volumes are positive and sum to the element's.
     """
     assert mesh.element.mass_rule is not None
     points, weights = mesh.element.mass_rule
@@ -199,7 +198,7 @@ def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
 
 
 def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
-    """One point a cell for the shape term; the same, or vertex patches, for the volume term."""
+    """Returns a discretisation with one point per cell for the shape term; these or vertex patches for the volume."""
     points, weights = mesh.element.rule
     gradients, determinants = physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])
     volumes = determinants * weights  # (M, 1)
@@ -215,12 +214,12 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
 def mean_gradients(
     cells: NDArray[np.int64], gradients: Array, shares: scipy.sparse.csr_array
 ) -> tuple[NDArray[np.int64], Array]:
-    """The mean gradient operator of the cells around each vertex, padded to the largest patch.
+    """Returns the mean gradient operator of the cells around each vertex, padded to the largest patch.
 
     Args:
         cells: (M, K) vertices of each cell.
-        gradients: (M, K, 3) of its shape functions in rest space [1/m].
-        shares: (N, M) sparse; volume of each cell that counts at each vertex [m^3].
+        gradients: (M, K, 3) rest-space gradients of the shape functions [1/m].
+        shares: (N, M) sparse; weight of each cell at each vertex, a volume [m^3].
 
     Returns:
         (N, W) vertices of each patch and (N, W, 3) their operators [1/m].
@@ -244,6 +243,6 @@ def mean_gradients(
 
 
 def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> SolidPoints:
-    """One point a vertex with the mean gradient operator of the cells around it."""
+    """Returns one point per vertex, with the mean gradient operator of the cells around it."""
     nodes, operator = mean_gradients(mesh.cells, gradients, quarter)
     return SolidPoints(nodes, operator[:, None], scipy.sparse.csr_array((len(nodes), len(mesh.cells))), quarter)

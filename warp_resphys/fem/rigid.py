@@ -1,4 +1,4 @@
-"""Rigid parts and glue: what makes some vertices of a body depend on others; see `fem.coordinates`."""
+"""Rigid parts and glue, which make vertices of a body depend on others (`fem.coordinates`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from ..io.errors import InputError
 
 @dataclass(frozen=True)
 class Rigid:
-    """A region of a mesh that hardly deforms, such as an end cap, a base plate or an insert.
+    """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert.
 
     Raises:
         InputError: a stiffness that is not positive.
     """
 
-    density: float | Sequence[float] | Any = 1200.0  # [kg/m^3]: a number, or (B, 1) values
+    density: float | Sequence[float] | Any = 1200.0  # [kg/m^3], a number or (B, 1) values
     stiffness: float = 1e9  # kappa of the energy kappa V |F - R(F)|^2 [Pa]
 
     def __post_init__(self) -> None:
@@ -29,8 +29,8 @@ class Rigid:
 
 @dataclass(frozen=True)
 class Glue:
-    """Vertices that stay where they are in the cells of a region that their own cells need not fit."""
+    """Vertices glued to a region of the mesh whose cells need not match theirs."""
 
-    vertices: ArrayLike  # (n,) of the side that follows
-    to: str  # region of the mesh that they are glued to
-    tolerance: float = 1e-3  # how far from it they may be [m]; a gap stays as it is
+    vertices: ArrayLike  # (n,) glued vertices
+    to: str  # region they are glued to
+    tolerance: float = 1e-3  # largest distance from the region [m]; gaps are kept

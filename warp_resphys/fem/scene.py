@@ -1,4 +1,4 @@
-"""Several bodies in one simulator: free, fixed, rigid or soft, each with its name."""
+"""Scene: several named bodies in one simulator, each free, fixed, rigid or soft."""
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -14,20 +14,19 @@ from ..stepping.inputs import Inputs
 from .body import Body
 from .coordinates import Coordinates
 
-_FIELDS = ("external_force", "fixed_positions", "attached_mass")  # of inputs, by vertex
+_FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex
 
 
 class Scene(Body):
-    """Bodies side by side; the vertices of each follow those of the one before.
+    """Bodies in one simulator, with their vertices concatenated; there is no contact between them.
 
-    In the simulator the names of a body's parameters, inputs and memory begin with its name and an underscore, as in
-    ``finger_tension``. Bodies do not touch each other.
+    Names of parameters, inputs and memory variables are prefixed with the body's name, as in ``finger_tension``.
 
     Args:
-        bodies: by name.
+        bodies: bodies by name.
 
     Raises:
-        InputError: there is no body.
+        InputError: no body.
     """
 
     def __init__(self, bodies: Mapping[str, Body]) -> None:
@@ -41,7 +40,7 @@ class Scene(Body):
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The meshes of all bodies as one, whose regions are the bodies and, by ``body_region``, their regions.
+        """The joined mesh; its regions are the bodies, and their regions under the names ``body_region``.
 
         Raises:
             MeshError: the bodies have different kinds of cells.
@@ -50,7 +49,7 @@ class Scene(Body):
 
     @property
     def members(self) -> Iterator[tuple[str, Body, int]]:
-        """Name, body and number of the first vertex of each body."""
+        """Name, body and index of the first vertex of each body."""
         first = 0
         for name, body in self.bodies.items():
             yield name, body, first
@@ -84,46 +83,43 @@ class Scene(Body):
         """(N,) mass of the attached weights [kg]."""
         return np.concatenate([body.attached_mass for body in self.bodies.values()])
 
-    def place(self, name: str) -> slice:
-        """Returns where the vertices of a body lie among those of the scene: ``state.q[:, scene.place("ball")]``.
+    def vertex_slice(self, name: str) -> slice:
+        """Returns the range of a body's vertices in the scene, as in ``state.q[:, scene.vertex_slice("ball")]``.
 
         Raises:
             InputError: no body of that name.
         """
-        for known, body, first in self.members:
-            if known == name:
+        for member, body, first in self.members:
+            if member == name:
                 return slice(first, first + body.n_vertices)
         raise InputError(f"Unknown body {name!r}. The scene has {', '.join(self.bodies)}.")
 
-    def inputs(self, of: Mapping[str, Inputs]) -> Inputs:
-        """Returns the inputs of a simulator of the scene from those of its bodies by name.
+    def inputs(self, by_body: Mapping[str, Inputs]) -> Inputs:
+        """Returns the inputs of the scene's simulator, from the inputs of its bodies by name.
 
-        Forces and attached masses of bodies without any are zero.
+        Bodies without forces or attached masses get zeros.
 
         Raises:
-            InputError: no body of that name, or fixed positions of some bodies that have fixed vertices but not of all.
+            InputError: no body of that name, or fixed positions of some bodies with fixed vertices but not of all.
         """
-        for name in of:
-            self.place(name)
         fields: dict[str, torch.Tensor] = {}
-        for name, own in of.items():
+        for name, own in by_body.items():
+            self.vertex_slice(name)
             fields |= {f"{name}_{key}": value for key, value in own.actuation.items()}
         for key in _FIELDS:
-            given = {name: value for name, own in of.items() if (value := own.fields.get(key)) is not None}
+            given = {name: value for name, own in by_body.items() if (value := own.fields.get(key)) is not None}
             if not given:
                 continue
             axis = -1 if key == "attached_mass" else -2
             sample = next(iter(given.values()))
-            parts = []
             for name, body in self.bodies.items():
                 if name in given:
-                    parts.append(given[name])
                     continue
                 size = len(body.fixed_vertices) if key == "fixed_positions" else body.n_vertices
                 if key == "fixed_positions" and size:
                     raise InputError(f"fixed_positions of {name} are missing: give those of every body that has any.")
-                shape = list(sample.shape)
+                shape = [*sample.shape]
                 shape[axis] = size
-                parts.append(sample.new_zeros(shape))
-            fields[key] = torch.cat(parts, axis)
+                given[name] = sample.new_zeros(shape)
+            fields[key] = torch.cat([given[name] for name in self.bodies], axis)
         return Inputs(**fields)

@@ -140,13 +140,13 @@ class LeastSquares(Reconstructor):
             for number, kind in enumerate(self._problems, 1):
                 problem = kind(step)
                 found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
-                if found.settled or number == len(self._problems):
+                if found.converged or number == len(self._problems):
                     break
-                log.info("full steps moved by %.1e m after %d: damped ones follow", found.moved, found.iterations)
+                log.info("full steps moved by %.1e m after %d: damped ones follow", found.last_step, found.iterations)
             x, force = (each.to(self.simulator.dtype) for each in problem.reached(found.point))
-            if not found.settled:
+            if not found.converged:
                 raise ConvergenceError(
-                    f"{problem.method} reconstruction moved by {found.moved:.1e} m in its last iteration, the "
+                    f"{problem.method} reconstruction moved by {found.last_step:.1e} m in its last iteration, the "
                     f"{found.iterations}th: raise {problem.remedies}.",
                     x,
                     None,

@@ -222,7 +222,7 @@ class WindowLoss:
         told = None if motion.told is None else _during(motion.told.index_select(-2, run), frame, self._window)
         base = None if motion.base is None else motion.base.during(run, frame, self._window)
         predict = LearnedPredictor(self._model, told, self._range, self._frames, base)
-        acting = inputs.from_steps(frame, self._window)
+        acting = inputs.window(frame, self._window)
         rollout = Rollout(simulator, predict, acting, constants)
         squares = state.q.new_zeros(len(windows))
         for step in range(1, self._window + 1):

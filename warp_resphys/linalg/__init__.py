@@ -1,4 +1,4 @@
-"""Linear solvers of the Hessian's structure, conjugate gradients and least squares.
+"""Linear solvers for Hessians, conjugate gradients and nonlinear least squares.
 
-From outside: `choice.make_linear_solver`, `least_squares.minimise`.
+Public: `choice.make_linear_solver`, `least_squares.minimise`.
 """

@@ -1,7 +1,7 @@
-"""LAPACK's banded Cholesky: the cheapest for slender bodies on a CPU, up to tens of thousands of unknowns.
+"""Banded Cholesky by LAPACK: the fastest choice for slender bodies on a CPU, up to tens of thousands of unknowns.
 
-Its routines are called as SciPy offers them to compiled code (``scipy.linalg.cython_lapack``), so that other threads
-may run meanwhile: SciPy's own wrappers keep Python's lock.
+The routines are called through ``scipy.linalg.cython_lapack``, which releases the GIL so that other threads can run;
+SciPy's Python wrappers hold it.
 """
 
 import ctypes
@@ -31,12 +31,12 @@ def _routine(name: str, arguments: int) -> Any:
 
 
 class BandedCholesky:
-    """Factors and solutions in place, of matrices (n, w + 1) by columns: row j has the entries (j, j) to (j + w, j).
+    """In-place factorisation and solution of matrices (n, w + 1), whose row j has the entries (j, j) to (j + w, j).
 
     Args:
-        n: unknowns.
-        width: w, entries below the diagonal.
-        dtype: of matrices and right-hand sides.
+        n: number of unknowns.
+        width: number of entries below the diagonal, w.
+        dtype: dtype of matrices and right-hand sides.
     """
 
     def __init__(self, n: int, width: int, dtype: torch.dtype) -> None:
@@ -46,14 +46,14 @@ class BandedCholesky:
         self._where = [ctypes.addressof(self._lower), *map(ctypes.addressof, self._numbers)]
 
     def factor(self, matrix: torch.Tensor) -> bool:
-        """Overwrites a contiguous matrix by its factor; False where it is not positive definite."""
+        """Overwrites a contiguous matrix with its factor; returns False if it is not positive definite."""
         lower, n, width, rows = self._where
         info = ctypes.c_int()
         self._factor(lower, n, width, matrix.data_ptr(), rows, ctypes.addressof(info))
         return info.value == 0
 
     def solve(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
-        """Overwrites contiguous right-hand sides, (n,) or (m, n), by the solutions."""
+        """Overwrites contiguous right-hand sides, (n,) or (m, n), with the solutions."""
         lower, n, width, rows = self._where
         count, info = ctypes.c_int(1 if columns.ndim == 1 else len(columns)), ctypes.c_int()
         place = columns.data_ptr()
@@ -61,7 +61,7 @@ class BandedCholesky:
 
 
 class BandedSolver(LinearSolver):
-    """Banded Cholesky in reverse Cuthill-McKee order, on the CPU, one environment after another."""
+    """Banded Cholesky in reverse Cuthill-McKee order on the CPU, one environment at a time."""
 
     overwrites = True
 
@@ -117,7 +117,7 @@ class _LU(SeparateFactors):
 
 
 def general_band(band: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """LAPACK's general band storage with room for pivoting, from (n, w + 1) lower symmetric storage."""
+    """Converts (n, w + 1) lower symmetric band storage to LAPACK's general band storage with rows for pivoting."""
     n, w = band.shape[0], band.shape[1] - 1
     general = np.zeros((3 * w + 1, n), dtype=band.dtype, order="F")
     general[2 * w :, :] = band.T

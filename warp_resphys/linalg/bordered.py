@@ -1,15 +1,15 @@
-r"""Banded Cholesky, with the few nodes that couple to many others last: a matrix in the shape of an arrow.
+r"""Banded Cholesky for arrow matrices: the few nodes that couple to many others come last.
 
-The control vertices of a rigid part couple to every vertex around it, and would widen the band to the part's size. Of
+The control vertices of a rigid part couple to every vertex around it and would widen the band to the part's size. In
 
     [A  B^T] [x]   [f]
     [B  C  ] [y] = [g],
 
-with A the banded rest, A^-1 B^T is solved once a factor, and S = C - B A^-1 B^T is a small dense matrix:
+A is banded, A^-1 B^T is computed once per factorisation, the Schur complement S = C - B A^-1 B^T is small, dense:
 
     y = S^-1 (g - B A^-1 f),   x = A^-1 f - A^-1 B^T y.
 
-The whole is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares it with dense
+The matrix is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares with dense
 factorisations.
 """
 
@@ -20,20 +20,20 @@ from typing_extensions import override
 from .banded import BandedSolver
 from .linear_solver import Factor, Indices, LinearSolver
 
-_HUB = 4.0  # times as many neighbours as half of the nodes have at most
+_HUB = 4.0  # a hub has more than this many times the median number of neighbours
 _MOST_HUBS = 64  # nodes
 
 
 def hubs(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """Returns the nodes that couple to many times as many others as most nodes do, ascending; none if too many."""
+    """Returns the nodes with many more neighbours than the median, ascending; none if there are too many of them."""
     apart = rows != cols
     neighbours = np.bincount(np.concatenate([rows[apart], cols[apart]]), minlength=n_nodes)
-    found = np.flatnonzero(neighbours > _HUB * max(float(np.median(neighbours)), 1.0))
-    return found if len(found) <= _MOST_HUBS else found[:0]
+    nodes = np.flatnonzero(neighbours > _HUB * max(float(np.median(neighbours)), 1.0))
+    return nodes if len(nodes) <= _MOST_HUBS else nodes[:0]
 
 
 def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> tuple[Indices, Indices, Indices]:
-    """Returns rows and columns of the blocks between nodes that are not in the border, and the number of each there."""
+    """Returns rows and columns of the blocks outside the border, and the new number of each node, -1 in the border."""
     inside = np.ones(n_nodes, dtype=bool)
     inside[border] = False
     number = np.where(inside, np.cumsum(inside) - 1, -1)
@@ -42,7 +42,7 @@ def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> 
 
 
 class BorderedSolver(LinearSolver):
-    """Banded Cholesky of all nodes but `hubs`, which a dense matrix of their own takes; on the CPU."""
+    """Banded Cholesky of all nodes but `hubs`, and a dense Schur complement for these; on the CPU."""
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
@@ -82,16 +82,16 @@ class BorderedSolver(LinearSolver):
 
 
 class _Bordered(Factor):
-    """Factors of A and S, and what joins them.
+    """Factors of A and S, and the coupling B.
 
     Args:
-        solver: whose layout this is.
+        solver: solver whose layout the matrices have.
         inner: factor of A.
         cross: (B, n - m, m) B^T.
         corner: (B, m, m) C.
-        definite: whether S is to be positive definite.
-        idle: (B,) matrices that keep the factor they have, if any.
-        before: the factors they have.
+        definite: whether S must be positive definite.
+        idle: (B,) matrices that keep their previous factor, if any.
+        before: the previous factors.
     """
 
     cross: torch.Tensor

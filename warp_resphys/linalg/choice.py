@@ -1,8 +1,8 @@
-"""Which linear solver: by name, or the cheapest for a pattern and a device.
+"""Linear solvers by name, and the cheapest one for a sparsity pattern and a device.
 
-The bodies of this field are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest choice
-on a CPU up to tens of thousands of unknowns, and one in tiles on a GPU. Larger bodies go to multigrid on a CPU and to
-CHOLMOD (cholespy) on a GPU, the smallest on a GPU to batched dense Cholesky.
+Soft robots are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest on a CPU up to tens
+of thousands of unknowns, and a tiled one on a GPU. Larger bodies use multigrid on a CPU and CHOLMOD (cholespy) on a
+GPU; the smallest bodies on a GPU use batched dense Cholesky.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from .tiled import TiledSolver
 
 LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
-MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU, beyond which multigrid is the cheaper one
-MAX_TILED_BANDWIDTH = 600  # unknowns, beyond which tiles of a band hold mostly fill on a GPU
+MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU above which multigrid is cheaper
+MAX_TILED_BANDWIDTH = 600  # unknowns above which the tiles of a band hold mostly fill on a GPU
 MAX_DENSE_UNKNOWNS = 4000  # unknowns
 
 
@@ -39,7 +39,7 @@ def make_linear_solver(
     dtype: torch.dtype,
     positions: NDArray[np.float64] | None = None,
 ) -> LinearSolver:
-    """Builds the named solver; ``auto`` takes the cheapest for the pattern and device.
+    """Returns the named solver; ``auto`` selects the cheapest for the pattern and the device.
 
     Raises:
         InputError: an unknown name, or a banded solver on a GPU.
@@ -62,12 +62,11 @@ def make_linear_solver(
 
 
 def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
-    """By what a factor takes of memory, and by the operations that a wide band costs.
+    """Returns the name of the cheapest solver by memory and operations.
 
-    A band of width w takes n w numbers and n w^2 operations, one with a border of m unknowns 4 n w m more,
-    dense n^2 and n^3 / 3; where the band is wide, a sparse
-    factor fills in less. The limit on a CPU was measured (``warp-resphys benchmark sizes``); those on a GPU are
-    arithmetic.
+    A band of width w takes n w numbers and n w^2 operations, a border of m unknowns 4 n w m more, a dense matrix n^2
+    and n^3 / 3; for wide bands a sparse factor has less fill-in. The limit on a CPU is measured (``warp-resphys
+    benchmark sizes``), those on a GPU are estimates from these counts.
     """
     unknowns, width = n_nodes * block, block * bandwidth(rows, cols, n_nodes)
     if device.type == "cpu":

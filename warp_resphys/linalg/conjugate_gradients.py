@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients for a batch of systems that are given by products with vectors."""
+"""Preconditioned conjugate gradients for a batch of matrix-free systems."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,11 +9,11 @@ LinearMap = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Iterate(NamedTuple):
-    """Result of the iterations of a batch."""
+    """Result of `conjugate_gradients`."""
 
-    x: torch.Tensor  # (B, ...)
+    x: torch.Tensor  # (B, ...) solutions
     converged: torch.Tensor  # (B,) bool
-    iterations: int  # until the last of them stopped
+    iterations: int  # largest number of iterations in the batch
 
 
 def conjugate_gradients(
@@ -23,24 +23,23 @@ def conjugate_gradients(
     tolerance: float,
     max_iterations: int = 500,
 ) -> Iterate:
-    """Preconditioned conjugate gradients for a batch of symmetric positive definite systems.
+    """Solves a batch of symmetric positive definite systems.
 
-    A system whose operator turns out not to be positive definite keeps the iterate before: it has come closer to the
-    solution along directions of positive curvature (Steihaug 1983), or is a step of the preconditioner if the first
-    direction is none.
+    A system stops at the first direction of non-positive curvature and returns the iterate before it (Steihaug 1983),
+    or the preconditioned right-hand side if that is the first direction.
 
     Args:
-        operator: (B, ...) to (B, ...).
-        preconditioner: approximate inverse of it, positive definite.
+        operator: maps (B, ...) to (B, ...).
+        preconditioner: positive definite approximate inverse of the operator.
         right: (B, ...) right-hand sides.
         tolerance: relative, in the preconditioner's norm.
-        max_iterations: the last iterate is returned after that many.
+        max_iterations: limit after which the last iterate is returned.
     """
 
     def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         return (a * b).flatten(1).sum(1)
 
-    spread = (-1, *(1,) * (right.ndim - 1))
+    column = (-1, *(1,) * (right.ndim - 1))
     tiny = torch.finfo(right.dtype).tiny
     x = torch.zeros_like(right)
     r = right.clone()
@@ -48,23 +47,23 @@ def conjugate_gradients(
     d = z.clone()
     rz = dot(r, z)
     goal = tolerance**2 * rz
-    curved = torch.zeros_like(rz, dtype=torch.bool)
+    indefinite = torch.zeros_like(rz, dtype=torch.bool)
     count = 0
     for count in range(max_iterations + 1):
-        going = (rz > goal) & ~curved
-        if count == max_iterations or not bool(going.any()):
+        active = (rz > goal) & ~indefinite
+        if count == max_iterations or not bool(active.any()):
             break
         hd = operator(d)
         curvature = dot(d, hd)
-        bent = going & ~(curvature > 0.0)
-        if count == 0 and bool(bent.any()):
-            x += torch.where(bent.view(spread), z, 0.0)
-        curved |= bent
-        step = torch.where(going & ~bent, rz / curvature.clamp_min(tiny), 0.0).view(spread)
+        stopped = active & ~(curvature > 0.0)
+        if count == 0 and bool(stopped.any()):
+            x += torch.where(stopped.view(column), z, 0.0)
+        indefinite |= stopped
+        step = torch.where(active & ~stopped, rz / curvature.clamp_min(tiny), 0.0).view(column)
         x += step * d
         r -= step * hd
         z = preconditioner(r)
-        following = dot(r, z)
-        d = z + (following / rz.clamp_min(tiny)).view(spread) * d
-        rz = following
-    return Iterate(x, (rz >= 0.0) & (rz <= goal) & ~curved, count)
+        new_rz = dot(r, z)
+        d = z + (new_rz / rz.clamp_min(tiny)).view(column) * d
+        rz = new_rz
+    return Iterate(x, (rz >= 0.0) & (rz <= goal) & ~indefinite, count)

@@ -1,7 +1,7 @@
-"""Symmetric linear systems of a batch of bodies: what every factorisation offers.
+"""Interface of the solvers of symmetric linear systems, for a batch of bodies.
 
-A solver is built once for a sparsity pattern; it says at which ``address`` of its value array each matrix entry
-belongs, so that one Warp kernel assembles for every layout. ``factor`` turns a batch of value arrays into a `Factor`.
+A solver is built once per sparsity pattern. Its ``address`` maps each matrix entry to a place in the value array, so
+that one Warp kernel assembles for every layout. ``factor`` turns a batch of value arrays into a `Factor`.
 """
 
 from abc import ABC, abstractmethod
@@ -19,15 +19,15 @@ from typing_extensions import override
 from ..io.errors import InputError
 
 Indices = NDArray[np.int64]
-_MOST_VALUES = 2**31 // 8 - 1  # Warp's strides are 32-bit numbers of bytes.
+_MOST_VALUES = 2**31 // 8 - 1  # Warp strides are 32-bit byte counts.
 
 
 class Factor(ABC):
     """A factorised batch of matrices.
 
     Attributes:
-        approximate: whether solutions in place are rough.
-        failed: (B,) bool; matrices that are not positive definite and have no factor: their solutions are not finite.
+        approximate: whether `solve_in_place` is only approximate.
+        failed: (B,) bool; matrices without a factor because they are not positive definite; their solutions are NaN.
     """
 
     failed: NDArray[np.bool_]
@@ -35,20 +35,20 @@ class Factor(ABC):
 
     @abstractmethod
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        """Solves for (B, n, m) right-hand sides; a factor of batch 1 serves every environment of the batch."""
+        """Returns the solutions for (B, n, m) right-hand sides; a factor of batch 1 applies to every environment."""
 
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        """Overwrites (B, n) right-hand sides, in the order of the linear solver, by their solutions."""
+        """Overwrites (B, n) right-hand sides, in the solver's order of unknowns, with the solutions."""
         columns.copy_(self.solve(columns[:, :, None])[:, :, 0])
 
 
 class CorrectedFactor(Factor):
-    """A factor of A + C C^T from one of A (Sherman, Morrison and Woodbury).
+    """A factor of A + C C^T from a factor of A (Sherman, Morrison and Woodbury).
 
     Args:
-        factor: of A.
+        factor: factor of A.
         columns: (B, n, r) C.
-        order: (n,) unknown at each place of the linear solver.
+        order: (n,) unknowns in the order of the linear solver.
     """
 
     def __init__(self, factor: Factor, columns: torch.Tensor, order: torch.Tensor) -> None:
@@ -60,12 +60,12 @@ class CorrectedFactor(Factor):
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        found = self.factor.solve(rhs)
-        return found - self._solved @ torch.linalg.lu_solve(*self._small, self.columns.mT @ found)
+        x = self.factor.solve(rhs)
+        return x - self._solved @ torch.linalg.lu_solve(*self._small, self.columns.mT @ x)
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        if self.factor.approximate:  # What is rough along C would be amplified.
+        if self.factor.approximate:  # Errors along C would be amplified.
             super().solve_in_place(columns)
             return
         self.factor.solve_in_place(columns)
@@ -74,17 +74,17 @@ class CorrectedFactor(Factor):
 
 
 class SeparateFactors(Factor):
-    """A factor for each matrix of a batch, made one after another; None for a matrix that has none.
+    """One factor per matrix of a batch, computed one after another.
 
     Args:
-        solver: whose order right-hand sides in place have.
-        matrices: B, or one for all environments.
-        factorise: the factor of matrix i; None where it is not positive definite.
-        idle: (B,) matrices that keep the factor they have, if any.
-        before: the factors they have.
+        solver: linear solver, which defines the order of unknowns in `solve_in_place`.
+        matrices: B matrices, or one for all environments.
+        factorise: returns the factor of matrix i, or None if it is not positive definite.
+        idle: (B,) matrices that keep their previous factor, if any.
+        before: the previous factors.
 
     Attributes:
-        factors: of the B matrices.
+        factors: factor of each matrix, or None.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class SeparateFactors(Factor):
         before: Factor | None,
     ) -> None:
         kept = before if isinstance(before, type(self)) else None
-        self._solver, left_out = solver, [False] * len(matrices) if idle is None else idle.tolist()
+        self._solver, is_idle = solver, [False] * len(matrices) if idle is None else idle.tolist()
         self.failed = np.zeros(len(matrices), dtype=bool)
         self.factors: list[Any] = []
         for i, matrix in enumerate(matrices):
-            if left_out[i]:
+            if is_idle[i]:
                 self.factors.append(None if kept is None else kept.factors[i])
                 self.failed[i] = kept is not None and kept.failed[i]
             else:
@@ -109,7 +109,7 @@ class SeparateFactors(Factor):
 
     @abstractmethod
     def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
-        """Overwrites contiguous right-hand sides (m, n) by the solutions, or where not `exact` by rough ones."""
+        """Overwrites contiguous right-hand sides (m, n) with the solutions, approximate ones unless `exact`."""
 
     def _overwrite_all(self, blocks: torch.Tensor, exact: bool) -> None:
         for factor, failed, rows in zip(self.factors, self.failed, blocks, strict=True):
@@ -137,21 +137,21 @@ class LinearSolver(ABC):
     Args:
         rows: (E,) node row of each stored block, ``rows >= cols``.
         cols: (E,) node column of each stored block.
-        n_nodes: rows and columns of the matrix in nodes.
-        block: unknowns a node (3 for a Hessian, 1 for a projective-dynamics matrix).
-        device: where values and right-hand sides live.
-        dtype: their type.
-        positions: (n_nodes, 3) of the nodes [m], for solvers that make use of them.
+        n_nodes: number of nodes.
+        block: unknowns per node (3 for a Hessian, 1 for a projective-dynamics matrix).
+        device: device of values and right-hand sides.
+        dtype: dtype of values and right-hand sides.
+        positions: (n_nodes, 3) node positions [m], for solvers that use them.
 
     Raises:
         InputError: a matrix too large for the layout.
 
     Attributes:
-        address: (E, block^2) place of each block's entries in the value array, -1 where not stored.
+        address: (E, block^2) place of each block entry in the value array, -1 if not stored.
         n_values: length of the value array.
-        overwrites: whether `factor` writes over the values.
-        iterates: whether a factor costs little beside its solutions, which are found by iterations.
-        order: (n_nodes,) node at each place of its right-hand sides `in place <Factor.solve_in_place>`.
+        overwrites: whether `factor` overwrites the values.
+        iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
+        order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
     address: NDArray[np.int32]
@@ -200,10 +200,10 @@ class LinearSolver(ABC):
         Args:
             values: (B, n_values) entries at the solver's addresses, zero elsewhere; see `overwrites`.
             definite: Cholesky, which reports matrices that are not positive definite in ``failed``; otherwise a pivoted
-                factorisation that takes any regular matrix.
+                factorisation of any regular matrix.
             columns: (B, n, r) C.
-            idle: (B,) matrices that keep the factor they have; without one, their solutions may be anything.
-            before: the factor they have. It serves no more itself.
+            idle: (B,) matrices that keep their previous factor; without one, their solutions are undefined.
+            before: the previous factor, which must not be used any more.
         """
         kept = before if idle is not None else None
         if isinstance(kept, CorrectedFactor):
@@ -217,38 +217,37 @@ class LinearSolver(ABC):
     def _factorise(
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
-        """The factor of matrices A; `before` is None unless a matrix is idle."""
+        """Returns the factor of the matrices A; `before` is None unless a matrix is idle."""
 
     @cached_property
     def dofs(self) -> torch.Tensor:
-        """(n,) unknown at each place of the right-hand sides in place."""
+        """(n,) unknowns in the order of the right-hand sides of `Factor.solve_in_place`."""
         dofs = (self.order[:, None] * self.block + np.arange(self.block)).ravel()
         return torch.as_tensor(dofs, device=self.device)
 
     @cached_property
     def places(self) -> torch.Tensor:
-        """(n,) place of each unknown there."""
+        """(n,) place of each unknown in that order."""
         return torch.argsort(self.dofs)
 
     def _entries(self, rows: Indices, cols: Indices) -> tuple[Indices, Indices]:
-        """Scalar row and column (E, block^2) of every entry of every block, in the order of the nodes given."""
+        """Returns the scalar row and column, (E, block^2) each, of every entry of every block."""
         r, c = np.divmod(np.arange(self.block**2), self.block)
         return rows[:, None] * self.block + r, cols[:, None] * self.block + c
 
 
 def bandwidth(rows: Indices, cols: Indices, n_nodes: int) -> int:
-    """Returns the number of nodes in the band, the diagonal included, in `bandwidth_reducing_order`."""
+    """Returns the bandwidth in nodes, including the diagonal, in `bandwidth_reducing_order`."""
     place = np.argsort(bandwidth_reducing_order(rows, cols, n_nodes))
     return int(np.abs(place[rows] - place[cols]).max(initial=0)) + 1
 
 
 def bandwidth_reducing_order(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
-    """(n_nodes,) node at each place, in the given order or reverse Cuthill-McKee's: whichever band is smaller."""
+    """Returns nodes (n_nodes,) in reverse Cuthill-McKee order, or in the given order if its band is not wider."""
     i, j = np.concatenate([rows, cols]), np.concatenate([cols, rows])
     graph = scipy.sparse.csr_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n_nodes, n_nodes))
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True).astype(np.int64)
-    place = np.empty(n_nodes, dtype=np.int64)
-    place[order] = np.arange(n_nodes)
+    place = np.argsort(order)
     if np.abs(place[rows] - place[cols]).max(initial=0) < np.abs(rows - cols).max(initial=0):
         return order
     return np.arange(n_nodes)

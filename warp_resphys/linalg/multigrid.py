@@ -1,4 +1,4 @@
-"""Conjugate gradients preconditioned by algebraic multigrid: for large bodies, at a cost that grows with their size."""
+"""Conjugate gradients preconditioned by algebraic multigrid: for large bodies, at a cost linear in their size."""
 
 import warnings
 from collections.abc import Sequence
@@ -17,27 +17,29 @@ from .sparse import SparseSolver, sparse_lu
 
 FloatArray = NDArray[np.float64]
 
-_COARSEST = 400  # unknowns, up to which a level is solved by a dense factor
-_DEGREE = 3  # of the smoother's polynomial
-_SMOOTHED = 20.0  # ratio of the largest eigenvalue to the smallest one that the smoother reduces
-_POWER_STEPS = 15  # to estimate the largest eigenvalue, which is then taken to be so much larger:
-_MARGIN = 1.1
+_COARSEST = 400  # largest number of unknowns of the coarsest level, which has a dense factor
+_DEGREE = 3  # degree of the smoother's polynomial
+_SMOOTHED = 20.0  # ratio of the largest to the smallest eigenvalue that the smoother damps
+_POWER_STEPS, _MARGIN = 15, 1.1  # power iterations for the largest eigenvalue, and safety factor of the estimate
 _MOST_ITERATIONS = 1000
-_WEAR, _FEW = 1.5, 6  # a cycle is worn once it takes so many times the iterations that it first took, or this number
-DIRECTION = 1e-2  # relative accuracy of a direction of descent
-EXACT = 1e-12  # that of a solution
+_WEAR, _FEW = (
+    1.5,
+    6,
+)  # a cycle is stale once solves take 1.5 times its first number of iterations (counted as 6 or more)
+DIRECTION = 1e-2  # relative accuracy of a descent direction
+EXACT = 1e-12  # relative accuracy of a solution
 
 
 class MultigridSolver(SparseSolver):
     """Conjugate gradients with a V-cycle of smoothed aggregation (Vanek, Mandel and Brezina 1996) by PyAMG.
 
-    The coarse spaces hold the motions of a rigid body, the near-null space of elasticity; the smoother is a Chebyshev
-    polynomial of the block-Jacobi iteration (Adams, Brezina, Hu and Tuminaro 2003). The cycle is made of sparse
-    products, which any device has, and of a dense factor of a few hundred unknowns.
+    The coarse spaces contain the rigid-body motions, the near-null space of elasticity; the smoother is a Chebyshev
+    polynomial of the block-Jacobi iteration (Adams, Brezina, Hu and Tuminaro 2003). The cycle consists of sparse
+    products, available on any device, and a dense factor of a few hundred unknowns.
 
-    Solutions are accurate to 1e-12; directions `in place <Factor.solve_in_place>`, of which a line search takes a share
-    anyway, to 1e-2, where nothing of low rank is added. A matrix whose coarsest level or diagonal is not positive
-    definite counts as failed. One that is not positive definite and has to be solved all the same gets a sparse factor.
+    `Factor.solve` is accurate to 1e-12; `Factor.solve_in_place`, which gives directions for a line search, to 1e-2
+    unless there is a low-rank correction. A matrix whose coarsest level or diagonal blocks are not positive definite
+    counts as failed. With ``definite=False``, matrices get a sparse factor.
     """
 
     iterates = True
@@ -63,12 +65,12 @@ class MultigridSolver(SparseSolver):
         return _Preconditioned(self, entries, partial(self._system, len(values)), idle, before)
 
     def _system(self, batch: int, number: int, entries: torch.Tensor) -> "_System | None":
-        """An environment's matrix, from its `mirrored` entries; None where it is found not to be positive definite."""
+        """Returns an environment's system from its `mirrored` entries, or None if it is seen to be indefinite."""
         environment = (batch, number)
         if not bool(torch.isfinite(entries).all()):
             return None
         cycle = self._cycles.get(environment)
-        if cycle is None or cycle.worn:
+        if cycle is None or cycle.stale:
             at, columns, starts = self._blocks.source, self._blocks.columns, self._blocks.starts
             parts = (entries[at].cpu().numpy(), columns, starts)
             hierarchy = _hierarchy(scipy.sparse.bsr_array(parts, shape=(self.n, self.n)), self._near_null)
@@ -81,16 +83,16 @@ class MultigridSolver(SparseSolver):
 
 
 class _Layout:
-    """Source of the entries of a sparse matrix, from a matrix whose entries are their places, counted from one."""
+    """Index arrays of a sparse matrix and the source of its entries, which `places` holds as indices plus one."""
 
     def __init__(self, places: Any, device: torch.device) -> None:
         self.starts, self.columns = places.indptr, places.indices
         self.source = torch.as_tensor(places.data.astype(np.int64) - 1, device=device)
-        self.indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (self.starts, self.columns)]
+        self.indices = [torch.as_tensor(i.astype(np.int32), device=device) for i in (self.starts, self.columns)]
 
 
 class _Preconditioned(SeparateFactors):
-    """Matrices with a V-cycle each."""
+    """One preconditioned system per matrix."""
 
     approximate = True
 
@@ -101,76 +103,74 @@ class _Preconditioned(SeparateFactors):
 
 
 class _System:
-    """A matrix with a V-cycle, made for it or for an earlier matrix."""
+    """A matrix with a V-cycle, built for it or for an earlier matrix."""
 
     def __init__(self, matrix: torch.Tensor, cycle: "_Cycle") -> None:
         self._matrix, self.cycle = matrix, cycle
         self._lu: Any = None
 
     def direction(self, right: torch.Tensor) -> torch.Tensor:
-        """(m, n) rough solutions for right-hand sides (m, n), each a direction of descent."""
+        """Returns approximate solutions (m, n) for right-hand sides (m, n), all descent directions."""
         return self._iterate(right, DIRECTION).x
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """(m, n) the solutions for (m, n) right-hand sides; by a sparse factor where the iterations do not converge.
+        """Returns solutions (m, n) for (m, n) right-hand sides, by a sparse factor if the iterations do not converge.
 
-        Those of a matrix that has no factor either are not finite.
+        Solutions of a singular matrix are NaN.
         """
         if self._lu is None:
-            found = self._iterate(right, EXACT)
-            if bool(found.converged.all()):
-                return found.x
+            iterate = self._iterate(right, EXACT)
+            if bool(iterate.converged.all()):
+                return iterate.x
             matrix = self._matrix.cpu()
             parts = (matrix.values().numpy(), matrix.col_indices().numpy(), matrix.crow_indices().numpy())
             try:
                 self._lu = sparse_lu(scipy.sparse.csr_array(parts, shape=matrix.shape).tocsc(), definite=False)
             except RuntimeError:
                 return torch.full_like(right, torch.nan)
-        found = self._lu.solve(np.ascontiguousarray(right.cpu().numpy().T))
-        return torch.as_tensor(found.T, device=right.device)
+        columns = self._lu.solve(np.ascontiguousarray(right.cpu().numpy().T))
+        return torch.as_tensor(columns.T, device=right.device)
 
     def _iterate(self, right: torch.Tensor, tolerance: float) -> Iterate:
         matrix, cycle = self._matrix, self.cycle
-        found = conjugate_gradients(
-            lambda x: _times(matrix, x), cycle.apply, right, tolerance, max_iterations=_MOST_ITERATIONS
-        )
-        cycle.note(found.iterations, tolerance)
-        return found
+        iterate = conjugate_gradients(lambda x: _times(matrix, x), cycle.apply, right, tolerance, _MOST_ITERATIONS)
+        cycle.note(iterate.iterations, tolerance)
+        return iterate
 
 
 class _Level(NamedTuple):
     """A level of the hierarchy: its matrix, its smoother, and the transfer to the next level."""
 
     matrix: torch.Tensor  # (n, n) sparse
-    inverse: torch.Tensor  # (n / k, k, k) of its diagonal blocks
-    largest: float  # eigenvalue of the block-Jacobi iteration
+    inverse: torch.Tensor  # (n / k, k, k) inverse diagonal blocks
+    largest: float  # largest eigenvalue of the block-Jacobi iteration
     prolongation: torch.Tensor  # (n, n') sparse
-    restriction: torch.Tensor  # (n', n) its transpose
+    restriction: torch.Tensor  # (n', n) sparse, its transpose
 
 
 class _Cycle:
-    """A V-cycle of a matrix; it serves later ones too, until it is worn.
+    """A V-cycle of a matrix, reused for later matrices until it is stale.
 
     Raises:
-        torch.linalg.LinAlgError: the matrix is not positive definite, as far as its diagonals and coarsest level tell.
+        torch.linalg.LinAlgError: the coarsest level or a diagonal block is not positive definite.
 
     Attributes:
-        worn: whether iterations have become so many that a new one is worth its making.
+        stale: whether the number of iterations has grown so much that a new cycle pays off.
     """
 
     def __init__(self, hierarchy: Any, device: torch.device) -> None:
         *finer, coarsest = hierarchy.levels
-        self._levels = [_level(each, device) for each in finer]
+        self._levels = [_level(level, device) for level in finer]
         self._coarsest = torch.linalg.cholesky(torch.as_tensor(coarsest.A.toarray(), device=device))
-        self._fresh: dict[float, int] = {}
-        self.worn = not finer  # The factor of a small matrix costs nothing, and serves no other.
+        self._first_iterations: dict[float, int] = {}
+        self.stale = not finer  # A single level is exact for this matrix only, and cheap to rebuild.
 
     def note(self, iterations: int, tolerance: float) -> None:
-        """Records the iterations of a solve, to find out when the cycle is worn."""
-        self.worn |= iterations > _WEAR * self._fresh.setdefault(tolerance, max(iterations, _FEW))
+        """Records the iterations of a solve, and marks the cycle as stale if there are too many."""
+        self.stale |= iterations > _WEAR * self._first_iterations.setdefault(tolerance, max(iterations, _FEW))
 
     def apply(self, right: torch.Tensor, k: int = 0) -> torch.Tensor:
-        """(m, n) from (m, n): the cycle from zero on level k."""
+        """Returns (m, n) results of the cycle from level k on, starting from zero, for (m, n) right-hand sides."""
         if k == len(self._levels):
             return torch.cholesky_solve(right.mT, self._coarsest).mT
         level = self._levels[k]
@@ -181,12 +181,12 @@ class _Cycle:
 
 
 def _times(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """(m, n') products of a matrix (n', n) with each of (m, n)."""
+    """Returns the products (m, n') of a matrix (n', n) with vectors (m, n)."""
     return (matrix @ x[0])[None] if len(x) == 1 else (matrix @ x.mT).mT
 
 
 def _smooth(level: _Level, right: torch.Tensor) -> torch.Tensor:
-    """(m, n) a Chebyshev polynomial of the block-Jacobi iteration, from zero (Saad 2003, algorithm 12.1)."""
+    """Applies a Chebyshev polynomial of the block-Jacobi iteration to (m, n), from zero (Saad 2003, algorithm 12.1)."""
     least = level.largest / _SMOOTHED
     middle, half = 0.5 * (level.largest + least), 0.5 * (level.largest - least)
     ratio = middle / half
@@ -196,19 +196,19 @@ def _smooth(level: _Level, right: torch.Tensor) -> torch.Tensor:
     x = step
     for _ in range(_DEGREE - 1):
         residual = residual - _times(level.matrix, step)
-        following = 1.0 / (2.0 * ratio - rho)
-        step = following * rho * step + (2.0 * following / half) * _block_diagonal(level.inverse, residual)
-        x, rho = x + step, following
+        new_rho = 1.0 / (2.0 * ratio - rho)
+        step = new_rho * rho * step + (2.0 * new_rho / half) * _block_diagonal(level.inverse, residual)
+        x, rho = x + step, new_rho
     return x
 
 
 def _block_diagonal(blocks: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """(m, n) products of the blocks (n / k, k, k) with each of (m, n)."""
+    """Returns the products (m, n) of diagonal blocks (n / k, k, k) with vectors (m, n)."""
     return (blocks @ x.view(len(x), -1, blocks.shape[1], 1)).view_as(x)
 
 
 def _level(level: Any, device: torch.device) -> _Level:
-    """Our form of a level of PyAMG."""
+    """Converts a level of PyAMG to torch and estimates its largest eigenvalue."""
     a = level.A
     row = np.repeat(np.arange(len(a.indptr) - 1), np.diff(a.indptr))
     blocks = torch.as_tensor(a.data[row == a.indices], device=device)
@@ -222,14 +222,14 @@ def _level(level: Any, device: torch.device) -> _Level:
 
 
 def _sparse(matrix: Any, device: torch.device) -> torch.Tensor:
-    """A SciPy matrix as a torch matrix on the device, with the 32-bit indices that its libraries need."""
+    """Converts a SciPy matrix to a torch CSR matrix with 32-bit indices, as sparse libraries need."""
     rows = scipy.sparse.csr_array(matrix)
-    indices = [torch.as_tensor(each.astype(np.int32), device=device) for each in (rows.indptr, rows.indices)]
+    indices = [torch.as_tensor(i.astype(np.int32), device=device) for i in (rows.indptr, rows.indices)]
     return _of_rows(indices, torch.as_tensor(rows.data, device=device), rows.shape)
 
 
 def _of_rows(indices: Sequence[torch.Tensor], values: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
-    """A sparse matrix from where its rows start, its columns, and its entries."""
+    """Builds a torch CSR matrix from row starts and columns, and its entries."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
         starts, columns = indices
@@ -237,7 +237,7 @@ def _of_rows(indices: Sequence[torch.Tensor], values: torch.Tensor, shape: tuple
 
 
 def _hierarchy(matrix: scipy.sparse.bsr_array, near_null: FloatArray) -> Any:
-    """PyAMG's levels, the same on every run: weights by row in place of an eigenvalue from random numbers."""
+    """Builds PyAMG's levels deterministically: row-wise weights instead of a randomised eigenvalue estimate."""
     from pyamg.aggregation import smoothed_aggregation_solver
 
     return smoothed_aggregation_solver(
@@ -248,13 +248,13 @@ def _hierarchy(matrix: scipy.sparse.bsr_array, near_null: FloatArray) -> Any:
         presmoother=None,
         postsmoother=None,
         improve_candidates=None,
-        max_coarse=_COARSEST // near_null.shape[1],  # in nodes of as many unknowns
+        max_coarse=_COARSEST // near_null.shape[1],  # nodes with that many unknowns each
         max_levels=20,
     )
 
 
 def _rigid_motions(positions: FloatArray | None, block: int, n_nodes: int) -> FloatArray:
-    """(n, k) translations; (n, 6) with rotations, where there are three unknowns a node at known positions."""
+    """Returns translations (n, k), or (n, 6) translations and rotations for three unknowns per node with positions."""
     translations = np.tile(np.eye(block), (n_nodes, 1))
     if positions is None or block != 3:
         return translations

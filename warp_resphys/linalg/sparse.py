@@ -1,4 +1,4 @@
-"""Sparse Cholesky through CHOLMOD or SuperLU: for wide bodies, one environment after another."""
+"""Sparse Cholesky by CHOLMOD or SuperLU, for wide bodies, one environment at a time."""
 
 from functools import partial
 from typing import Any
@@ -11,11 +11,11 @@ from typing_extensions import override
 
 from .linear_solver import Factor, Indices, LinearSolver, SeparateFactors
 
-_COLUMNS = 128  # that CHOLMOD solves at once on a GPU
+_COLUMNS = 128  # most right-hand sides per call of CHOLMOD on a GPU
 
 
 class SparseSolver(LinearSolver):
-    """CHOLMOD through cholespy (CPU and CUDA); SciPy's SuperLU for indefinite matrices and where cholespy is absent."""
+    """CHOLMOD by cholespy (CPU and CUDA); SciPy's SuperLU for indefinite matrices and without cholespy."""
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
@@ -28,11 +28,11 @@ class SparseSolver(LinearSolver):
         self._rows, self._cols = np.append(lower, upper[self._off]), np.append(upper, lower[self._off])
 
     def mirrored(self, values: torch.Tensor) -> torch.Tensor:
-        """(B, E') entries of both triangles from (B, n_values)."""
+        """Returns the entries (B, E') of both triangles from values (B, n_values) of the lower one."""
         return torch.cat([values, values[:, torch.as_tensor(self._off, device=values.device)]], dim=1)
 
     def matrix(self, entries: torch.Tensor) -> scipy.sparse.csc_array:
-        """(n, n) the matrix of one environment's `mirrored` entries (E',)."""
+        """Returns the matrix (n, n) of one environment from its `mirrored` entries (E',)."""
         data = entries.detach().double().cpu().numpy()
         return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
@@ -71,17 +71,17 @@ class _Cholmod(SeparateFactors):
     def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
         for part in rows.split(_COLUMNS):
             right = part.double().mT.contiguous()
-            found = torch.empty_like(right)
-            factor.solve(right, found)
-            part.copy_(found.mT)
+            solution = torch.empty_like(right)
+            factor.solve(right, solution)
+            part.copy_(solution.mT)
 
 
 def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
-    """SuperLU's factor of a symmetric matrix.
+    """Returns SuperLU's factor of a symmetric matrix.
 
     Raises:
-        ValueError: it is to be positive definite, and is not.
-        RuntimeError: it is singular.
+        ValueError: `definite` is set, but the matrix is not positive definite.
+        RuntimeError: the matrix is singular.
     """
     lu = scipy.sparse.linalg.splu(
         matrix,
@@ -89,14 +89,14 @@ def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
         diag_pivot_thresh=0.0 if definite else 1.0,
         options={"SymmetricMode": definite},
     )
-    # Without pivoting a symmetric matrix is positive definite where every pivot is positive.
+    # Without pivoting, a symmetric matrix is positive definite if and only if all pivots are positive.
     if definite and not (lu.U.diagonal() > 0).all():
         raise ValueError("a pivot is not positive")
     return lu
 
 
 def _cholespy() -> Any:
-    """The cholespy module, or None where it is not installed (it has no wheel for every platform)."""
+    """Returns the cholespy module, or None if it is not installed (wheels exist for some platforms only)."""
     try:
         import cholespy
     except ModuleNotFoundError:

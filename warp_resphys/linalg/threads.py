@@ -1,4 +1,4 @@
-"""Numbers of threads: one for small linear algebra, several for the shards of a batch."""
+"""Thread counts: one thread for small linear algebra, several for the shards of a batch."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -16,53 +16,53 @@ from ..io.errors import InputError
 S = TypeVar("S")
 T = TypeVar("T")
 
-_WORTH_SHARING = 9_000  # unknowns of a body
-_LEAST_ENVIRONMENTS = 2  # of a shard
+_WORTH_SHARING = 9_000  # unknowns of a body from which torch uses several threads
+_LEAST_ENVIRONMENTS = 2  # environments per shard
 
 
 @contextmanager
 def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
-    """BLAS on one thread; torch too, where bodies of so many unknowns are not worth sharing, or shards have one each.
+    """Limits BLAS to one thread, and torch too for small bodies (`unknowns`) or for a batch split into shards.
 
-    Threads that spin for one another's share of a microsecond's work take milliseconds when the cores are busy, and a
-    banded factor gains nothing from a second one.
+    Threads that spin-wait for microseconds of work cost milliseconds when the cores are busy, and a banded factor gains
+    nothing from a second thread.
     """
     before = torch.get_num_threads()
-    one = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
-    # By the libraries themselves: a step is too short to ask all that threadpoolctl asks.
-    several = [(library, count) for library in _blas() if (count := library.get_num_threads()) != 1]
-    for library, _ in several:
+    limit_torch = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
+    # Direct calls to the libraries: threadpoolctl's own queries take too long for a time step.
+    limited = [(library, count) for library in _blas() if (count := library.get_num_threads()) != 1]
+    for library, _ in limited:
         library.set_num_threads(1)
-    if one:
+    if limit_torch:
         torch.set_num_threads(1)
     try:
         yield
     finally:
-        if one:
+        if limit_torch:
             torch.set_num_threads(before)
-        for library, count in several:
+        for library, count in limited:
             library.set_num_threads(count)
 
 
 @cache
 def _blas() -> list[LibController]:
-    found: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
-    return found
+    libraries: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
+    return libraries
 
 
 def shards_of(batch: int, device: torch.device) -> list[slice]:
-    """Rows of a batch that a thread each works on, or nothing if one thread has them all.
+    """Returns the slices of a batch for one thread each, or none if a single thread does it all.
 
-    On a CPU a kernel runs on the thread that launches it, and releases Python's lock meanwhile. As many threads are
-    used as torch may use; ``WARP_RESPHYS_THREADS`` is another number.
+    On a CPU a kernel runs on the thread that launches it and releases the GIL. The number of threads is torch's, or
+    ``WARP_RESPHYS_THREADS``.
 
     Raises:
-        InputError: that is none.
+        InputError: the environment variable is not a whole number.
     """
-    wanted = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
-    if not wanted.isdecimal():
-        raise InputError(f"WARP_RESPHYS_THREADS is {wanted!r}: it must be a whole number of threads.")
-    count = min(int(wanted), batch // _LEAST_ENVIRONMENTS)
+    threads = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
+    if not threads.isdecimal():
+        raise InputError(f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads.")
+    count = min(int(threads), batch // _LEAST_ENVIRONMENTS)
     if device.type != "cpu" or count < 2:
         return []
     ends = [round(batch * k / count) for k in range(count + 1)]
@@ -70,24 +70,24 @@ def shards_of(batch: int, device: torch.device) -> list[slice]:
 
 
 @cache
-def _crew(threads: int) -> ThreadPoolExecutor:
+def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "warp-resphys", lambda: torch.set_num_threads(1))
 
 
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
-    """The results of a function for each shard, the last of which the calling thread works on.
+    """Returns the results of a function for all shards; the calling thread works on the last one.
 
-    What one of them raises is raised when all have ended.
+    Exceptions are raised after all threads have finished.
     """
     if len(shards) == 1:
         return [work(shards[0])]
-    graded = torch.is_grad_enabled()  # Each thread has that setting for itself.
+    grad_enabled = torch.is_grad_enabled()  # a thread-local setting
 
     def work_on(shard: S) -> T:
-        with torch.set_grad_enabled(graded):
+        with torch.set_grad_enabled(grad_enabled):
             return work(shard)
 
-    others = [_crew(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
+    others = [_pool(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
     try:
         own = work(shards[-1])
     finally:

@@ -1,4 +1,4 @@
-"""Banded Cholesky by blocks of threads: for batches of slender bodies on a GPU, each with a factor of its own."""
+"""Tiled banded Cholesky: for batches of slender bodies on a GPU, one block of threads per matrix."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +16,9 @@ from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_ord
 
 
 class TiledSolver(LinearSolver):
-    """Cholesky in tiles over a band, in reverse Cuthill-McKee order, on any device; see ``kernels.tiled_cholesky``.
+    """Banded Cholesky in tiles (``kernels.tiled_cholesky``), in reverse Cuthill-McKee order, on any device.
 
-    A matrix that is not positive definite, and has to be solved all the same, is solved as a dense one.
+    With ``definite=False``, matrices that are not positive definite get a dense factor.
     """
 
     overwrites = True
@@ -50,8 +50,9 @@ class TiledSolver(LinearSolver):
     ) -> Factor:
         values[:, self._padding] = 1.0
         whole = None if definite else values.clone()
-        everyone = torch.ones(len(values), device=values.device, dtype=torch.int32)
-        active = everyone if idle is None else everyone.masked_fill_(idle, 0)
+        active = torch.ones(len(values), device=values.device, dtype=torch.int32)
+        if idle is not None:
+            active.masked_fill_(idle, 0)
         self.launch(self.kernels.factor, (len(values),), active, values.view(-1, *self.shape))
         factor = _TiledFactor(values, self)
         if whole is None or not factor.failed.any():
@@ -60,28 +61,27 @@ class TiledSolver(LinearSolver):
         return _PartlyDense(factor, DenseFactor(self._dense(whole[rows]), definite=False), rows)
 
     def failed(self, values: torch.Tensor) -> NDArray[np.bool_]:
-        """(B,) matrices whose factor has a pivot that is not positive."""
+        """Returns (B,) whether a factor has a pivot that is not positive."""
         failed: NDArray[np.bool_] = (~(values[:, self._diagonal] > 0.0).all(1)).cpu().numpy()
         return failed
 
     def launch(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> None:
-        """Launches on torch's stream."""
+        """Launches a kernel on torch's stream."""
         self._record(kernel, blocks, *arrays).launch(launch_stream(self.device))
 
     def _record(self, kernel: Any, blocks: tuple[int, ...], *arrays: torch.Tensor) -> Any:
-        views = [wp.from_torch(each, requires_grad=False) for each in arrays]
+        views = [wp.from_torch(array, requires_grad=False) for array in arrays]
         options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
             return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
 
     def record_factor(self, values: torch.Tensor, active: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
-        """Launches ``clear``, ``factor`` and ``check`` on a value array (B, n_values); see ``kernels.tiled_cholesky``.
+        """Returns recorded launches of ``clear``, ``factor`` and ``check`` (``kernels.tiled_cholesky``).
 
         Args:
-            values: filled between the first two, and overwritten by the factors.
-            active: (B,) zero for matrices that stay as they are, and after `check` for all but those that failed and
-                were not clamped.
-            clamped: (B,) matrices that are positive definite by force: their factors are not finite if they fail.
+            values: (B, n_values), assembled between ``clear`` and ``factor``, overwritten by the factors.
+            active: (B,) zero for matrices to skip; ``check`` leaves one only where an unclamped matrix failed.
+            clamped: (B,) matrices with clamped eigenvalues; their factors are NaN if they fail.
         """
         batch, unit = len(values), torch.zeros(self.n_values, device=self.device, dtype=self.dtype)
         unit[self._padding] = 1.0
@@ -93,11 +93,11 @@ class TiledSolver(LinearSolver):
         )
 
     def record_solve(self, factors: torch.Tensor, columns: torch.Tensor) -> Any:
-        """The launch that overwrites (B, n) right-hand sides, in the solver's order, by the solutions."""
+        """Returns the recorded launch that overwrites (B, n) right-hand sides, in the solver's order."""
         return self._record(self.kernels.solve, (len(columns), 1), factors.view(-1, *self.shape), columns[:, None])
 
     def _dense(self, values: torch.Tensor) -> torch.Tensor:
-        """(B, n, n) lower triangles."""
+        """Returns the lower triangles (B, n, n)."""
         i = np.arange(self.n)[:, None]
         j = (i // TILE - self.width) * TILE + np.arange(self.shape[1])
         inside = torch.as_tensor((j >= 0) & (j <= i), device=self.device)
@@ -130,7 +130,7 @@ class _TiledFactor(Factor):
 
 
 class _PartlyDense(Factor):
-    """A factor, and dense ones of the matrices (B,) that it has none of."""
+    """A tiled factor, with dense factors for the matrices (B,) whose tiled factorisation failed."""
 
     def __init__(self, factor: _TiledFactor, dense: DenseFactor, rows: torch.Tensor) -> None:
         self._factor, self._dense, self._rows = factor, dense, rows
@@ -140,12 +140,12 @@ class _PartlyDense(Factor):
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        found = self._factor.solve(rhs)
-        found[self._rows] = self._dense.solve(rhs[self._rows][:, self._dofs])[:, self._places]
-        return found
+        solution = self._factor.solve(rhs)
+        solution[self._rows] = self._dense.solve(rhs[self._rows][:, self._dofs])[:, self._places]
+        return solution
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        found = self._dense.solve(columns[self._rows][:, :, None])[:, :, 0]
+        dense = self._dense.solve(columns[self._rows][:, :, None])[:, :, 0]
         self._factor.solve_in_place(columns)
-        columns[self._rows] = found
+        columns[self._rows] = dense

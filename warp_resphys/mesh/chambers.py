@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.errors import MeshError
-from .elements import FACES
+from .elements import FACES, Rule, Shape
 from .mesh import Mesh, boundary_faces, connected_parts, face_triangles
 
 _SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer than that along it are side by side
@@ -26,6 +26,12 @@ class Chamber:
     def vertices(self) -> NDArray[np.int64]:
         """(S,) sorted vertices on it."""
         return np.unique(self.faces)
+
+
+def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
+    """Returns shape functions of the faces, and a rule exact for linear faces and a degree on quadratic ones."""
+    face = FACES[chambers[0].faces.shape[1]]
+    return face.shape, face.rule(degree)
 
 
 def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple[Chamber, ...]:

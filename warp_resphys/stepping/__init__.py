@@ -1,1 +1,1 @@
-"""The state of a batch, what acts on it, and time integration: what energies and the simulator share."""
+"""States, inputs, constants, quantities and time integrators, which the energies and the simulator share."""

@@ -1,4 +1,4 @@
-"""What acts on a batch of bodies over time."""
+"""Time-dependent inputs of a batch of bodies: forces, motion of the fixed vertices, hung weights, actuation."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,16 +10,16 @@ from .quantity import Quantity
 
 
 class Inputs:
-    """What acts on a batch, during one step or during each of T: any subset, all differentiable.
+    """Inputs of a batch for one step or for T steps; every field is optional and differentiable.
 
-    Every field may have a leading axis of time, T, if it changes: `at` gives that of one step. ``attached_mass`` is
-    constant. Without both axes, such as (N, 3) or (n,), a field is that of a batch of one.
+    Every field but ``attached_mass`` may have a leading time axis T; `at` selects one step. A field without time and
+    batch axes, such as (N, 3) or (n,), is a batch of one.
 
     Args:
-        external_force: (B, N, 3) or (T, B, N, 3) held during a step, gravity not included [N].
-        fixed_positions: (B, D, 3) or (T, B, D, 3) of the fixed vertices at the end of a step, in the order of
-            ``body.fixed_vertices`` [m]; where they are, if left out.
-        attached_mass: (1 or B, N) weights that hang on the vertices, beside the body's own [kg].
+        external_force: (B, N, 3) or (T, B, N, 3), constant during a step, without gravity [N].
+        fixed_positions: (B, D, 3) or (T, B, D, 3) positions of the fixed vertices at the end of a step, in the order of
+            ``body.fixed_vertices`` [m]; if omitted, they do not move.
+        attached_mass: (1 or B, N) weights hung on the vertices, beside the body's own [kg].
         actuation: (B, n) or (T, B, n) inputs of the body's energies by name, such as ``pressure`` in each chamber [Pa].
 
     Raises:
@@ -43,75 +43,70 @@ class Inputs:
 
     @property
     def fields(self) -> dict[str, torch.Tensor]:
-        """What is given, by name."""
+        """All fields that are set, by name."""
         names = ("external_force", "fixed_positions", "attached_mass")
-        own = {name: getattr(self, name) for name in names}
-        return {name: value for name, value in (own | self.actuation).items() if value is not None}
+        fields = {name: getattr(self, name) for name in names} | self.actuation
+        return {name: value for name, value in fields.items() if value is not None}
 
     def replace(self, **fields: torch.Tensor | None) -> "Inputs":
-        """The same but for some fields; None takes one out."""
+        """Returns inputs with some fields replaced; None removes a field."""
         return Inputs(**{**self.fields, **fields})
 
-    def each(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "Inputs":
-        """The same with every field changed by a function of it and of the number of its axis of environments."""
+    def map(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "Inputs":
+        """Returns inputs with a function applied to every field and the index of its batch axis."""
         return Inputs(**{name: change(*pair) for name, pair in self.axes().items()})
 
     def select(self, environments: torch.Tensor) -> "Inputs":
-        """Those of some environments, by number."""
-        return self.each(lambda value, axis: value.index_select(axis, environments.to(value.device)))
+        """Returns the inputs of some environments, given their indices."""
+        return self.map(lambda value, axis: value.index_select(axis, environments.to(value.device)))
 
     def repeat(self, times: int) -> "Inputs":
-        """Those of all environments, several times over."""
-        return self if times == 1 else self.each(lambda value, axis: torch.cat([value] * times, axis))
+        """Returns the inputs of the whole batch, repeated along the batch axis."""
+        return self if times == 1 else self.map(lambda value, axis: torch.cat([value] * times, axis))
 
     def joined(self, other: "Inputs") -> "Inputs":
-        """Those of these environments and of others after them."""
+        """Returns the inputs of both batches, concatenated along the batch axis."""
         theirs = other.fields
         return Inputs(**{n: torch.cat([value, theirs[n]], axis) for n, (value, axis) in self.axes().items()})
 
     def to(self, like: torch.Tensor) -> "Inputs":
-        """The same on the device and in the type of a tensor."""
-        return self.each(lambda value, _: value.to(like))
+        """Returns the inputs with the device and dtype of a tensor."""
+        return self.map(lambda value, _: value.to(like))
 
     def plus(self, force: torch.Tensor | None) -> "Inputs":
-        """The same with a further external force (B, N, 3) [N]."""
+        """Returns the inputs with an external force (B, N, 3) added [N]."""
         if force is None:
             return self
         return self.replace(external_force=force if self.external_force is None else self.external_force + force)
 
-    def _series(self) -> Mapping[str, bool]:
-        """Whether a field has an axis of time."""
+    def _has_time_axis(self) -> Mapping[str, bool]:
+        """Whether each field has a time axis, by name."""
         axes = {"external_force": 4, "fixed_positions": 4}
         return {n: n != "attached_mass" and value.ndim == axes.get(n, 3) for n, value in self.fields.items()}
 
     def axes(self) -> dict[str, tuple[torch.Tensor, int]]:
-        """What is given, by name, with the number of its axis of environments."""
-        return {name: (self.fields[name], int(series)) for name, series in self._series().items()}
+        """All fields by name, each with the index of its batch axis."""
+        return {name: (self.fields[name], int(has_time)) for name, has_time in self._has_time_axis().items()}
 
     def check_steps(self, steps: int) -> None:
-        """Refuses series of another length.
-
-        Raises:
-            InputError: a field has another number of steps.
-        """
-        for name, is_series in self._series().items():
-            if is_series and len(self.fields[name]) != steps:
+        """Raises InputError if the time axis of a field has another length than `steps`."""
+        for name, has_time in self._has_time_axis().items():
+            if has_time and len(self.fields[name]) != steps:
                 raise InputError(f"{name} has {len(self.fields[name])} time steps, but {steps} are to be simulated.")
 
     def at(self, step: int) -> "Inputs":
-        """Those during one step; past the end of a series, its last."""
-        series = self._series()
-        if not any(series.values()):
+        """Returns the inputs of one step; after the last step, the last values are held."""
+        has_time = self._has_time_axis()
+        if not any(has_time.values()):
             return self
-        fields = self.fields
-        return Inputs(**{n: v[min(step, len(v) - 1)] if series[n] else v for n, v in fields.items()})
+        return Inputs(**{n: v[min(step, len(v) - 1)] if has_time[n] else v for n, v in self.fields.items()})
 
-    def from_steps(self, first: torch.Tensor, steps: int) -> "Inputs":
-        """Those during some steps, which every environment begins at a step of its own.
+    def window(self, first: torch.Tensor, steps: int) -> "Inputs":
+        """Returns the inputs of consecutive steps that start at another step in each environment.
 
         Args:
-            first: (B,) numbers of the first steps.
-            steps: how many; past the end of a series its last stays.
+            first: (B,) indices of the first steps.
+            steps: length of the window; after the last step, the last values are held.
         """
         span = first + torch.arange(steps, device=first.device)[:, None]
 
@@ -119,8 +114,8 @@ class Inputs:
             at = span.clamp_max(len(value) - 1).to(value.device)
             return value[at, torch.arange(value.shape[1], device=value.device)]
 
-        series = self._series()
-        return Inputs(**{name: pick(v) if series[name] else v for name, v in self.fields.items()})
+        has_time = self._has_time_axis()
+        return Inputs(**{name: pick(v) if has_time[name] else v for name, v in self.fields.items()})
 
     def check(
         self,
@@ -130,45 +125,38 @@ class Inputs:
         fixed: int,
         like: torch.Tensor,
     ) -> None:
-        """Refuses what cannot be simulated, in one sentence on the first such field.
+        """Checks all fields.
 
         Args:
             accepted: inputs of the body's energies by name, each with its number of values n.
             batch: B.
             vertices: N.
             fixed: D.
-            like: a tensor on the device and of the type of the simulator.
+            like: a tensor with the device and dtype of the simulator.
 
         Raises:
-            InputError: an unknown input, a field of another shape or type, or values that are not finite or out of
-                their range.
+            InputError: an unknown input, a wrong shape, dtype or device, or values that are not finite or out of range.
         """
-        known = {
+        fields = {
             "external_force": ((batch, vertices, 3), "N", "vertex"),
             "fixed_positions": ((batch, fixed, 3), "m", "vertex"),
             "attached_mass": ((batch, vertices), "kg", "vertex"),
-        }
-        own = {name: ((batch, count), quantity.unit, quantity.per) for name, (quantity, count) in accepted.items()}
+        } | {name: ((batch, count), quantity.unit, quantity.per) for name, (quantity, count) in accepted.items()}
         for name, values in self.fields.items():
-            if name not in known and name not in own:
-                raise InputError(f"Unknown input {name}. This body accepts {', '.join([*known, *own])}.")
-            shape, unit, place = (known | own)[name]
-            check_tensor(name, values, shape, unit, place, like)
+            if name not in fields:
+                raise InputError(f"Unknown input {name}. This body accepts {', '.join(fields)}.")
+            check_tensor(name, values, *fields[name], like)
             if name in accepted:
                 accepted[name][0].check(values)
 
 
 def _batched(values: torch.Tensor | None, axes: int) -> torch.Tensor | None:
-    """A field with an axis of environments, of one that has only so many axes without it."""
+    """Adds the batch axis to a field that has only `axes` axes."""
     return values[None] if isinstance(values, torch.Tensor) and values.ndim == axes else values
 
 
 def check_tensor(name: str, values: Any, shape: tuple[int, ...], unit: str, place: str, like: torch.Tensor) -> None:
-    """Refuses a tensor of another type, device or shape, or with values that are not finite.
-
-    Raises:
-        InputError: in one sentence that names it.
-    """
+    """Raises InputError if a tensor has the wrong dtype, device or shape, or values that are not finite."""
     if not isinstance(values, torch.Tensor):
         raise InputError(f"{name} is a {type(values).__name__}: it must be a torch tensor.")
     if values.device.type != like.device.type or values.dtype != like.dtype:

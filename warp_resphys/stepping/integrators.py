@@ -1,8 +1,8 @@
-"""Time integrators, each as an implicit Euler step of another length from another start.
+"""Time integrators, each written as an implicit Euler step with its own step length and starting point.
 
-A step of every method here is: find x, the minimum of the incremental potential with effective step ``h_e``, inertial
-target y and strain-rate reference r; then read the new state off x. All of it is linear in the states, so that a method
-is five lines, and its gradients follow from those of the one nonlinear solve.
+Every step minimises the incremental potential with effective step ``h_e``, inertial target y and strain-rate reference
+r, and computes the new state from the minimiser x. Both parts are linear in the states, so the gradients of a method
+follow from those of the nonlinear solve.
 """
 
 from abc import ABC, abstractmethod
@@ -13,22 +13,20 @@ from typing_extensions import override
 from ..io.errors import InputError
 from .state import ImplicitStage, State
 
-INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
-
 
 class Integrator(ABC):
     """One step of a method for M q'' = f(q, q')."""
 
     @abstractmethod
     def stage(self, state: State, h: float) -> ImplicitStage:
-        """The implicit solve of a step of length h [s]."""
+        """Returns the implicit solve of a step of length h [s]."""
 
     @abstractmethod
     def finish(self, state: State, x: torch.Tensor, h: float) -> State:
-        """The new state from the solution x (B, N, 3) of the stage."""
+        """Returns the new state from the solution x (B, N, 3) of the stage."""
 
     def solution_for(self, state: State, q: torch.Tensor) -> torch.Tensor:
-        """The solution x that `finish` turns into the positions q (B, N, 3)."""
+        """Returns the solution x of the stage for which `finish` gives the positions q (B, N, 3)."""
         del state
         return q
 
@@ -46,9 +44,9 @@ class ImplicitEuler(Integrator):
 
 
 class BDF2(Integrator):
-    """Second order, damps what it cannot resolve; its first step is implicit Euler's.
+    """Second order, damps motions that the step does not resolve; the first step is implicit Euler.
 
-    q+ = (4 q - q') / 3 + 2h/3 v+ and the same for v+ (Hairer and Wanner 1996, section V.1), q' being one step back.
+    q+ = (4 q - q') / 3 + 2h/3 v+, likewise for v+ (Hairer and Wanner 1996, section V.1); q' is one step earlier.
     """
 
     @override
@@ -72,12 +70,12 @@ class BDF2(Integrator):
 class Midpoint(Integrator):
     """Implicit midpoint: second order, conserves the energy of small vibrations.
 
-    An implicit Euler step of h/2, then the same step again explicitly: q+ = 2 x - q, v+ = 4 (x - q) / h - v. Motions
-    faster than a few steps ring on; give the material some damping.
+    An implicit Euler step of h/2, then an explicit one: q+ = 2 x - q, v+ = 4 (x - q) / h - v. Vibrations with periods
+    of few steps persist unless the material is damped.
 
-    The strain rate belongs to the end x of that half step, but (E(x) - E(q)) / (h/2) is the one in its middle: with
+    The strain rate is needed at the end x of the half step, but (E(x) - E(q)) / (h/2) is the rate at its middle: with
     L = grad v it lacks h/4 L^T L, as E is quadratic. Since E(q + s v) + E(q - s v) - 2 E(q) = s^2 L^T L, the reference
-    2 E(q) - (E(q + s v) + E(q - s v)) / 2 with s = h/2 mends that, and rigid rotations stay undamped.
+    2 E(q) - (E(q + s v) + E(q - s v)) / 2 with s = h/2 corrects this, and rigid rotations stay undamped.
     """
 
     @override
@@ -96,17 +94,11 @@ class Midpoint(Integrator):
         return State(2.0 * x - state.q, 2.0 * half - state.v)
 
 
-def make_integrator(name: str) -> Integrator:
-    """The named method.
+INTEGRATORS: dict[str, type[Integrator]] = {"implicit_euler": ImplicitEuler, "bdf2": BDF2, "midpoint": Midpoint}
 
-    Raises:
-        InputError: an unknown name.
-    """
-    methods: dict[str, type[Integrator]] = {
-        "implicit_euler": ImplicitEuler,
-        "bdf2": BDF2,
-        "midpoint": Midpoint,
-    }
-    if name not in methods:
+
+def make_integrator(name: str) -> Integrator:
+    """Returns the named integrator, or raises InputError for an unknown name."""
+    if name not in INTEGRATORS:
         raise InputError(f"integrator is {name!r}: choose one of {', '.join(INTEGRATORS)}.")
-    return methods[name]()
+    return INTEGRATORS[name]()

@@ -1,4 +1,4 @@
-"""Numbers that a simulation depends on: their names, units and ranges."""
+"""Parameters and inputs of a simulation: names, units and valid ranges."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,33 +15,32 @@ Parameter = float | Sequence[float] | NDArray[np.float64] | torch.Tensor
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number that a simulation depends on."""
+    """A parameter or an input of a simulation."""
 
-    name: str  # by which parameters and inputs are given
-    unit: str  # of its values
-    lower: float = -np.inf  # all values are greater
-    upper: float = np.inf  # all values are less
+    name: str  # key under which parameters and inputs are passed
+    unit: str  # SI unit of the values
+    lower: float = -np.inf  # exclusive lower bound, inclusive if `closed`
+    upper: float = np.inf  # exclusive upper bound
     closed: bool = False  # whether `lower` itself is allowed
-    # what there may be a value each of, such as ``element`` or ``chamber``; without it, only environments
-    per: str = ""
-    shape: tuple[int, ...] = ()  # of one value that is an array, such as a network's weights; then without `per`
-    typical: float = 1.0  # about how large it is: an input, or a parameter that may be anything
-    words: str = ""  # what an input is called in a sentence, and
-    shown_unit: str = ""  # the unit in which people read it,
-    shown_factor: float = 1.0  # of which this many make one of `unit`
+    per: str = ""  # ``element``, ``chamber`` and the like, if there may be one value for each; empty: one per body
+    shape: tuple[int, ...] = ()  # shape of an array-valued quantity, such as a network's weights; excludes `per`
+    typical: float = 1.0  # order of magnitude of an input, or of a parameter without bounds
+    words: str = ""  # name of an input in a sentence
+    shown_unit: str = ""  # unit of displayed values
+    shown_factor: float = 1.0  # number of `shown_unit` in one `unit`
 
     def shown(self, value: float) -> str:
-        """A value as people read it."""
+        """Returns a value as text, in the displayed unit."""
         return f"{self.shown_factor * value:.4g} {self.shown_unit}"
 
     @property
     def plural(self) -> str:
-        """What several of it are called."""
+        """Plural of `words`."""
         return f"{self.words}{'es' if self.words.endswith('s') else 's'}"
 
     @property
-    def wanted(self) -> str:
-        """Its range in words."""
+    def valid_range(self) -> str:
+        """The valid range in words, with the unit."""
         unit = f", in {self.unit}" if self.unit else ""
         if self.lower == 0.0 and np.isinf(self.upper):
             return ("zero or more" if self.closed else "positive") + unit
@@ -50,9 +49,9 @@ class Quantity:
         return (" and ".join(ends) or "finite") + unit
 
     def varied(self, value: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """A value within the range for every x, and the given one for zero.
+        """Returns a value within the range for every x, and `value` itself for x = 0.
 
-        At first it changes by a factor exp(x), or by x times its size or `typical` where it may be anything.
+        Near x = 0 a bounded value changes by the factor exp(x), an unbounded one by x times its size or `typical`.
         """
         if np.isfinite(self.lower) and np.isfinite(self.upper):
             width = self.upper - self.lower
@@ -62,15 +61,11 @@ class Quantity:
         return value + value.abs().amax().clamp_min(self.typical) * x
 
     def check(self, value: Any) -> None:
-        """Refuses a value out of range.
-
-        Raises:
-            InputError: it is no number or array of numbers, or one of them is out of range.
-        """
+        """Raises InputError unless a value is a number or an array of numbers, all within the range."""
         try:
             values = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
         except (TypeError, ValueError, RuntimeError):
-            raise InputError(f"{self.name} is {value!r}: it must be a number, {self.wanted}.") from None
+            raise InputError(f"{self.name} is {value!r}: it must be a number, {self.valid_range}.") from None
         inside = (values >= self.lower if self.closed else values > self.lower) & (values < self.upper)
         inside &= torch.isfinite(values)
         if self.shape and tuple(values.shape) != self.shape and tuple(values.shape[1:]) != self.shape:
@@ -84,7 +79,7 @@ class Quantity:
             )
         if not bool(inside.all()):
             wrong = values[~inside].flatten()[0].item()
-            raise InputError(f"{self.name} is {wrong:g}: it must be {self.wanted}.")
+            raise InputError(f"{self.name} is {wrong:g}: it must be {self.valid_range}.")
 
     def shaped(self, values: torch.Tensor) -> torch.Tensor:
         """Returns a number, (n,), (B, 1) or (B, n) values as (1 or B, 1 or n), an array as (1 or B, *shape).

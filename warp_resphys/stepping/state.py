@@ -1,21 +1,21 @@
-"""The state of a batch, and the implicit solve that a time step comes down to."""
+"""The state of a batch, and the implicit solve of a time step."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
 
-_MEMORY = "memory."  # begins the names of memory among the tensors of a state
+_MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
 
 @dataclass(frozen=True)
 class State:
-    """Positions and velocities of a batch, and what its energies remember."""
+    """Positions and velocities of a batch, and the memory variables of its energies."""
 
     q: torch.Tensor  # (B, N, 3) [m]
     v: torch.Tensor  # (B, N, 3) [m/s]
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, for BDF2
-    # (B, ...) by name, see `energies.base.Memory`; what is not there is as in a body that has been at rest for long
+    # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     @property
@@ -28,7 +28,7 @@ class State:
         return State.from_tensors({name: change(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> "State":
-        """Returns the state cut off from the autograd graph."""
+        """Returns the state detached from the autograd graph."""
         return self.map(torch.Tensor.detach)
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -48,11 +48,11 @@ class State:
 
 @dataclass(frozen=True)
 class ImplicitStage:
-    """The implicit solve that a time step comes down to."""
+    """The implicit solve of a time step."""
 
     step: float  # effective step h_e [s]
-    target: torch.Tensor  # (B, N, 3) y, where inertia alone would go [m]
-    velocity_reference: torch.Tensor  # (B, N, 3) r with velocity (x - r) / h_e at the solution [m]
-    # (position, weight) pairs whose weighted strains the strain rate starts from
+    target: torch.Tensor  # (B, N, 3) inertial target y, the solution without forces [m]
+    velocity_reference: torch.Tensor  # (B, N, 3) r; the velocity at the solution is (x - r) / h_e [m]
+    # (position, weight) pairs; the weighted sum of their strains is the reference of the strain rate
     strain_weights: tuple[tuple[torch.Tensor, float], ...]
-    end: float = 1.0  # fraction of the time step at which x stands
+    end: float = 1.0  # time of x, as a fraction of the time step

@@ -221,8 +221,10 @@ def test_poses_under_weights_and_releases_are_identified_and_corrected_together(
 def test_settings_are_searched_for_any_experiment(arguments):
     code, err = run("tune", *arguments, "tune.trials=2", *QUIET)
     assert (code, err[-600:] if code else "") == (0, "")
-    (found,) = Path("configs/tuned").glob("*.yaml")
-    assert "network:" in found.read_text()
+    (option,) = Path("configs/tuned").glob("*.yaml")
+    written = option.read_text()
+    assert "network:" in written
+    assert ("in_the_loop:" in written) == ("tune=in_the_loop" in arguments)
 
 
 def test_a_search_where_the_force_is_trained_on_motions_has_its_own_group():

@@ -122,9 +122,9 @@ def write_results(results: SearchResults, finished: bool = False) -> None:
 
 
 def _option_text(results: SearchResults, best: Outcome, trials: int) -> str:
-    """An option of the group ``tuned``: all of ``network`` and ``trainer``, as in the best trial."""
-    training = with_settings(results.training, best.settings)
-    settings: dict[str, Any] = {"network": training.network.plain(), "trainer": training.trainer.plain()}
+    """An option of the group ``tuned``: all settings of the training as in the best trial, but for the seed."""
+    training = with_settings(results.training, best.settings).plain()
+    settings: dict[str, Any] = {key: value for key, value in training.items() if key != "seed" and value is not None}
     if results.tune.model == "simfree":
         settings = {"simfree": settings}
     head = [

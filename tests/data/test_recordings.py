@@ -397,7 +397,7 @@ def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monk
     zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
     np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
     assert (tmp_path / "swing.npz").stat().st_size < 1 << 20
-    with pytest.raises(DataFileError, match=r"swing\.npz .* \(its arrays take more than"):
+    with pytest.raises(DataFileError, match=r"swing\.npz .* \(its arrays are larger than"):
         read_recording(tmp_path / "swing.npz")
     with h5py.File(tmp_path / "swing.h5", "w") as file:
         file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))  # nothing of it in the file

@@ -546,7 +546,7 @@ class TestCommand:
     def test_a_trial_in_two_splits(self, shelf, command):
         err = command("data.folds=null", "data.train=[bare]", "data.test=[bare,load52]")
         assert err.endswith(
-            "error: the trial 'bare' is in data.train and data.test: every trial is in one split, once.\n"
+            "error: the trial 'bare' is in data.train and data.test: a trial belongs to one split only.\n"
         )
 
 

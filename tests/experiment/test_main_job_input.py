@@ -68,7 +68,7 @@ class TestBadInput:
             ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one value."),
             ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
             ("data.weights_g.test=[]", "data.weights_g.test is empty"),
-            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: every trajectory is in one split."),
+            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: a trial belongs to one split only."),
             ("data.weights_g.test=[-4]", "data.weights_g.test holds a value that is not positive: [-4.0]."),
             ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
             (

@@ -256,10 +256,10 @@ def recorded(tmp_path, finished, change):
     [
         (["chambers.count=3"], "the mesh has 2 closed chambers, but chambers.count is 3"),
         (["data.train=9"], "data.train, data.validation and data.test ask for 11 trials, but there are 5"),
-        (["data.test=[t000]"], "the trial 't000' is in data.train and data.test: every trial is in one split, once."),
+        (["data.test=[t000]"], "the trial 't000' is in data.train and data.test: a trial belongs to one split only."),
         (["data.test=[t777]"], "data.test names the trial 't777'"),
-        (["data.folder=nowhere"], "nowhere is no folder"),
-        (["data.train=0"], "data.train is empty: name one of data.trials there"),
+        (["data.folder=nowhere"], "nowhere is not a folder"),
+        (["data.train=0"], "data.train is empty: add at least one of data.trials"),
         (["coupling=weak"], "coupling is 'weak': it must be one of implicit, explicit."),
         (["force_frame=rest"], "force_frame is 'rest': it must be one of corotated, world."),
         (["actuation.filter_time_constants=[-1.0]"], "actuation.filter_time_constants"),
@@ -336,7 +336,7 @@ def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(f
         write_recording(tmp_path / f"{name}.h5", in_kilopascal(read_recording(tmp_path / f"{name}.h5")))
     assert "the pressures of all 4 recordings stay below" in refused(finished, monkeypatch, *places)
     (tmp_path / "t001.csv").touch()
-    assert "t001.csv and t001.h5, two recordings of one name" in refused(finished, monkeypatch, *places)
+    assert "two recordings of one name, t001.csv and t001.h5" in refused(finished, monkeypatch, *places)
 
 
 def test_another_method_of_reconstruction_is_taken_as_a_whole():

@@ -268,7 +268,7 @@ class _Drive(ResumableRollout):
         return self._laboratory.state
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         points = self._laboratory.markers().reshape(len(self._controllers), -1) @ self._task.tracked.T
         return {"points": points, "inputs": self._inputs, "seconds": self._seconds}
 

@@ -574,7 +574,7 @@ class Simulator:
         try:
             x, report = solve(1.0, state.q if start is None else start.detach())
         except ConvergenceError as error:
-            log.info("an equilibrium is sought under growing loads: %s", error)
+            log.debug("the equilibrium is computed under gradually increasing loads: %s", error)
             with torch.no_grad():
                 limited = self.settings.max_iterations < _MOST_ITERATIONS
                 near = ramped(lambda share, at: solve(share, at)[0], state.q, error if limited else None)

@@ -1,4 +1,4 @@
-"""Experiments: from a configuration to objects, and the stages, one module each; they talk through files.
+"""Experiments: builds objects from settings, and runs the stages, one module each, which exchange data through files.
 
-From outside: `build.build_simulator`, `experiment.run_experiment`.
+Entry points: `build.build_simulator`, `experiment.Experiment`.
 """

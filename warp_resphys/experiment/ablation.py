@@ -154,7 +154,7 @@ class _FromMarkers(Reconstructing):
         return self.bring_to(self._markers(self._motion[number].expand_as(self.force)))
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         away = self.state.q - self._motion[number]
         return {
             "error": away.norm(dim=-1).mean(-1).cpu().numpy(),

@@ -1,4 +1,4 @@
-"""What the stages of an experiment share: the body, its trials, its simulators and its models."""
+"""The `Experiment` that all stages share: the body, its trials, its simulators and its models."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Datas
 
 COROTATED: Final = "corotated"
 LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
-# By model: the simulator that it is, or corrects, and the identification whose parameters that has.
+# By model: the simulator that it uses or corrects, and the identification that provides its parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "published": ("published", None),
     "simulation": ("simulation", None),
@@ -53,9 +53,9 @@ class Experiment:
     """The trials and the simulators of an experiment.
 
     Attributes:
-        settings: of the stage.
-        folder: of the split.
-        on_failure: whether a step that fails raises, or is counted.
+        settings: settings of the stage.
+        folder: folder of the split.
+        on_failure: whether a failed step raises an error (``raise``) or is counted (``count``).
     """
 
     settings: LearningStage
@@ -64,16 +64,16 @@ class Experiment:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The trials, and those at scaled inputs where the stage tests them."""
+        """Dataset of the trials, including trials with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
-        found = read_dataset(shared / DATASET)
+        dataset = read_dataset(shared / DATASET)
         if isinstance(self.settings, TestStage) and len(self.settings.groups) > 1:
-            found = found.joined(read_dataset(shared / SCALED_DATASET))
-        return found
+            dataset = dataset.joined(read_dataset(shared / SCALED_DATASET))
+        return dataset
 
     @cached_property
     def body(self) -> Body:
-        """That is simulated."""
+        """The simulated body."""
         return build_body(self.settings, self.settings.payload_at)
 
     @cached_property
@@ -81,11 +81,11 @@ class Experiment:
         return {}
 
     def simulator(self, kind: str) -> Simulator:
-        """A simulator under the gravity of the trials.
+        """Returns a simulator with the gravity of the trials.
 
         Args:
-            kind: ``simulation`` (uncorrected), ``target`` (which made the trials), ``published``, or ``identified``,
-                which may step with another integrator, and take shorter steps.
+            kind: ``simulation`` (uncorrected), ``target`` (which generated the trials), ``published``, or
+                ``identified``, which may use another integrator and a shorter time step.
         """
         if kind not in self._simulators:
             body = None if kind == "published" else self.body
@@ -94,7 +94,7 @@ class Experiment:
         return self._simulators[kind]
 
     def settings_of(self, kind: str) -> SimulatorSettings:
-        """What `build_simulator` makes a simulator of; for its kinds see there."""
+        """Settings of a simulator of some kind, see `simulator`."""
         settings, identified = self.settings, self.settings.identified
         own: dict[str, Any] = {"gravity": tuple(self.dataset.gravity.tolist())}
         if kind == "published":
@@ -105,7 +105,7 @@ class Experiment:
         return SimulatorSettings.of(settings).model_copy(update=own)
 
     def material_of(self, kind: str) -> MaterialSettings:
-        """Material of a simulator; for its kinds see `simulator`."""
+        """Material of a simulator of some kind, see `simulator`."""
         if kind == "published":
             return self._published.simulation
         if kind != "target":
@@ -122,66 +122,65 @@ class Experiment:
 
     @property
     def like(self) -> torch.Tensor:
-        """A tensor on the device and in the type of the simulators."""
+        """A tensor with the device and data type of the simulators."""
         return self.simulator("simulation").rest_positions
 
     @cached_property
     def observe(self) -> Observation:
-        """What recordings show of the body: M markers, or all vertices."""
+        """Observation of the body in the recordings: M markers, or all vertices."""
         if self.dataset.bound is None:
             return WHOLE_STATE
         markers, labels = self.settings.markers, self.dataset.labels
         assert markers is not None
-        found = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
-        return ViewedMarkers.of(found, marker_view_of(markers, labels, self.dataset.sets)).to(self.like)
+        bound = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
+        return ViewedMarkers.of(bound, marker_view_of(markers, labels, self.dataset.sets)).to(self.like)
 
     def observe_by(self, model: str) -> Observation:
-        """The same, with the markers where the identification of a model found that they sit."""
+        """Observation with the marker placement that was identified for a model, if any."""
         key = MODELS[model][1]
         if key is None or self.settings.identified is None:
             return self.observe
-        found = read_json(self.folder / IDENTIFICATION)[key].get("placement")
-        if found is None:
+        placement = read_json(self.folder / IDENTIFICATION)[key].get("placement")
+        if placement is None:
             return self.observe
         assert isinstance(self.observe, Markers)
-        return PlacedMarkers.of(self.observe, Placement.from_plain(found, self.dataset.labels)).to(self.like)
+        return PlacedMarkers.of(self.observe, Placement.from_plain(placement, self.dataset.labels)).to(self.like)
 
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
-        """Some of the trials, which begin alike, on the simulators' device, with inputs for a simulator's steps."""
+        """Trials that begin in the same way, on the device of the simulators, with inputs at the simulator's steps."""
         body, step = (self.body, None) if simulator is None else (simulator.body, simulator.time_step)
-        found = self.dataset.trials(names, body, self.settings.payload_at, step)
-        return found.to(self.like)
+        return self.dataset.trials(names, body, self.settings.payload_at, step).to(self.like)
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
-        """The frame of what the body is fixed to in some of the trials; None where that stands still."""
+        """Frame of the base to which the body is fixed in trials; None if the base stands still."""
         poses = self.dataset.base_at(names, simulator.time_step)
         return None if poses is None else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
 
     def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
-        """(K, R, A) what networks are told of the base during each step: what differs between trials and times."""
-        poses, told = self.dataset.base_at(names, simulator.time_step), self.told_of_base(simulator)
-        if poses is None or told is None:
+        """(K, R, A) motion of the base during each step as network inputs; None if the base stands still."""
+        poses, mask = self.dataset.base_at(names, simulator.time_step), self.base_movement_mask(simulator)
+        if poses is None or mask is None:
             return None
-        moved = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
-        return moved[..., told].to(simulator.rest_positions)
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return movement[..., mask].to(simulator.rest_positions)
 
-    def told_of_base(self, simulator: Simulator) -> torch.Tensor | None:
-        """(15,) bool, which numbers of `base_movement` networks are told; None where the base stands still."""
-        everything = self.dataset.base_at(self.dataset.names, simulator.time_step)
-        if everything is None:
+    def base_movement_mask(self, simulator: Simulator) -> torch.Tensor | None:
+        """(15,) bool, components of `base_movement` that vary and are network inputs; None if the base stands still."""
+        poses = self.dataset.base_at(self.dataset.names, simulator.time_step)
+        if poses is None:
             return None
-        known = base_movement(everything, simulator.time_step, torch.from_numpy(self.dataset.gravity))
-        return known.flatten(0, 1).std(0) > _STANDS_STILL
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return movement.flatten(0, 1).std(0) > _STANDS_STILL
 
-    def alike(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Trials in groups that begin alike, and can be simulated as one batch."""
-        found: dict[str, list[str]] = {}
+    def batches(self, names: Sequence[str]) -> list[tuple[str, ...]]:
+        """Groups trials by how they begin; the trials of a group can be simulated as one batch."""
+        groups: dict[str, list[str]] = {}
         for name in names:
-            found.setdefault(self.begins(name), []).append(name)
-        return [tuple(some) for some in found.values()]
+            groups.setdefault(self.begins(name), []).append(name)
+        return [tuple(group) for group in groups.values()]
 
     def moving(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of the trials that have a time."""
+        """Names of the trials that are motions, not static poses."""
         return tuple(name for name in names if self.begins(name) != STATIC)
 
     def begins(self, name: str) -> str:
@@ -189,7 +188,7 @@ class Experiment:
         return self.dataset.begins[self.dataset.names.index(name)]
 
     def start(self, replay: Replay, model: str = "simulation") -> Start:
-        """How trials begin, as the simulator of a model would have it."""
+        """Estimates how the trials of a replay begin, with the simulator of a model."""
         simulator, trials = replay.simulator, replay.trials
         begins = self.begins(trials.names[0])
         if begins == GIVEN:
@@ -200,25 +199,25 @@ class Experiment:
         if begins == "released":
             return estimate_release(simulator, replay.observe, trials, self.settings.release)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
-        if begins == STATIC:  # Far from rest, where whoever changes a parameter a little need not begin again.
+        if begins == STATIC:  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.setting(self.parameters(model))
                 guess = simulator.static_equilibrium(resting, constants).q
         return Start.resting(guess)
 
     def replay(self, simulator: Simulator, names: Sequence[str], model: str = "simulation") -> Replay:
-        """A simulator of some of the trials, which begin alike, seen as a model sees them."""
+        """Replay of trials that begin in the same way, with a model's observation."""
         return Replay(simulator, self.observe_by(model), self.trials(names, simulator))
 
     def replays(
         self, simulator: Simulator, names: Sequence[str], model: str = "simulation"
     ) -> list[tuple[Replay, Start]]:
-        """A simulator of any of the trials, a replay for those that begin alike, and how they begin."""
-        found = [self.replay(simulator, some, model) for some in self.alike(names)]
-        return [(each, self.start(each, model)) for each in found]
+        """Replays of any trials, one for each way of beginning, each with its start."""
+        replays = [self.replay(simulator, batch, model) for batch in self.batches(names)]
+        return [(replay, self.start(replay, model)) for replay in replays]
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
-        """(1,) identified parameters of a model's simulator; none for one that is not identified."""
+        """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
         key = MODELS[model][1]
         if key is None or self.settings.identified is None:
             return {}
@@ -226,87 +225,87 @@ class Experiment:
         return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
 
     def model_simulator(self, model: str) -> Simulator:
-        """The one that a model is, or corrects."""
+        """The simulator that a model uses or corrects."""
         kind = MODELS[model][0]
         return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
 
     def conditions(
         self, replay: Replay, parameters: Mapping[str, torch.Tensor], payload: bool = False
     ) -> torch.Tensor | None:
-        """What networks are told of trials beside the state; None where nothing acts on them.
+        """Returns the network inputs of trials besides the state; None if there are none.
 
         Args:
-            replay: of the trials.
-            parameters: (1,) that were identified.
-            payload: whether they are told of it, whatever is configured (``actuation.sees_payload``).
+            replay: replay of the trials.
+            parameters: (1,) identified parameters.
+            payload: whether to include the payload even if ``actuation.sees_payload`` is false.
 
         Returns:
-            (R, 1) the payloads [kg]; or (K, R, A) during each step, these, each input with its exponential means, and
-            how the base moves (`base_movement`). Of poses (R, A), whose inputs have lasted.
+            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs with their
+            exponential means, and motion of the base (`base_movement`). (R, A) for static poses, under steady inputs.
         """
         _, inputs, resting = replay.setting(parameters)
         assert isinstance(self.settings, NetworkStage)
-        actuation, told = self.settings.actuation, list[torch.Tensor]()
+        actuation, constant = self.settings.actuation, list[torch.Tensor]()
         if self.settings.payload_at is not None and (payload or actuation.sees_payload):
             rows = self.dataset.rows(replay.trials.names)
-            told.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
-        constants = actuation.filter_time_constants
+            constant.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
+        filters = actuation.filter_time_constants
         acting = resting if replay.is_static else inputs
-        driven = [each for name, each in acting.actuation.items() if name != PAYLOAD.name]
+        driven = [values for name, values in acting.actuation.items() if name != PAYLOAD.name]
         moving = self._base_movement(replay.trials.names, replay.simulator)
         if replay.is_static:
-            told += [each.repeat(1, 1 + len(constants)) for each in driven]
-            told += [] if moving is None else [moving[0]]
-            return torch.cat(told, -1) if told else None
-        response = InputResponse(replay.simulator.time_step, filters=constants)
-        series = [told_of(*response.from_rest(each)) for each in driven]
+            constant += [values.repeat(1, 1 + len(filters)) for values in driven]
+            constant += [] if moving is None else [moving[0]]
+            return torch.cat(constant, -1) if constant else None
+        response = InputResponse(replay.simulator.time_step, filters=filters)
+        series = [told_of(*response.from_rest(values)) for values in driven]
         series += [] if moving is None else [moving]
         if not series:
-            return told[0] if told else None
+            return constant[0] if constant else None
         at = torch.arange(max(map(len, series)))
-        series = [each[at.clamp_max(len(each) - 1).to(each.device)] for each in series]
-        return torch.cat([*(each.expand(len(at), -1, -1) for each in told), *series], -1)
+        series = [values[at.clamp_max(len(values) - 1).to(values.device)] for values in series]
+        return torch.cat([*(values.expand(len(at), -1, -1) for values in constant), *series], -1)
 
     def frames(self, simulator: Simulator, kind: str | None = None) -> VertexFrames | None:
-        """With which residual forces turn; None where they keep their directions (``force_frame: world``)."""
+        """Corotational frames of the residual forces; None for forces in the world frame (``force_frame: world``)."""
         if (self.settings.force_frame if kind is None else kind) != COROTATED:
             return None
         return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions)
 
-    def explained(self, replay: Replay, start: Start) -> torch.Tensor:
-        """(R, K + 1, M, 3) what forces are to explain at a simulator's steps [m], NaN where nothing was seen.
+    def targets(self, replay: Replay, start: Start) -> torch.Tensor:
+        """(R, K + 1, M, 3) target positions at a simulator's steps [m], NaN where a marker was not seen.
 
-        That is the part of each trial that is learned from.
+        Only the part of each trial that is used for training is returned.
         """
         simulator, trials = replay.simulator, replay.trials
         if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
-            found = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+            targets = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
         elif self.begins(trials.names[0]) in (GIVEN, STATIC):
-            found = trials.observed
+            targets = trials.observed
         else:
-            found = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
-        return found[:, : self.learned_steps(found.shape[1] - 1) + 1]
+            targets = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
+        return targets[:, : self.learned_steps(targets.shape[1] - 1) + 1]
 
     def learned_steps(self, steps: int) -> int:
-        """Steps of a trial that are learned from."""
+        """Number of steps of a trial that are used for training."""
         return max(round(self.settings.train_fraction * steps), 1)
 
 
 def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
     """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
 
-    Cubic splines through the frames in which a marker was seen, with where it was held at time zero. Steps further than
-    a frame and a half from the next sight of a marker count as not seen.
+    Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at
+    time zero. A marker counts as not seen at steps that are more than 1.5 frames away from its nearest frame.
 
     Args:
-        trials: observed.
-        step: h [s].
-        delay: (R,) by which the bodies were let go later than the time zero of the frames [s]; none if left out.
+        trials: observed trials.
+        step: time step h [s].
+        delay: (R,) delay of the release after time zero of the frames [s]; zero by default.
     """
     since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
     times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
-    found = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
+    positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
     for r, m in np.ndindex(len(times), markers.shape[2]):
         seen = np.isfinite(markers[r, :, m]).all(1)
         t, y = times[r, seen], markers[r, seen, m]
@@ -318,5 +317,5 @@ def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> 
             continue
         nearest = np.abs(steps[:, None] - t).min(1)
         near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
-        found[r, near, m] = CubicSpline(t, y)(steps[near])
-    return found
+        positions[r, near, m] = CubicSpline(t, y)(steps[near])
+    return positions

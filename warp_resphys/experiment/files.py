@@ -1,4 +1,4 @@
-"""Names of the files in a run folder, and the dataset: trials as they were simulated or recorded."""
+"""Names of the files in a run folder, and the dataset of simulated or recorded trials."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ TIMES: Final = "times.json"
 MESH_CHECK: Final = "mesh_check.json"
 CONTROL: Final = "control.json"
 DRIVEN: Final = "driven.h5"
-# What drives a robot: the beginning of its name, and what it plans with or its gain.
+# Prefixes of the names of controllers; the rest of a name is the planning model or the gain.
 OPEN: Final = "open_"
 RECEDING: Final = "receding_"
 LINEAR: Final = "linear"
@@ -44,7 +44,7 @@ FEEDBACK: Final = "feedback_"
 METRICS: Final = "metrics.json"
 REPORT: Final = "report.html"
 
-GIVEN: Final = "given"  # how trials begin whose state a simulation knows
+GIVEN: Final = "given"  # beginning of simulated trials, whose initial state is known
 STATIC: Final = "static"
 _KIND = "dataset"
 _UNITS = {
@@ -54,52 +54,52 @@ _UNITS = {
 
 
 def reconstruction_file(model: str) -> str:
-    """The states and forces that a model's simulator was brought to."""
+    """File of the states and residual forces reconstructed with a model's simulator."""
     return f"reconstruction_{model}.h5"
 
 
 def weights_file(model: str, refined: bool = False) -> str:
-    """What a model has learned."""
+    """File of a model's trained weights."""
     return f"{model}_refined.safetensors" if refined else f"{model}.safetensors"
 
 
 def training_file(model: str, refined: bool = False) -> str:
-    """How the training of a model, or its refinement through the simulator, went."""
+    """File of a model's training history, or of its refinement through the simulator."""
     return f"refinement_{model}.json" if refined else f"training_{model}.json"
 
 
 def fold_folder(trial: str) -> str:
-    """The folder of the fold that is tested on a trial, in the run folder."""
+    """Subfolder of the fold that is tested on a trial."""
     return f"fold_{trial}"
 
 
 def read_if_there(path: Path) -> dict[str, Any]:
-    """What a JSON file holds; nothing where there is none."""
+    """Contents of a JSON file, or an empty dictionary if the file does not exist."""
     content: dict[str, Any] = read_json(path) if path.is_file() else {}
     return content
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """R trials of one body, in its frame, as `DATASET` has them.
+    """R trials of one body, in the frame of the body, as stored in `DATASET`.
 
     Attributes:
-        names: of the trials.
-        labels: of the M tracked markers; none where every vertex is observed.
+        names: names of the trials.
+        labels: labels of the M tracked markers; empty if every vertex is observed.
         begins: how each trial begins, see `settings.trials.Begins`; held bodies are ``released`` here.
-        times: (R, T) of the frames [s]; trials that end early repeat their last time.
-        observed: (R, T, M, 3) [m], NaN where nothing was seen.
-        held: (R, M, 3) the same before time zero [m], NaN for markers that a trial does not have.
-        payload: (R,) mass that hangs on the body [kg].
-        gravity: (3,) [m/s^2].
-        time_step: of the inputs [s].
-        bound: (M, 3) the markers on the undeformed body [m]; None for vertices.
-        smoothed: (R, T, M, 3) what forces are to explain of the markers [m]; None for all of it.
-        velocity: (R, T, N, 3) of the vertices [m/s], where a simulation knows them.
-        inputs: (R, K, C) during each step, by name, such as ``pressure`` [Pa]; see `actuators.DRIVING_QUANTITIES`.
-        channels: names of the C values, by input.
-        base: (R, K + 1, 6) how what the body is fixed to has moved at the steps, see `data.base_motion`; None where it
-            stands still.
+        times: (R, T) times of the frames [s]; trials that end early repeat their last time.
+        observed: (R, T, M, 3) observed positions [m], NaN where a marker was not seen.
+        held: (R, M, 3) positions before time zero [m], NaN for markers that a trial does not have.
+        payload: (R,) mass hanging on the body [kg].
+        gravity: (3,) gravity [m/s^2].
+        time_step: time step of the inputs [s].
+        bound: (M, 3) markers on the undeformed body [m]; None for vertices.
+        smoothed: (R, T, M, 3) smoothed positions that residual forces are fitted to [m]; None to fit `observed`.
+        velocity: (R, T, N, 3) velocities of the vertices [m/s], in simulated trials.
+        inputs: (R, K, C) inputs during each step, by name, such as ``pressure`` [Pa]; see
+            `actuators.DRIVING_QUANTITIES`.
+        channels: names of the C channels, by input.
+        base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
     """
 
     names: tuple[str, ...]
@@ -120,25 +120,25 @@ class Dataset:
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """(R, M) whether a trial has a marker: whether that is seen in any of its frames."""
+        """(R, M) whether a trial has a marker, i.e. whether any of its frames shows the marker."""
         seen = np.asarray(np.isfinite(self.observed).all(axis=-1))
         return np.asarray(seen.any(axis=1))
 
     @property
     def sets(self) -> tuple[tuple[int, ...], ...]:
-        """The numbers of the markers that trials have; none where all have all."""
+        """Sets of marker indices that occur in the trials; empty if every trial has all markers."""
         kept = np.unique(self.present, axis=0)
         return () if kept.all() else tuple(tuple(np.flatnonzero(row).tolist()) for row in kept)
 
     def write(self, path: Path) -> None:
-        """Writes its file, for `read_dataset`.
+        """Writes the dataset to a file, see `read_dataset`.
 
         Raises:
             DataFileError: the file cannot be written.
         """
         words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
-        words |= {f"{name}_channels": known for name, known in self.channels.items()}
-        attributes = {**{key: list(each) for key, each in words.items()}, "gravity": self.gravity}
+        words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
+        attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
             for name, unit in _UNITS.items():
                 if getattr(self, name) is not None:
@@ -148,11 +148,9 @@ class Dataset:
                 create(file, name, values, units=DRIVING_QUANTITIES[name].unit or "1", time_axis=1)
 
     def joined(self, other: "Dataset") -> "Dataset":
-        """These trials and others of the same body after them, with as many frames."""
+        """Returns a dataset with these trials followed by others of the same body with the same number of frames."""
         arrays = {
-            name: None
-            if getattr(self, name) is None
-            else np.concatenate([getattr(each, name) for each in (self, other)])
+            name: None if getattr(self, name) is None else np.concatenate([getattr(self, name), getattr(other, name)])
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
@@ -161,18 +159,18 @@ class Dataset:
         return replace(self, **changed)
 
     def rows(self, names: Sequence[str]) -> list[int]:
-        """Where trials are."""
+        """Indices of trials."""
         return [self.names.index(name) for name in names]
 
     def _during(self, values: FloatArray, time_step: float) -> FloatArray:
-        """(K', R, C) inputs (R, K, C) during steps of another length: those of the step in whose middle theirs is."""
+        """(K', R, C) inputs (R, K, C) resampled to another time step, by the values at the middle of each new step."""
         count = round(values.shape[1] * self.time_step / time_step)
         at = ((np.arange(count) + 0.5) * time_step / self.time_step).astype(np.int64)
-        found: FloatArray = values[:, np.minimum(at, values.shape[1] - 1)].swapaxes(0, 1).copy()
-        return found
+        resampled: FloatArray = values[:, np.minimum(at, values.shape[1] - 1)].swapaxes(0, 1).copy()
+        return resampled
 
     def base_at(self, names: Sequence[str], time_step: float) -> torch.Tensor | None:
-        """(K + 1, R, 6) the motion of the base in some of the trials, at steps of another length; None for none."""
+        """(K + 1, R, 6) motion of the base in trials, resampled to another time step; None if the base stands still."""
         if self.base is None:
             return None
         times = self.time_step * np.arange(self.base.shape[1])
@@ -183,13 +181,13 @@ class Dataset:
     def trials(
         self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float | None = None
     ) -> Trials:
-        """Some of the trials, which begin alike, in float64 on the CPU.
+        """Returns trials that begin in the same way, in float64 on the CPU.
 
         Args:
-            names: of the trials.
-            body: that payloads hang on.
+            names: names of the trials.
+            body: body that carries the payloads.
             payload_at: see `payload_inputs`.
-            time_step: of the simulation, if another than that of the inputs [s].
+            time_step: time step of the simulation [s]; by default the time step of the inputs.
 
         Raises:
             InputError: see `payload_inputs`.
@@ -201,7 +199,7 @@ class Dataset:
         given = {key: torch.from_numpy(self._during(values[rows], step)) for key, values in self.inputs.items()}
         if any(self.payload):
             hung = payload_inputs(body, payload_at, self.payload[rows])
-            given |= {key: torch.from_numpy(each) for key, each in hung.items()}
+            given |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
         poses = self.base_at(names, step)
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
@@ -212,14 +210,14 @@ class Dataset:
 
 
 def read_dataset(path: Path) -> Dataset:
-    """Reads what `Dataset.write` wrote.
+    """Reads a dataset written by `Dataset.write`.
 
     Raises:
         DataFileError: the file is missing, damaged or of another kind.
     """
     with read_hdf5(path, _KIND) as file:
         names, labels, begins, inputs = (
-            tuple(str(each) for each in file.attrs[key]) for key in ("names", "labels", "begins", "inputs")
+            tuple(map(str, file.attrs[key])) for key in ("names", "labels", "begins", "inputs")
         )
         r = len(names)
         times = read_array(file, "times", (r, None))
@@ -239,25 +237,25 @@ def read_dataset(path: Path) -> Dataset:
             time_step=float(file.attrs["time_step"]),
             base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
             inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
-            channels={name: tuple(str(each) for each in file.attrs[f"{name}_channels"]) for name in inputs},
+            channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
             **optional,
         )
 
 
 def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:
-    """What payloads are for a simulation, as arguments of `Inputs` [kg].
+    """Converts payloads to arguments of `Inputs` [kg].
 
-    On a body with strings they are (R, 1) `energies.strings.PAYLOAD`; on others an (R, N) ``attached_mass`` in equal
-    shares on the vertices that carry them.
+    On a body with strings the result is (R, 1) `energies.strings.PAYLOAD`; otherwise it is an (R, N) ``attached_mass``,
+    in equal shares on the vertices that carry the payload.
 
     Args:
-        body: that they hang on.
-        payload_at: its vertices; None where nothing ever hangs.
-        loads: (R,) [kg].
+        body: body that carries the payloads.
+        payload_at: place of the carrying vertices; None if there is never a payload.
+        loads: (R,) payloads [kg].
 
     Raises:
-        InputError: a payload without a place, or a place where nothing can move.
-        MeshError: no vertex lies there.
+        InputError: a payload without a place, or a place with fixed vertices only.
+        MeshError: no vertex lies at the place.
     """
     if any(isinstance(energy, Strings) for energy in body.energies):
         return {PAYLOAD.name: loads[:, None].copy()}
@@ -268,6 +266,6 @@ def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArr
         raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
     carrying = select_vertices(body.mesh, **payload_at.arguments())
     if np.isin(carrying, body.fixed_vertices).all():
-        raise InputError("data.payload_at names fixed vertices alone: hang the payload on vertices that can move.")
+        raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)
     return {"attached_mass": masses}

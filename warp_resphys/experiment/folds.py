@@ -1,4 +1,4 @@
-"""A cross-validation: the folds of an experiment, each in a folder of its own, several at once."""
+"""Cross-validation: runs the folds of an experiment in parallel, with one folder per fold."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -20,9 +20,9 @@ class Fold:
     """One fold of a cross-validation.
 
     Attributes:
-        name: of the trial that is left out.
-        folder: of its files.
-        stages: makes its stages for the workers that share their work; can be sent to another process.
+        name: name of the trial that is left out.
+        folder: folder of the fold's files.
+        stages: makes the stages of the fold for given workers; can be sent to another process.
     """
 
     name: str
@@ -31,13 +31,13 @@ class Fold:
 
 
 def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
-    """Runs the folds that are not up to date: as many at once as there are workers; the last one alone has all of them.
+    """Runs the folds that are not up to date, one per worker; a single remaining fold uses all workers.
 
-    The numbers do not depend on the workers.
+    The results do not depend on the number of workers.
 
     Raises:
-        WorkerError: a fold failed; the others keep what they have computed.
-        StageInterrupted: Ctrl-C; all folds keep what they have computed.
+        WorkerError: a fold failed; the other folds keep their results.
+        StageInterrupted: Ctrl-C; all folds keep their results.
     """
     left = [fold for fold in folds.values() if not up_to_date(fold.stages(ALONE), fold.folder)]
     if workers.alone or len(left) <= 1:
@@ -60,18 +60,18 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
             fan_out(_run, left, workers.at_most(len(left)), advance, left[0].folder.parent)
     except KeyboardInterrupt as error:
         raise StageInterrupted(
-            f"interrupted in the folds {', '.join(running)}; they keep what they have saved, as do those before them, "
-            "and the same command goes on from there"
+            f"interrupted in the folds {', '.join(running)}; all saved results are kept, and "
+            "the same command goes on from there"
         ) from error
 
 
 def _run(fold: Fold, advance: Advance) -> None:
-    """Runs a fold in a worker process; `advance` is called at the beginning of every stage."""
+    """Runs a fold in a worker process; calls `advance` at the beginning of every stage."""
     logging.basicConfig(level=logging.WARNING, format=f"fold {fold.name}: %(message)s", force=True)
     counts = iter([0])
     try:
         run_stages(
-            fold.stages(ALONE), fold.folder, begins=lambda each: advance(next(counts, 1), name=fold.name, stage=each)
+            fold.stages(ALONE), fold.folder, begins=lambda stage: advance(next(counts, 1), name=fold.name, stage=stage)
         )
     except ResphysError as error:
         raise WorkerError(f"fold {fold.name}: {error}") from error

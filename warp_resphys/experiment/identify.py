@@ -1,4 +1,4 @@
-"""Stage: the physical parameters that explain the training trials."""
+"""Stage: identifies the physical parameters from the training trials."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,29 +24,33 @@ from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
 _LANDSCAPE = "landscape"
-_AT_ONCE = 4  # points of the landscape
+_AT_ONCE = 4  # points of the landscape per batch
 
 Replays = Sequence[tuple[Replay, Start]]
 
 
 def identify(context: StageContext) -> None:
-    """Writes identification.json: the configured parameters, E and nu alone where that is asked for, and the landscape.
+    """Writes identification.json: all configured parameters, optionally E and nu alone, and the loss landscape.
 
-    E and nu alone belong to the uncorrected simulator, with its integrator, as published; the parameters belong to the
-    identified one. A few of the training trials, and the beginning of each, may tell enough: ``identify.trials`` and
-    ``identify.seconds``. What an interrupted run has finished is not done again: starts, searches, points.
+    E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
+    the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
+    training trials. An interrupted run keeps its finished starts, searches and points.
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
     experiment = Experiment(settings, context.run_dir)
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-    ranges = {model: {name: bounds_of(each) for name, each in some.items()} for model, some in searches.items() if some}
+    ranges = {
+        model: {name: bounds_of(limits) for name, limits in search.items()}
+        for model, search in searches.items()
+        if search
+    }
     kinds = {model: MODELS[model][0] for model in ranges}
     evaluations = len(ranges) * wanted.starts * wanted.max_evaluations
-    kept = {part: _Kept(context, part) for part in (*ranges, _LANDSCAPE)}
+    kept = {part: _Checkpoint(context, part) for part in (*ranges, _LANDSCAPE)}
     done = sum(kept[model].evaluations for model in ranges)
-    found, replays = {}, {}
+    identified, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
             replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
@@ -54,28 +58,28 @@ def identify(context: StageContext) -> None:
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
             guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
             guess = {name: guess[name] for name in bounds}
-            found[model] = _search(settings, identifier, guess, kept[model], progress) | {"first_guess": guess}
+            identified[model] = _search(settings, identifier, guess, kept[model], progress) | {"first_guess": guess}
     if wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
-        grid = {name: each for name, each in dict(wanted.grid).items() if each is not None}
-        axes = {name: Bounds(each.lower, each.upper, each.logarithmic) for name, each in grid.items()}
+        grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
+        axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
         identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(experiment))
-        counts = {name: each.points for name, each in grid.items()}
-        found[_LANDSCAPE] = _landscape(identifier, counts, found["sysid"]["parameters"], kept[_LANDSCAPE])
-    write_json(context.run_dir / IDENTIFICATION, found)
-    for each in kept.values():
-        forget_checkpoint(each.path)
+        counts = {name: axis.points for name, axis in grid.items()}
+        identified[_LANDSCAPE] = _landscape(identifier, counts, identified["sysid"]["parameters"], kept[_LANDSCAPE])
+    write_json(context.run_dir / IDENTIFICATION, identified)
+    for part in kept.values():
+        forget_checkpoint(part.path)
 
 
 def bounds_of(settings: RangeSettings) -> Bounds:
-    """A range as it is configured."""
+    """Bounds of a parameter from its settings."""
     prior = None if settings.prior is None else Prior(**dict(settings.prior))
     return Bounds(settings.lower, settings.upper, settings.logarithmic, prior)
 
 
 def _placement(experiment: Experiment) -> dict[str, Any]:
-    """What an `Identifier` is told of how well it is known where markers sit; nothing where that is not asked."""
+    """Arguments of an `Identifier` to estimate the placement of the markers; empty if it is not to be estimated."""
     settings = experiment.settings
     assert isinstance(settings, IdentifyStage)
     wanted, markers = settings.identify.placement, settings.markers
@@ -87,37 +91,37 @@ def _placement(experiment: Experiment) -> dict[str, Any]:
     return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
-class _Kept:
-    """What is finished of a part, in a file until the stage is done; nothing of a run with other settings."""
+class _Checkpoint:
+    """Checkpoint of the finished work of a part, deleted at the end of the stage; ignored if the settings changed."""
 
     def __init__(self, context: StageContext, part: str) -> None:
         self.path, self._fingerprint = context.run_dir / f"identify_{part}.safetensors", context.fingerprint
-        found = resume_checkpoint(self.path, "identify", context.fingerprint)
-        self.content: dict[str, Any] = {} if found is None else found[1]
+        checkpoint = resume_checkpoint(self.path, "identify", context.fingerprint)
+        self.content: dict[str, Any] = {} if checkpoint is None else checkpoint[1]
 
     def keep(self, **content: Any) -> None:
-        """Adds what is finished."""
+        """Adds finished work."""
         self.content |= {"fingerprint": self._fingerprint, **content}
         keep_checkpoint(self.path, "identify", {}, self.content)
 
     @property
     def evaluations(self) -> int:
-        """How many went into the starts of a search that are finished."""
+        """Number of evaluations of the finished starts of a search."""
         return sum(len(attempt["history"]) for attempt in self.content.get("attempts", ()))
 
 
 def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
-    """How much of each trial counts [s]; None for all of it."""
+    """Duration from the beginning of each trial that is used [s]; None for whole trials."""
     limits, fraction = [settings.trial_seconds, settings.identify.seconds], settings.train_fraction
     if fraction < 1.0:
         limits.append(fraction * max(float(replay.trials.times.max()) for replay, _ in replays))
-    return min((each for each in limits if each is not None), default=None)
+    return min((limit for limit in limits if limit is not None), default=None)
 
 
 def _search(
-    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: _Kept, progress: Progress
+    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: _Checkpoint, progress: Progress
 ) -> dict[str, Any]:
-    """The `Identification` of a model from a first guess, as plain data; goes on where an interrupted one ended."""
+    """`Identification` of a model from a first guess, as plain data; resumes an interrupted search."""
     if "found" in kept.content:
         return dict(kept.content["found"])
     wanted = settings.identify
@@ -133,15 +137,14 @@ def _search(
         kept.keep(attempts=attempts)
 
     starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
-    found = identifier.run(starts, most, report, finished, keep, wanted.tolerance)
-    kept.keep(found=asdict(found))
+    kept.keep(found=asdict(identifier.run(starts, most, report, finished, keep, wanted.tolerance)))
     return dict(kept.content["found"])
 
 
 def _landscape(
-    identifier: Identifier, counts: Mapping[str, int], found: Mapping[str, float], kept: _Kept
+    identifier: Identifier, counts: Mapping[str, int], identified: Mapping[str, float], kept: _Checkpoint
 ) -> dict[str, Any]:
-    """Losses around the identified parameters, at so many points of the ranges of some of them."""
+    """Losses on a grid over the ranges of parameters, the others at their identified values."""
     finished = kept.content.get("losses", [])
     with Progress("identify: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
 
@@ -149,6 +152,6 @@ def _landscape(
             kept.keep(losses=losses)
             progress.advance(len(losses) - progress.done)
 
-        losses = identifier.grid(counts, found, _AT_ONCE, finished, report)
+        losses = identifier.grid(counts, identified, _AT_ONCE, finished, report)
     ticks = {name: identifier.ticks(name, count).tolist() for name, count in counts.items()}
     return {**ticks, "loss": losses.tolist()}

@@ -44,7 +44,7 @@ def samples_of(experiment: Experiment, model: str, names: Sequence[str], device:
     body; what replaces a simulator learns the displacement and the velocity where a step ends. What no marker saw has
     nothing to teach.
     """
-    parts = [_samples(experiment, model, some, device) for some in experiment.alike(names)]
+    parts = [_samples(experiment, model, some, device) for some in experiment.batches(names)]
     found = parts[0] if len(parts) == 1 else _joined(parts)
     frames = None if model == SIMFREE else experiment.frames(experiment.model_simulator(model))
     if frames is None:
@@ -287,7 +287,7 @@ def _motions(experiment: Experiment, model: str, names: Sequence[str]) -> list[R
     found = []
     simulator = reconstructing_simulator(experiment, model)
     for replay, start in experiment.replays(simulator, experiment.moving(names), model):
-        some, target = replay.trials.names, experiment.explained(replay, start)
+        some, target = replay.trials.names, experiment.targets(replay, start)
         known, device = experiment.dataset.velocity is not None, simulator.rest_positions.device
         q, v, *_ = _known(experiment, some, device) if known else _reconstructed(experiment, model, some, device)
         q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))

@@ -1,4 +1,4 @@
-"""The models of an experiment, rolled out: a simulator, with a learned force, or a network in its place."""
+"""Roll-outs of the models of an experiment: a simulator, a simulator with a learned force, or a network alone."""
 
 import contextlib
 import copy
@@ -30,22 +30,22 @@ from .parts import ResumableRollout
 FloatArray = NDArray[np.float64]
 
 SIMFREE: Final = "simfree"
-POSE_STEPS = 200  # in which a network in place of a simulator is taken to come to rest
+POSE_STEPS = 200  # after which the roll-out of a network without simulator is taken to be at rest
 
 
 def kind_of(model: str) -> tuple[type[StateMap], str]:
-    """The class of a learned model, and what its checkpoints hold."""
+    """Class of a learned model, and the kind of its checkpoint files."""
     return (NextState, "next state") if model == SIMFREE else (ResidualForce, "residual force")
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What a model has learned.
+    """A trained network with the settings of its roll-outs.
 
     Attributes:
-        network: that predicts a force, or the next state.
-        range_: of its inputs in training, in which roll-outs hold it; None for no guard.
-        force_frame: whether its forces turn with the body, see `Experiment.frames`.
+        network: network that predicts a residual force or the next state.
+        range_: training range to which roll-outs clamp its inputs; None for no clamping.
+        force_frame: frame of the predicted forces, see `Experiment.frames`.
     """
 
     network: StateMap
@@ -53,41 +53,41 @@ class Learned:
     force_frame: str = "world"
 
     def description(self) -> dict[str, Any]:
-        """What `load` needs beside the network's own."""
-        known = None if self.range_ is None else self.range_.description()
-        return {"range": known, "force_frame": self.force_frame}
+        """Metadata of a checkpoint that `load` needs besides the description of the network."""
+        range_ = None if self.range_ is None else self.range_.description()
+        return {"range": range_, "force_frame": self.force_frame}
 
 
 def load(folder: Path, model: str, device: torch.device, refined: bool = False) -> Learned:
-    """What a model of `LEARNED` has learned, refined through the simulator or not, from its checkpoint.
+    """Loads a trained model of `LEARNED` from its checkpoint.
 
     Args:
-        folder: of the split.
-        model: its name.
-        device: of the network.
-        refined: whether through the simulator, too.
+        folder: folder of the split.
+        model: name of the model.
+        device: device of the network.
+        refined: whether to load the weights that were refined through the simulator.
 
     Raises:
         DataFileError: the file is missing or damaged.
     """
     network_type, kind = kind_of(model)
     tensors, description = read_checkpoint(folder / weights_file(model, refined), kind)
-    network, known = restore(network_type, tensors, description).to(device), description["range"]
-    range_ = None if known is None else Range.restore(known, network.linear)
+    network, limits = restore(network_type, tensors, description).to(device), description["range"]
+    range_ = None if limits is None else Range.restore(limits, network.linear)
     return Learned(network, range_, str(description["force_frame"]))
 
 
 class ModelRollout(ResumableRollout):
-    """A model over some trials that begin alike, step by step.
+    """Step-by-step roll-out of a model over trials that begin in the same way.
 
     Args:
-        experiment: of the experiment.
-        model: its name.
-        names: of the trials.
-        learned: what it has learned; None for a simulator alone.
-        start: how the trials begin, where that is known; estimated if left out.
-        simulator: in place of the model's.
-        filmed: the trial whose bodies are kept, too.
+        experiment: the experiment.
+        model: name of the model.
+        names: names of the trials.
+        learned: trained network; None for a simulator alone.
+        start: how the trials begin; estimated by default.
+        simulator: simulator to use instead of the model's own.
+        filmed: trial of which all vertex positions are saved, too.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ModelRollout(ResumableRollout):
         self.start = experiment.start(self.replay, model) if start is None else start
         parameters = experiment.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.setting(parameters)
-        self._told = None if learned is None else experiment.conditions(self.replay, parameters, model == SIMFREE)
+        self._conditions = None if learned is None else experiment.conditions(self.replay, parameters, model == SIMFREE)
         self._first: State | None = None
         self._failed = False
         self._filmed = names.index(filmed) if filmed in names else None
@@ -125,19 +125,19 @@ class ModelRollout(ResumableRollout):
             replaces = isinstance(learned.network, NextState)
             frames = None if replaces else self.experiment.frames(self.simulator, learned.force_frame)
             base = self.experiment.base(self.replay.trials.names, self.simulator)
-            predict = LearnedPredictor(learned.network, self._told, learned.range_, frames, base)
+            predict = LearnedPredictor(learned.network, self._conditions, learned.range_, frames, base)
         return Rollout(self.simulator, predict, self._inputs, self._constants), predict
 
     def with_learned(self, learned: Learned) -> "ModelRollout":
-        """The same trials from their beginning, with something else learned."""
+        """Returns a roll-out of the same trials from their beginning with another network."""
         if not self.replay.is_static:
-            self.beginning()  # Once for all.
+            self.beginning()  # Computed once and shared by the copies.
         other = copy.copy(self)
         other.rollout, other.predictor = self._make(learned)
         return other
 
     def _steps(self) -> int:
-        """Steps that reach past all frames; of whole time steps of the experiment."""
+        """Number of steps that covers all frames, rounded up to whole time steps of the experiment."""
         if self.replay.is_static:
             return POSE_STEPS if self.model == SIMFREE else 0
         substeps = round(self.experiment.settings.time_step / self.simulator.time_step)
@@ -145,10 +145,10 @@ class ModelRollout(ResumableRollout):
 
     @torch.no_grad()
     def beginning(self) -> State:
-        """The states that the trials begin with; poses end there too.
+        """Initial states of the trials; for static poses these are the final states, too.
 
         Raises:
-            ConvergenceError: a body cannot be brought there.
+            ConvergenceError: the equilibrium of an initial state was not found.
         """
         if self.replay.is_static and self.predictor is not None and self.model != SIMFREE:
             force: Any = self.predictor
@@ -159,7 +159,7 @@ class ModelRollout(ResumableRollout):
 
     @override
     def begin(self) -> State:
-        """The `beginning`; a pose that does not settle has failed."""
+        """Returns the `beginning`; a static pose without equilibrium is marked as diverged."""
         try:
             return self.beginning()
         except ConvergenceError:
@@ -177,12 +177,12 @@ class ModelRollout(ResumableRollout):
         return self.rollout.lost(self.state) | self._failed
 
     def points(self) -> torch.Tensor:
-        """(R, M, 3) what is observed of the last state [m]; NaN where the roll-out has diverged."""
+        """(R, M, 3) observed points of the last state [m]; NaN where the roll-out has diverged."""
         return torch.where(self._lost[:, None, None], torch.nan, self.replay.observe(self.state.q))
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
-        """Points, when each trial left the range of the training (-1 before that), and bodies of the film."""
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+        """Observed points, steps at which trials left the training range (-1 before that), and filmed vertices."""
         points = self.points()
         kept: dict[str, ArrayLike] = {"points": points.cpu().numpy()}
         if self.predictor is not None:
@@ -195,18 +195,19 @@ class ModelRollout(ResumableRollout):
 
     @override
     def snapshot(self) -> dict[str, torch.Tensor]:
-        known = {"lost": self.rollout.lost(self.state), "done": torch.tensor(self.rollout.done)}
+        tensors = super().snapshot()
+        tensors |= {"lost": self.rollout.lost(self.state), "done": torch.tensor(self.rollout.done)}
         predictor = self.predictor
         own = {} if predictor is None else {"left": predictor.left_at, "hidden": predictor.hidden}
-        return {**super().snapshot(), **known, **{name: value for name, value in own.items() if value is not None}}
+        return tensors | {name: value for name, value in own.items() if value is not None}
 
     @override
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
         super().restore(tensors)
-        known = {name: tensor.to(self.like.device) for name, tensor in tensors.items()}
-        self.rollout.resume(known["lost"], int(known["done"]))
+        tensors = {name: tensor.to(self.like.device) for name, tensor in tensors.items()}
+        self.rollout.resume(tensors["lost"], int(tensors["done"]))
         if self.predictor is not None:
-            self.predictor.left_at, self.predictor.hidden = known.get("left"), known.get("hidden")
+            self.predictor.left_at, self.predictor.hidden = tensors.get("left"), tensors.get("hidden")
 
     @override
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
@@ -214,7 +215,7 @@ class ModelRollout(ResumableRollout):
         return {"delay": (self.start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
 
     def errors(self) -> list[FloatArray]:
-        """Mean distances [mm] at those frames of each trial that are learned from; NaN where the roll-out diverged."""
+        """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""
         observed, steps = self.replay.trials.observed, self.frames - 1
         observed = observed[:, : self.experiment.learned_steps(observed.shape[1] - 1) + 1]
         if self.experiment.settings.train_fraction < 1.0:
@@ -228,30 +229,30 @@ class ModelRollout(ResumableRollout):
             series = [] if bool(self._lost.all()) else [*series, self.points()]
         if not series:
             return [np.full(1, np.nan) for _ in observed]
-        found = self.replay.at_frames(torch.stack(series[-1:] if self.replay.is_static else series, 1), self.start)
+        simulated = self.replay.at_frames(torch.stack(series[-1:] if self.replay.is_static else series, 1), self.start)
         first = first_frame(self.experiment, self.replay.trials.names)
-        pairs = zip(found[:, first:].cpu().numpy(), observed[:, first:].cpu().numpy(), strict=True)
+        pairs = zip(simulated[:, first:].cpu().numpy(), observed[:, first:].cpu().numpy(), strict=True)
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
 def first_frame(experiment: Experiment, names: Sequence[str]) -> int:
-    """From which frame on errors count: the state that a roll-out is given is none of its making."""
+    """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
     return int(experiment.begins(names[0]) == GIVEN)
 
 
 def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> Callable[[Learned], float]:
-    """What tells the mean error of a model over some trials [mm]; infinite where a roll-out diverged.
+    """Returns a function that computes the mean error of a model over trials [mm]; infinite if a roll-out diverged.
 
     Args:
-        experiment: whose simulators count failures.
-        model: one that learns.
-        names: of the trials.
+        experiment: an experiment with ``on_failure="count"``.
+        model: name of a model with a network.
+        names: names of the trials.
     """
     runs: list[ModelRollout] = []
 
     def error(learned: Learned) -> float:
-        if not runs:  # The beginnings of trials are estimated once, and only where someone asks.
-            runs.extend(ModelRollout(experiment, model, some, learned) for some in experiment.alike(names))
+        if not runs:  # The starts of the trials are estimated once, at the first call.
+            runs.extend(ModelRollout(experiment, model, batch, learned) for batch in experiment.batches(names))
         rows = [row for run in runs for row in run.with_learned(learned).errors()]
         mean = summarise(rows)["mean"]
         return float("inf") if mean is None else mean
@@ -260,7 +261,7 @@ def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> C
 
 
 def learned_of(experiment: Experiment, model: str) -> Learned | None:
-    """What a model has learned in this run; None for those that are simulators alone."""
+    """Trained network of a model in this run; None for models without a network."""
     assert isinstance(experiment.settings, TestStage)
     refined = model != SIMFREE and experiment.settings.refined
     return load(experiment.folder, model, experiment.like.device, refined) if model in LEARNED else None

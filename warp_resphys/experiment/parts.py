@@ -1,7 +1,7 @@
-"""Trials rolled out frame by frame, in one process or several; an interrupted run goes on where it was.
+"""Rolls trials out frame by frame, in one process or several; an interrupted run resumes at its last saved frame.
 
-A stage splits its trials into parts, each with a file of its own. A `ResumableRollout` computes the frames of a part,
-and `io.resumable.ResumableHDF5` keeps them with the state that the next frame goes on from.
+A stage splits its trials into parts, with one file per part. A `ResumableRollout` computes the frames of a part, and
+`io.resumable.ResumableHDF5` saves them together with the state from which the next frame continues.
 """
 
 import shutil
@@ -30,14 +30,14 @@ from .build import simulation_device
 
 
 class ResumableRollout(ABC):
-    """Computes some trials frame by frame.
+    """Computes a batch of trials frame by frame.
 
     Attributes:
         frames: number of frames.
-        fields: the arrays of a frame that go to the file.
-        like: a tensor of the type and on the device of the trials.
-        state: of the last frame.
-        shown: named values to show beside the progress.
+        fields: arrays of a frame that are written to the file.
+        like: a tensor with the data type and device of the trials.
+        state: state of the last frame.
+        shown: named values displayed beside the progress bar.
     """
 
     frames: int
@@ -48,45 +48,45 @@ class ResumableRollout(ABC):
 
     @abstractmethod
     def begin(self) -> State:
-        """The state of the first frame."""
+        """Returns the state of the first frame."""
 
     @abstractmethod
     def step(self, number: int) -> State:
-        """The state of a frame, from that of the one before."""
+        """Returns the state of frame `number`, computed from the state of the previous frame."""
 
     @abstractmethod
-    def kept(self, number: int) -> dict[str, ArrayLike]:
-        """The arrays of a frame, which is that of `state`, for the file."""
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+        """Returns the arrays of the current `state` to write to the file as frame `number`."""
 
     def constants(self) -> dict[str, tuple[ArrayLike, str]]:
-        """Arrays that do not depend on the frame, with units, for the file."""
+        """Returns arrays independent of the frame, with their units, to write to the file."""
         return {}
 
     def frame(self, number: int) -> dict[str, ArrayLike]:
-        """Computes a frame from the one before; returns its arrays for the file."""
+        """Computes the next frame and returns its arrays for the file."""
         with torch.no_grad():
             self.state = self.begin() if number == 0 else self.step(number)
-            return self.kept(number)
+            return self.frame_arrays(number)
 
     def snapshot(self) -> dict[str, torch.Tensor]:
-        """Tensors that the next frame goes on from; they are not changed in place."""
+        """Returns the tensors from which the next frame continues; they are not changed in place."""
         return self.state.tensors()
 
     def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Goes back to a `snapshot`."""
-        self.state = State.from_tensors(tensors).map(lambda each: each.to(self.like))
+        """Restores a `snapshot`."""
+        self.state = State.from_tensors(tensors).map(lambda tensor: tensor.to(self.like))
 
 
 @dataclass(frozen=True)
 class TrialPart:
-    """Some of the trials of a stage, and their file.
+    """A subset of the trials of a stage, with the file that holds their results.
 
     Attributes:
-        context: of the stage.
-        names: of the trials.
-        path: of the file.
-        frames: number of frames of a trial.
-        more: further arguments for what makes the roll-out.
+        context: context of the stage.
+        names: names of the trials.
+        path: path of the file.
+        frames: number of frames per trial that the progress bar expects; the roll-out may have a few more or less.
+        more: further arguments for the function that makes the roll-out.
     """
 
     context: StageContext
@@ -96,7 +96,7 @@ class TrialPart:
     more: Any = None
 
     def write(self, make: "Callable[[TrialPart], ResumableRollout]", advance: Advance) -> None:
-        """Computes the frames from where an interrupted run was, and writes the file; `advance` counts the frames."""
+        """Computes the frames that are still missing and writes the file; `advance` counts the frames."""
         count = len(self.names)
         if self.done:
             advance(count * self.frames)
@@ -106,15 +106,16 @@ class TrialPart:
         with ResumableHDF5(*arguments) as file:
             if file.done:
                 rollout.restore(file.state)
-            advance(count * file.done)
+            advance(count * min(file.done, self.frames))
             while file.done < file.frames:
                 arrays = rollout.frame(file.done)
                 file.append(rollout.snapshot(), **arrays)
-                advance(count, **rollout.shown)
+                advance(count if file.done <= self.frames else 0, **rollout.shown)
+            advance(count * max(self.frames - file.frames, 0))
             file.finish(rollout.constants())
 
     def read(self, name: str) -> NDArray[Any]:
-        """An array of the file.
+        """Reads an array of the file.
 
         Raises:
             DataFileError: the file or the array is missing or damaged.
@@ -124,7 +125,7 @@ class TrialPart:
 
     @property
     def done(self) -> bool:
-        """Whether the file is there, made from the same settings."""
+        """Whether a complete file made from the same settings exists."""
         return is_final(self.path, self.context.name, self.context.fingerprint)
 
 
@@ -136,15 +137,15 @@ def split_into_parts(
     more: Any = None,
     batch: int | None = None,
 ) -> list[TrialPart]:
-    """Parts of some trials of a stage.
+    """Splits trials of a stage into parts.
 
     Args:
-        context: of the stage.
-        names: of the trials.
-        frames: of a trial.
-        label: that the files' names begin with.
-        more: see `TrialPart`.
-        batch: trials of a part, at most; all of them, if left out.
+        context: context of the stage.
+        names: names of the trials.
+        frames: number of frames per trial.
+        label: prefix of the file names.
+        more: further arguments, see `TrialPart`.
+        batch: maximum number of trials per part; by default there is one part.
     """
     folder, size = _folder(context), batch or len(names)
     return [
@@ -154,29 +155,27 @@ def split_into_parts(
 
 
 def _folder(context: StageContext) -> Path:
-    """Where a stage keeps its parts until it is done."""
+    """Folder of a stage's parts while the stage runs."""
     return context.run_dir / f"{context.name}_parts"
 
 
 def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> Workers:
-    """As many as wanted; if that is not said, one a core, but one for all where a GPU simulates.
+    """Returns the wanted number of workers; by default one per core on the CPU, and a single one on a GPU.
 
     Args:
-        parallel: of the run.
-        wanted: number of processes.
-        device: of the simulation.
+        parallel: parallel settings of the run.
+        wanted: number of processes, or None for the default.
+        device: device of the simulation.
 
     Raises:
-        InputError: a cluster without a number of workers, or that cannot simulate on the device.
+        InputError: a cluster without a number of workers, or one that cannot simulate on the device.
     """
     on_cpu = simulation_device(device).type == "cpu"
     if parallel.backend != "local" and wanted is None:
-        raise InputError(
-            f"parallel.processes is null: say how many workers of the {parallel.backend} cluster are to be used."
-        )
+        raise InputError(f"parallel.processes is null: set the number of workers of the {parallel.backend} cluster.")
     if parallel.backend == "ray" and not on_cpu:
         raise InputError(
-            "parallel.backend is ray, which hands out CPUs here: choose device=cpu, or parallel.backend=dask."
+            "parallel.backend is ray, which provides CPUs only: choose device=cpu, or parallel.backend=dask."
         )
     if wanted is None:
         wanted = available_cores() if on_cpu else 1
@@ -184,22 +183,22 @@ def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> 
 
 
 def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRollout], workers: Workers) -> None:
-    """Computes those parts that are not done yet, and writes their files.
+    """Computes the parts that are not done yet and writes their files.
 
     Args:
-        parts: of one stage.
-        make: makes the roll-out of a part; defined at the top of a module.
-        workers: that share the parts.
+        parts: parts of one stage.
+        make: makes the roll-out of a part; a top-level function or class, so that it can be pickled.
+        workers: workers that share the parts.
 
     Raises:
         ConvergenceError, WorkerError: a part could not be computed.
         DataFileError: a file could not be written.
     """
     left, first = [part for part in parts if not part.done], parts[0]
-    total, missing = (sum(part.frames * len(part.names) for part in some) for some in (parts, left))
+    total, missing = (sum(part.frames * len(part.names) for part in subset) for subset in (parts, left))
     with Progress(first.context.name, total, "frames", total - missing) as progress:
         if workers.alone or (workers.backend == "local" and len(parts) == 1):
-            with threadpool_limits(1):  # As in a worker process: the same numbers, however many there are.
+            with threadpool_limits(1):  # As in worker processes, for the same results.
                 for part in left:
                     part.write(make, progress.advance)
         else:
@@ -212,19 +211,22 @@ def _write(make: Callable[[TrialPart], ResumableRollout], part: TrialPart, advan
 
 
 def read_parts(parts: Sequence[TrialPart], name: str) -> NDArray[Any]:
-    """The arrays (R, T, ...) of a name in all parts, one after the other; NaN past the end of shorter ones."""
+    """Reads an array from all parts and joins them, (R, T, ...); NaN past the end of shorter trials."""
     return padded([part.read(name) for part in parts])
 
 
-def padded(found: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
-    """Joins arrays (R, T, ...) along R, with as many frames as the longest has, or more: NaN past their ends."""
-    frames = max(frames, *(each.shape[1] for each in found))
-    ends = [[(0, 0), (0, frames - each.shape[1]), *[(0, 0)] * (each.ndim - 2)] for each in found]
-    return np.concatenate(
-        [np.pad(x, w, constant_values=np.nan) if any(map(any, w)) else x for x, w in zip(found, ends, strict=True)]
-    )
+def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
+    """Joins arrays (R, T, ...) along R, with at least `frames` frames: NaN past the end of shorter arrays."""
+    frames = max(frames, *(array.shape[1] for array in arrays))
+
+    def extended(array: NDArray[Any]) -> NDArray[Any]:
+        missing = frames - array.shape[1]  # Integer arrays of full length keep their type.
+        widths = [(0, 0), (0, missing), *[(0, 0)] * (array.ndim - 2)]
+        return np.pad(array, widths, constant_values=np.nan) if missing else array
+
+    return np.concatenate([extended(array) for array in arrays])
 
 
 def remove_parts(context: StageContext) -> None:
-    """Removes the files of a stage's parts."""
+    """Deletes the files of a stage's parts."""
     shutil.rmtree(_folder(context), ignore_errors=True)

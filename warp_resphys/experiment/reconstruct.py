@@ -46,7 +46,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     settings: ReconstructStage = context.settings
     experiment, model = Experiment(settings, context.run_dir), settings.model
     parts: list[TrialPart] = []
-    for number, names in enumerate(experiment.alike(settings.reconstructed)):
+    for number, names in enumerate(experiment.batches(settings.reconstructed)):
         last = float(experiment.trials(names).times.max()) / experiment.model_simulator(model).time_step
         frames = max(experiment.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, frames, f"part{number}", batch=settings.batch)
@@ -129,7 +129,7 @@ class _OfTrials(Reconstructing):
         replay = self._replay = experiment.replay(simulator, part.names, settings.model)
         self._start, self.like = experiment.start(replay, settings.model), simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(experiment.parameters(settings.model))
-        self._observed = experiment.explained(replay, self._start)
+        self._observed = experiment.targets(replay, self._start)
         if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
             simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
@@ -152,7 +152,7 @@ class _OfTrials(Reconstructing):
         return self.bring_to(self._observed[:, number], self._inputs.at(number - 1))
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         values = {"q": self.state.q, "v": self.state.v, "force": self.force}
         reached, seen = (x.cpu().numpy() for x in (self._replay.observe(self.state.q), self._observed[:, number]))
         error = np.array([frame_error(x, y) for x, y in zip(reached, seen, strict=True)])
@@ -177,7 +177,7 @@ def replayed_errors(
     replay = experiment.replay(simulator, names, settings.model)
     start = experiment.start(replay, settings.model)
     constants, inputs, resting = replay.setting(experiment.parameters(settings.model))
-    observed = experiment.explained(replay, start)
+    observed = experiment.targets(replay, start)
     frames = experiment.frames(simulator)
     steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
     known = [torch.from_numpy(each).to(simulator.rest_positions).unbind(1) for each in steps]

@@ -132,7 +132,7 @@ class _Free(ResumableRollout):
         return self._simulator.step(self.state, inputs, self._constants)[0]
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         return {"observed": self.state.q.cpu().numpy(), "velocity": self.state.v.cpu().numpy()}
 
 
@@ -154,7 +154,7 @@ def held_state(simulator: Simulator, load: PlaceSettings, weights: NDArray[Any])
     """
     face = select_vertices(simulator.body.mesh, **load.arguments())
     if np.isin(face, simulator.body.fixed_vertices).all():
-        raise InputError("data.load names fixed vertices alone: hang the weights on vertices that can move.")
+        raise InputError("data.load selects fixed vertices only: hang the weights on vertices that can move.")
     log.info("finding the equilibrium under %d weights", len(weights))
     forces = simulator.tensor(weights)[:, None] * simulator.tensor(simulator.gravity)
     return simulator.static_equilibrium(Inputs(_shared(simulator, face, forces)))
@@ -430,7 +430,7 @@ class _Played(ResumableRollout):
         return state
 
     @override
-    def kept(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         return {"markers": self._read(self.state.q).cpu().numpy()}
 
 

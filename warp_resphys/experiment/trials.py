@@ -1,4 +1,4 @@
-"""Which trials an experiment has, how each begins, and how they are split."""
+"""Trials of an experiment: their names, how they begin, and their split into training, validation and test."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
 
 @dataclass(frozen=True)
 class Variation:
-    """What sets the trajectories of a simulated experiment apart.
+    """The parameter that differs between the trials of a simulated experiment.
 
     Attributes:
-        key: under ``data``, with a list for each split.
-        unit: of the configured values.
-        factor: from there to SI units.
+        key: key under ``data``, with one list of values per split.
+        unit: unit of the configured values.
+        factor: conversion factor to SI units.
     """
 
     key: str
@@ -33,7 +33,7 @@ class Variation:
     factor: float
 
     def name(self, value: float) -> str:
-        """Of the trajectory with a configured value."""
+        """Name of the trial with a configured value."""
         return f"{value:g}{'' if self.unit == '°' else ' '}{self.unit}"
 
 
@@ -45,10 +45,10 @@ VARIATIONS: Final = {
 
 
 def known_trials(run: RunSettings) -> dict[str, Trial]:
-    """All trials there are, by name.
+    """All configured or recorded trials, by name.
 
     Raises:
-        DataFileError: there is no folder of recordings, or none in it.
+        DataFileError: the folder of recordings does not exist or has no recordings.
     """
     data = run.data
     if not isinstance(data, RecordedData):
@@ -60,20 +60,21 @@ def known_trials(run: RunSettings) -> dict[str, Trial]:
         folder = Path(data.folder).expanduser()
         entries = data.trials or _recordings(folder)
         return {
-            name: _trial(name, each, data.begins, file=_in_folder(folder, name, each)) for name, each in entries.items()
+            name: _trial(name, entry, data.begins, file=_in_folder(folder, name, entry))
+            for name, entry in entries.items()
         }
     assert run.laboratory is not None
     drawn = {f"t{number:03d}": number for number in range(data.sequences)}
-    found = {name: Trial(name=name, begins=data.begins, sequence=number) for name, number in drawn.items()}
+    trials = {name: Trial(name=name, begins=data.begins, sequence=number) for name, number in drawn.items()}
     for name, own in run.laboratory.trials.items():
-        new = len(found) if data.sequences else None
-        sequence = found[name].sequence if name in found else new
-        found[name] = _trial(name, own, data.begins, sequence=sequence)
-    return found
+        new = len(trials) if data.sequences else None
+        sequence = trials[name].sequence if name in trials else new
+        trials[name] = _trial(name, own, data.begins, sequence=sequence)
+    return trials
 
 
 def _trial(name: str, own: TrialSettings, begins: str, file: str | None = None, sequence: int | None = None) -> Trial:
-    """A trial from its entry in a table of trials."""
+    """A trial from its entry in the configuration."""
     return Trial(**{**dict(own), "name": name, "begins": own.begins or begins, "file": file, "sequence": sequence})
 
 
@@ -84,31 +85,35 @@ def _in_folder(folder: Path, name: str, own: TrialSettings) -> str:
 
 
 def _recordings(folder: Path) -> dict[str, TrialSettings]:
-    """The entries of all recordings in a folder."""
+    """Makes entries for all recordings in a folder."""
     if not folder.is_dir():
-        raise DataFileError(f"{folder} is no folder: set data.folder to that of the recordings.")
-    found: dict[str, str] = {}
+        raise DataFileError(f"{folder} is not a folder: set data.folder to your recordings.")
+    files: dict[str, str] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in _SUFFIXES:
             continue
-        other = found.setdefault(path.stem, path.name)
+        other = files.setdefault(path.stem, path.name)
         if other != path.name:
             raise DataFileError(
-                f"{folder} has {other} and {path.name}, two recordings of one name: list the trials in data.trials."
+                f"{folder} has two recordings of one name, {other} and {path.name}: list the trials in data.trials."
             )
-    if not found:
-        raise DataFileError(f"{folder} holds no recording ({', '.join(_SUFFIXES)}): set data.folder to that of yours.")
-    return {name: TrialSettings(file=file) for name, file in found.items()}
+    if not files:
+        suffixes = ", ".join(_SUFFIXES)
+        raise DataFileError(
+            f"{folder} has no recordings ({suffixes}): set data.folder to the folder of the recordings."
+        )
+    return {name: TrialSettings(file=file) for name, file in files.items()}
 
 
 def split_of(run: RunSettings) -> Split:
-    """The trials of training, validation and test.
+    """Splits the trials into training, validation and test.
 
-    A split is a list of names, or a number of trials: these are taken in order, of training first. A laboratory that
-    has a split of its own is asked first. Validation may be empty where the force is trained on whole motions.
+    Each split is configured as a list of names or as a number of trials; numbered trials are assigned in order,
+    training first. The split of a laboratory takes precedence. Validation may be empty if the force is trained on whole
+    motions.
 
     Raises:
-        InputError: an unknown trial, one in two splits, more than there are, or none to train or to test.
+        InputError: an unknown trial, a trial in two splits, too few trials, or an empty training or test split.
         DataFileError: see `known_trials`.
     """
     data = run.data
@@ -119,7 +124,7 @@ def split_of(run: RunSettings) -> Split:
 
 
 def _valued(data: SimulatedData) -> dict[str, list[str]]:
-    """The names of the trials that the splits of a simulated experiment list by their values."""
+    """Names of the trials in each split of a simulated experiment, from the configured values."""
     kind = VARIATIONS[data.kind]
     values = {name: getattr(data.amounts, name) for name in SPLITS}
     for name, row in values.items():
@@ -128,12 +133,12 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
     everything = [x for row in values.values() for x in row]
     twice = sorted({x for x in everything if everything.count(x) > 1})
     if twice:
-        raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: every trajectory is in one split.")
+        raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: a trial belongs to one split only.")
     return {name: [kind.name(x) for x in row] for name, row in values.items()}
 
 
 def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:
-    """The group whose split counts, and its name."""
+    """Name and settings of the group that configures the split."""
     assert isinstance(run.data, RecordedData)
     if run.is_laboratory and run.laboratory is not None and run.laboratory.train is not None:
         return "laboratory", run.laboratory
@@ -141,17 +146,17 @@ def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:
 
 
 def _named(run: RunSettings) -> dict[str, list[str]]:
-    """The names that the splits of a group list or count."""
+    """Names of the trials in each split, from the configured lists or numbers."""
     known, (group, settings) = list(known_trials(run)), _splits(run)
     wanted = {name: getattr(settings, name) for name in SPLITS}
-    asked = sum(each for each in wanted.values() if isinstance(each, int))
+    asked = sum(members for members in wanted.values() if isinstance(members, int))
     if asked > len(known):
         raise InputError(
             f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(known)}."
         )
     rest, lists = iter(known), dict[str, list[str]]()
-    for name, each in wanted.items():
-        lists[name] = [*islice(rest, each)] if isinstance(each, int) else list(each)
+    for name, members in wanted.items():
+        lists[name] = [*islice(rest, members)] if isinstance(members, int) else list(members)
         unknown = [trial for trial in lists[name] if trial not in known]
         if unknown:
             raise InputError(
@@ -159,13 +164,13 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
             )
         if not lists[name] and not (name == "validation" and run.in_the_loop is not None):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
-            raise InputError(f"{group}.{name} is empty: name one of {group}.trials there{more}.")
+            raise InputError(f"{group}.{name} is empty: add at least one of {group}.trials{more}.")
     _check_once(group, lists, run.train_fraction < 1.0)
     return lists
 
 
 def _check_once(group: str, lists: Mapping[str, Sequence[str]], parted: bool) -> None:
-    """Refuses a trial in two splits, but for one of training whose rest is a test."""
+    """Refuses a trial in two splits, except a partly trained trial whose remainder is tested."""
     seen: dict[str, str] = {}
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
         if trial in seen:
@@ -173,15 +178,15 @@ def _check_once(group: str, lists: Mapping[str, Sequence[str]], parted: bool) ->
                 continue
             other = seen[trial]
             where = f"twice in {group}.{name}" if other == name else f"in {group}.{other} and {group}.{name}"
-            raise InputError(f"the trial '{trial}' is {where}: every trial is in one split, once.")
+            raise InputError(f"the trial '{trial}' is {where}: a trial belongs to one split only.")
         seen[trial] = name
 
 
 def folds_of(run: RunSettings) -> dict[str, Split] | None:
-    """By the name of the trial that is tested: the splits of a cross-validation; None where there is one split.
+    """Splits of a leave-one-out cross-validation, by the name of the tested trial; None without cross-validation.
 
-    A fold trains on all other trials and has none to validate with. With ``data.limit`` there are fewer folds, and each
-    trains on fewer trials, evenly picked.
+    A fold trains on all other trials and has no validation trials. ``data.limit`` reduces the number of folds and of
+    training trials per fold, which are picked evenly.
 
     Raises:
         InputError: fewer than two trials.
@@ -191,43 +196,43 @@ def folds_of(run: RunSettings) -> dict[str, Split] | None:
         return None
     names = list(known_trials(run))
     if len(names) < 2:
-        raise InputError("data.folds is leave_one_out, which needs two trials or more in data.trials.")
+        raise InputError("data.folds is leave_one_out, which needs at least two trials in data.trials.")
     folds, members = (len(names), len(names)) if data.limit is None else (data.limit.test, data.limit.train)
-    others = {name: [each for each in names if each != name] for name in evenly(names, folds)}
+    others = {name: [other for other in names if other != name] for name in evenly(names, folds)}
     return {name: Split(train=tuple(evenly(row, members)), validation=(), test=(name,)) for name, row in others.items()}
 
 
 def trials_of(run: RunSettings) -> tuple[Trial, ...]:
-    """The trials of an experiment, in the order of the files: that of the split, or, with folds, as configured."""
+    """Trials of an experiment in the order of the files: by split, or as configured if there are folds."""
     known = known_trials(run)
     return tuple(known[name] for name in (known if folds_of(run) else split_of(run).names))
 
 
 def scaled_name(name: str, scale: float) -> str:
-    """The name of a test trial at scaled inputs."""
+    """Name of a test trial with scaled inputs."""
     return f"{name}_x{scale:g}"
 
 
 def scaled_trials_of(run: RunSettings) -> tuple[Trial, ...]:
-    """The test trials at ``data.input_scales``, scale by scale."""
+    """Test trials with inputs scaled by ``data.input_scales``, ordered by scale."""
     if not run.input_scales:
         return ()
     known = known_trials(run)
     test = [known[name] for name in split_of(run).test]
     return tuple(
-        each.model_copy(update={"name": scaled_name(each.name, scale), "scale": scale})
+        trial.model_copy(update={"name": scaled_name(trial.name, scale), "scale": scale})
         for scale in run.input_scales
-        for each in test
+        for trial in test
     )
 
 
 def test_groups(run: RunSettings, split: Split) -> dict[str, tuple[str, ...]]:
-    """By scale of the inputs, the trials that are tested; the first is that of the training, ``1``."""
+    """Names of the tested trials by input scale; the first group, ``1``, has the original inputs."""
     scaled = {f"{scale:g}": tuple(scaled_name(name, scale) for name in split.test) for scale in run.input_scales}
     return {"1": split.test} | scaled
 
 
 def evenly(row: Sequence[T], limit: int) -> list[T]:
-    """At most that many values of a row, one or more, spread over it."""
+    """Picks at most `limit` values, evenly spread over a row."""
     places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)
     return [row[i] for i in places]

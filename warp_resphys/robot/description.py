@@ -199,7 +199,7 @@ def describe(folder: Path, model: str) -> Description:
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
     learned, actuation = learned_of(experiment, model), settings.actuation
-    base = None if learned is None else experiment.told_of_base(simulator)
+    base = None if learned is None else experiment.base_movement_mask(simulator)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,

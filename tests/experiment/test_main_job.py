@@ -209,7 +209,7 @@ class TestChanges:
     def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
         monkeypatch.setattr(learn, "rollout_error", lambda *_: lambda _: float("inf"))
         assert run(*TINY, IN_RUN, "trainer.selection=validation_loss", "trainer.epochs=3")[0] == 0
-        assert "train_resphys: the weights that are kept diverge on the validation split" in caplog.text
+        assert "train_resphys: the selected weights diverge on the validation split" in caplog.text
         for name in ("resphys", "simfree"):
             kept = metrics()["networks"][name]
             assert (kept["selection"], kept["validation_rollout_error_mm"]) == ("validation_loss", None)

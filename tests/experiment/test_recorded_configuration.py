@@ -56,7 +56,7 @@ WHOLE = {"lower": 0.0, "upper": 1.0}
         ("data/trials", {"a": 3}, "data.trials.a is 3"),
         ("data/trials", {"a": TRIALS["a"] | {"colour": 1}}, "unknown key 'data.trials.a.colour'"),
         ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
-        ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs two trials"),
+        ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs at least two trials"),
         ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
         ("data/seconds", None, "data.seconds is not set"),
         ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
@@ -167,7 +167,7 @@ def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
     run = settings("experiment=fish_tail", "data.folder=recordings")
     assert split_of(run) == Split(train=["step"], validation=[], test=["step"])
     assert [trial.name for trial in trials_of(run)] == ["step"]
-    with pytest.raises(InputError, match=r"the trial 'step' is in data\.train and data\.test: every trial is in one"):
+    with pytest.raises(InputError, match=r"the trial 'step' is in data\.train and data\.test: a trial belongs to one"):
         split_of(settings("experiment=fish_tail", "data.folder=recordings", "data.train_fraction=1"))
 
 

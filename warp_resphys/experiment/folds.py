@@ -61,7 +61,7 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
     except KeyboardInterrupt as error:
         raise StageInterrupted(
             f"interrupted in the folds {', '.join(running)}; all saved results are kept, and "
-            "the same command goes on from there"
+            "the same command resumes there"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Stages: the residual force and the data-driven baseline, from reconstructed trials or through the simulator."""
+"""Stages: train the residual force and the data-driven baseline, on reconstructed steps or through the simulator."""
 
 import dataclasses
 import logging
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..dynamics.modes import RestStiffness
@@ -38,37 +37,41 @@ Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
 def samples_of(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> Samples:
-    """The single steps of some trials that a model learns from, and poses, from which a body goes nowhere.
+    """Collects the single steps of trials that a model is trained on; a static pose is one step without motion.
 
-    States are in the frame of the base. The force that leads on is that of the rest shape where forces turn with the
-    body; what replaces a simulator learns the displacement and the velocity where a step ends. What no marker saw has
-    nothing to teach.
+    States are in the frame of the base. The output is the force during the step, rotated to the rest shape if forces
+    are corotated; for ``simfree`` it is the displacement and velocity at the end of the step. Steps without any visible
+    marker are left out.
     """
-    parts = [_samples(experiment, model, some, device) for some in experiment.batches(names)]
-    found = parts[0] if len(parts) == 1 else _joined(parts)
+    parts = [_samples(experiment, model, batch, device) for batch in experiment.batches(names)]
+    samples = parts[0] if len(parts) == 1 else _joined(parts)
     frames = None if model == SIMFREE else experiment.frames(experiment.model_simulator(model))
     if frames is None:
-        return found
-    return dataclasses.replace(found, outputs=(frames.to_rest(found.q, found.v, *found.outputs),))
+        return samples
+    return dataclasses.replace(samples, outputs=(frames.to_rest(samples.q, samples.v, *samples.outputs),))
 
 
 def _joined(parts: Sequence[Samples]) -> Samples:
-    q, v = torch.cat([each.q for each in parts]), torch.cat([each.v for each in parts])
-    outputs = tuple(map(torch.cat, zip(*(each.outputs for each in parts), strict=True)))
-    told = [each.actuation for each in parts if each.actuation is not None]
-    return Samples(q, v, outputs, torch.cat(told) if told else None, tuple(n for each in parts for n in each.lengths))
+    q, v = torch.cat([part.q for part in parts]), torch.cat([part.v for part in parts])
+    outputs = tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True)))
+    inputs = [part.actuation for part in parts if part.actuation is not None]
+    lengths = tuple(length for part in parts for length in part.lengths)
+    return Samples(q, v, outputs, torch.cat(inputs) if inputs else None, lengths)
 
 
 def _samples(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> Samples:
-    """Those of trials that begin alike; forces as they are."""
-    simulator, known = experiment.model_simulator(model), model == SIMFREE and experiment.dataset.velocity is not None
-    q, v, force, seen = _known(experiment, names, device) if known else _reconstructed(experiment, model, names, device)
+    """Samples of trials that begin in the same way, with forces in the world frame."""
+    simulator = experiment.model_simulator(model)
+    if model == SIMFREE and experiment.dataset.velocity is not None:
+        q, v, force, seen = _simulated(experiment, names, device)
+    else:
+        q, v, force, seen = _reconstructed(experiment, model, names, device)
     base, like = experiment.base(names, simulator), simulator.rest_positions
     if base is not None:
         pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
         inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
-        q, v = (torch.stack(each, 1).to(q) for each in zip(*inside, strict=True))
-        forces = enumerate(force.unbind(1))  # That of a frame belongs to the step before.
+        q, v = (torch.stack(field, 1).to(q) for field in zip(*inside, strict=True))
+        forces = enumerate(force.unbind(1))  # The force of a frame belongs to the previous step.
         force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
     if experiment.begins(names[0]) == STATIC:
         q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
@@ -77,22 +80,22 @@ def _samples(experiment: Experiment, model: str, names: Sequence[str], device: t
     def pick(field: torch.Tensor) -> torch.Tensor:
         return field.flatten(0, 1) if whole else field[seen]
 
-    told = experiment.conditions(experiment.replay(simulator, names), experiment.parameters(model), model == SIMFREE)
-    if told is not None:  # (K, R, A), or (R, A) that is the same all the time
-        told = told[:steps].swapaxes(0, 1) if told.ndim == 3 else told[:, None].expand(-1, steps, -1)
-        told = pick(told.to(device))
+    inputs = experiment.conditions(experiment.replay(simulator, names), experiment.parameters(model), model == SIMFREE)
+    if inputs is not None:  # (K, R, A), or (R, A) constant in time
+        inputs = inputs[:steps].swapaxes(0, 1) if inputs.ndim == 3 else inputs[:, None].expand(-1, steps, -1)
+        inputs = pick(inputs.to(device))
     now = pick(q[:, :-1]), pick(v[:, :-1])
     lengths = tuple(seen.sum(1).tolist())
     if model != SIMFREE:
-        return Samples(*now, (pick(force[:, 1:]),), told, lengths)
-    return Samples(*now, (pick(q[:, 1:]) - experiment.like.to(q), pick(v[:, 1:])), told, lengths)
+        return Samples(*now, (pick(force[:, 1:]),), inputs, lengths)
+    return Samples(*now, (pick(q[:, 1:]) - experiment.like.to(q), pick(v[:, 1:])), inputs, lengths)
 
 
 States = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def _known(experiment: Experiment, names: Sequence[str], device: torch.device) -> States:
-    """The same as `_reconstructed`, of trials whose states a simulation knows, and without forces."""
+def _simulated(experiment: Experiment, names: Sequence[str], device: torch.device) -> States:
+    """States of simulated trials with zero forces, in the format of `_reconstructed`."""
     dataset, rows = experiment.dataset, experiment.dataset.rows(names)
     assert dataset.velocity is not None
     q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
@@ -100,31 +103,32 @@ def _known(experiment: Experiment, names: Sequence[str], device: torch.device) -
 
 
 def _reconstructed(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> States:
-    """Positions, velocities, forces (R, K + 1, N, 3) of trials that begin alike, and (R, K) whether steps were seen."""
+    """Reconstructed positions, velocities and forces (R, K + 1, N, 3), and (R, K) whether steps were seen."""
     source = "resphys" if model == SIMFREE else model
     with read_hdf5(experiment.folder / reconstruction_file(source), "reconstruction") as file:
         order = [str(name) for name in file.attrs["names"]]
         rows = [order.index(name) for name in names]
         index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
-        found = {key: read_array(file, key)[index] for key in ("q", "v", "force", "error")}
-    q, v, force = (torch.as_tensor(found[key], device=device) for key in ("q", "v", "force"))
-    return q, v, force, torch.as_tensor(np.isfinite(found["error"][:, 1:]), device=device)
+        q, v, force, error = (
+            torch.as_tensor(read_array(file, key)[index], device=device) for key in ("q", "v", "force", "error")
+        )
+    return q, v, force, error[:, 1:].isfinite()
 
 
 @dataclass(frozen=True)
 class Learning:
-    """What is learned, from what, and how it is judged; the network and the way of training are open.
+    """A learning task: the training data and the validation of a model, for any network and training settings.
 
     Attributes:
-        experiment: of the experiment.
-        model: name of what is learned.
+        experiment: the experiment.
+        model: name of the model.
     """
 
     experiment: Experiment
     model: str
 
     def trainer(self, settings: TrainingSettings) -> "Prepared":
-        """A trainer of a new model; the same settings give the same model.
+        """Prepares the trainer of a new model; the result depends on the settings only.
 
         Raises:
             InputError: a setting out of range, or an empty split.
@@ -141,11 +145,11 @@ class Learning:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A trainer, and what goes with its weights.
+    """A trainer with the model that it trains.
 
     Attributes:
-        trainer: to be run.
-        learned: the weights as they are, for roll-outs.
+        trainer: trainer, ready to run.
+        learned: network with the settings of its roll-outs.
     """
 
     trainer: EpochTrainer[Any]
@@ -153,7 +157,7 @@ class Prepared:
 
 
 def _new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
-    """An untrained network, with coders from the training steps; the same for the same seed."""
+    """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
     rest, network = experiment.like.to(train.q.device), settings.network
     if not experiment.moving(experiment.settings.split.train):
         network = _limited(network, len(train.q), model)
@@ -166,12 +170,12 @@ def _new_network(experiment: Experiment, model: str, train: Samples, settings: T
 
 
 def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSettings:
-    """The group ``network`` with no more modes than there are poses, each of which tells one at most."""
+    """The group ``network`` with at most as many modes as there are training poses."""
     names = ("position_modes",) if model == SIMFREE else ("position_modes", "force_modes")
     many = {name: getattr(network, name) for name in names if getattr(network, name) > poses}
     if many:
-        said = " and ".join(f"network.{name} of {count}" for name, count in many.items())
-        log.info("%s: %d poses tell %d modes, which %s comes down to", model, poses, poses, said)
+        reduced = " and ".join(f"network.{name} from {count}" for name, count in many.items())
+        log.info("%s: reduced %s to %d, the number of training poses", model, reduced, poses)
     return network.changed(**dict.fromkeys(many, poses))
 
 
@@ -183,7 +187,7 @@ def _supervised(
     judged: Sequence[str],
     settings: TrainingSettings,
 ) -> Prepared:
-    """Training on single steps, judged by roll-outs."""
+    """Prepares training on single steps, with validation by roll-outs."""
     network = _new_network(experiment, model, train, settings)
     learned = Learned(network, _range_of(experiment, network, train), experiment.settings.force_frame)
     error = rollout_error(dataclasses.replace(experiment, on_failure="count"), model, judged)
@@ -196,7 +200,7 @@ def _supervised(
 
 
 def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Range | None:
-    """The range of a network's inputs in training, in which roll-outs hold it, if that is asked for."""
+    """Training range of a network's inputs, to which roll-outs clamp them; None without ``range_guard``."""
     assert isinstance(experiment.settings, NetworkStage)
     if not experiment.settings.range_guard:
         return None
@@ -207,39 +211,39 @@ def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Rang
 def _in_the_loop(
     experiment: Experiment, model: str, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings
 ) -> Prepared:
-    """Training on whole trials through the simulator.
+    """Prepares training on whole trials through the simulator.
 
-    The reconstruction says in which modes bodies move and forces act. Without validation trials, each training trial is
-    held out once to find how long training serves others; no epoch at all is one of the choices.
+    The reconstruction provides the modes of motions and forces. Without validation trials, the number of epochs is
+    found by cross-validation, holding out each training trial once; it may be zero.
     """
     split = experiment.settings.split
     parameters, simulator = experiment.parameters(model), experiment.model_simulator(model)
-    everyone = experiment.replays(simulator, split.train + split.validation, model)
+    replays = experiment.replays(simulator, split.train + split.validation, model)
     frames = experiment.frames(simulator)
 
     def loss(names: Sequence[str]) -> MotionLoss:
         watched = []
-        for replay, start in everyone:
-            some = replay.trials.names
-            rows = [some.index(name) for name in names if name in some]
+        for replay, start in replays:
+            batch = replay.trials.names
+            rows = [batch.index(name) for name in names if name in batch]
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
-                told = experiment.conditions(part, parameters)
+                inputs = experiment.conditions(part, parameters)
                 base = experiment.base(part.trials.names, simulator)
-                watched.append(Watched(part, start.select(rows), told, frames, base))
+                watched.append(Watched(part, start.select(rows), inputs, frames, base))
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        found = _new_network(experiment, model, samples, settings)
-        assert isinstance(found, ResidualForce)
-        return found.double()
+        network = _new_network(experiment, model, samples, settings)
+        assert isinstance(network, ResidualForce)
+        return network.double()
 
     epochs, train, validation = None, split.train, split.validation
     if loop.hold_out and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
             epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
-        log.info("%s: %d epochs serve trials that are held out best", model, epochs)
+        log.info("%s: %d epochs are best for held-out trials", model, epochs)
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, loop, epochs)
     trainer.begin()
@@ -248,14 +252,14 @@ def _in_the_loop(
 
 
 def train(context: StageContext) -> None:
-    """Trains a model: <model>.safetensors, with the weights that are selected, and training_<model>.json."""
+    """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json."""
     settings: TrainStage = context.settings
     learning = Learning(Experiment(settings, context.run_dir), settings.model)
     fit(context, settings.model, learning.trainer(settings.training))
 
 
 def refine(context: StageContext) -> None:
-    """Trains a residual force on through the simulator: <model>_refined.safetensors and refinement_<model>.json."""
+    """Refines a residual force through the simulator; writes <model>_refined.safetensors, refinement_<model>.json."""
     settings: RefineStage = context.settings
     model, experiment = settings.model, Experiment(settings, context.run_dir, "count")
     simulator = experiment.model_simulator(model)
@@ -267,7 +271,7 @@ def refine(context: StageContext) -> None:
     error = rollout_error(experiment, model, judged)
     loss = WindowLoss(
         network,
-        partial(dataclasses.replace, simulator),  # One whose solver has seen nothing yet.
+        partial(dataclasses.replace, simulator),  # A copy with a fresh solver.
         refinement.window,
         refinement.batch_size,
         observe=experiment.observe_by(model),
@@ -283,32 +287,32 @@ def refine(context: StageContext) -> None:
 
 
 def _motions(experiment: Experiment, model: str, names: Sequence[str]) -> list[RefinementBatch]:
-    """What windows of some trials start from, and where they should go: a motion for those that begin alike."""
-    found = []
+    """Start states and targets of training windows, one batch for trials that begin in the same way."""
+    motions = []
     simulator = reconstructing_simulator(experiment, model)
     for replay, start in experiment.replays(simulator, experiment.moving(names), model):
-        some, target = replay.trials.names, experiment.targets(replay, start)
+        batch, target = replay.trials.names, experiment.targets(replay, start)
         known, device = experiment.dataset.velocity is not None, simulator.rest_positions.device
-        q, v, *_ = _known(experiment, some, device) if known else _reconstructed(experiment, model, some, device)
+        q, v, *_ = _simulated(experiment, batch, device) if known else _reconstructed(experiment, model, batch, device)
         q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
-        told = experiment.conditions(replay, experiment.parameters(model))
-        found.append(RefinementBatch(q, v, target, replay.trials, told, experiment.base(some, simulator)))
-    return found
+        inputs = experiment.conditions(replay, experiment.parameters(model))
+        motions.append(RefinementBatch(q, v, target, replay.trials, inputs, experiment.base(batch, simulator)))
+    return motions
 
 
 def fit(context: StageContext, model: str, prepared: Prepared, refined: bool = False) -> None:
-    """Trains, going on from an interrupted run, and writes the selected weights and the history.
+    """Trains, resuming an interrupted run, and writes the selected weights and the history.
 
     Args:
-        context: of the stage.
-        model: name of what is trained.
-        prepared: the trainer, and what goes with the weights.
-        refined: whether this is the refinement of a model that was trained before.
+        context: context of the stage.
+        model: name of the model.
+        prepared: the trainer with its model.
+        refined: whether this is the refinement of a trained model.
     """
     trainer = prepared.trainer
     checkpoint = context.run_dir / f"{context.name}.safetensors"
-    if (found := resume_checkpoint(checkpoint, "training", context.fingerprint)) is not None:
-        trainer.resume(*found)
+    if (snapshot := resume_checkpoint(checkpoint, "training", context.fingerprint)) is not None:
+        trainer.resume(*snapshot)
 
     def save(kept: Snapshot) -> None:
         keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
@@ -321,7 +325,7 @@ def fit(context: StageContext, model: str, prepared: Prepared, refined: bool = F
         "validation_rollout_error_mm": trainer.best_error if math.isfinite(trainer.best_error) else None,
     }
     if kept["validation_rollout_error_mm"] is None:
-        log.warning("%s: the weights that are kept diverge on the validation split", context.name)
+        log.warning("%s: the selected weights diverge on the validation split", context.name)
     write_json(context.run_dir / training_file(model, refined), {"kept": kept, "epochs": trainer.state.history})
     write_checkpoint(
         context.run_dir / weights_file(model, refined),
@@ -338,13 +342,13 @@ def run_epochs(
     save: Callable[[Snapshot], None],
     watch: Callable[[Mapping[str, float]], None] | None = None,
 ) -> None:
-    """Trains to the end; on the way, and however it ends, keeps the last whole epoch.
+    """Trains to the end; saves the last complete epoch regularly, and whenever training ends or is interrupted.
 
     Args:
-        name: what is shown beside the progress.
-        trainer: goes on from where it stands.
-        save: keeps a snapshot.
-        watch: is told the record of every epoch; what it raises ends the training.
+        name: description of the progress bar.
+        trainer: trainer, possibly resumed.
+        save: saves a snapshot.
+        watch: is called with the record of every epoch; an exception raised by it ends the training.
     """
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
@@ -367,7 +371,7 @@ def run_epochs(
 
 
 def _copy(snapshot: Snapshot) -> Snapshot:
-    """The next epoch changes the tensors in place."""
+    """Copies a snapshot, whose tensors the next epoch changes in place."""
     tensors, metadata = snapshot
     copies = {name: tensor.detach().clone() for name, tensor in tensors.items()}
     return copies, {**metadata, "history": list(metadata["history"])}

@@ -1,4 +1,4 @@
-"""Stage: the forces that bring a simulator to the trials that it should have learned from."""
+"""Stage: reconstructs the residual forces with which a simulator follows the observed trials."""
 
 import dataclasses
 import logging
@@ -30,18 +30,18 @@ log = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 _UNITS = {"q": "m", "v": "m/s", "force": "N"}
-_FOR_EVER = 1e6  # s
-_UNHELD = 0.1  # mm, by which replayed markers may be further off than reconstructed ones
+_STATIC_STEP = 1e6  # s, time step for static poses, in which inertia is negligible
+_REPLAY_TOLERANCE = 0.1  # mm, acceptable increase of the marker error when forces are replayed
 
 
 def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes reconstruction_<model>.h5: q, v and force (R, K + 1, N, 3), and adds to reconstruction.json.
 
-    The force of a frame is the one that led to it; that of the first frame is zero. Forces from markers are kept in
-    single precision, which rounds positions to 1e-8 m. The summary says how far the reconstructed points are from those
-    that were seen, and how far they are where the forces of validation are replayed. Forces can lead along equilibria
-    that are not stable, such as those of a chamber's wall that is about to buckle: step by step the markers are met,
-    but nothing that learns these forces will go there.
+    The force of a frame is the force during the step that ends there; it is zero in the first frame. Forces from
+    markers are stored in single precision, which rounds positions to 1e-8 m. The summary has the distance between
+    reconstructed and observed points, and the same distance when the forces of the validation trials are replayed.
+    Replays can fail where reconstruction follows unstable equilibria, e.g. of a chamber's wall that is about to buckle:
+    each step meets the markers, but a network that learns these forces does not.
     """
     settings: ReconstructStage = context.settings
     experiment, model = Experiment(settings, context.run_dir), settings.model
@@ -57,26 +57,26 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     error, held_out = read_parts(parts, "error"), {}
     with atomic_hdf5(context.run_dir / reconstruction_file(model), "reconstruction", {"names": order}) as file:
         create(file, "error", error, "mm", time_axis=1)
-        for name, unit in _UNITS.items():  # One after the other: those of many trials fill the memory.
+        for name, unit in _UNITS.items():  # One array at a time, as many trials take much memory.
             values = read_parts(parts, name)
             create(file, name, values, unit, time_axis=1)
             held_out[name] = values[rows].copy()
     summary = {"mean_mm": float(np.nanmean(error)), "max_mm": float(np.nanmax(error))}
     if rows and experiment.dataset.bound is not None:
         summary["replayed_mm"] = _replay(context, [order[row] for row in rows], {**held_out, "error": error[rows]})
-    found = read_if_there(context.run_dir / RECONSTRUCTION)
+    others = read_if_there(context.run_dir / RECONSTRUCTION)
     finite = {key: value if np.isfinite(value) else None for key, value in summary.items()}
-    write_json(context.run_dir / RECONSTRUCTION, {**found, model: finite})
+    write_json(context.run_dir / RECONSTRUCTION, {**others, model: finite})
     remove_parts(context)
 
 
-def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, FloatArray]) -> float:
-    """Mean distance of the markers where the forces of some trials are replayed [mm]; warns where it is too large."""
-    replayed = float(np.nanmean(replayed_errors(context.settings, context.run_dir, tuple(names), found)))
-    met = float(np.nanmean(found["error"]))
-    if not replayed <= met + _UNHELD:
+def _replay(context: StageContext, names: Sequence[str], reconstructed: Mapping[str, FloatArray]) -> float:
+    """Mean distance of the markers when reconstructed forces are replayed [mm]; warns if it is too large."""
+    replayed = float(np.nanmean(replayed_errors(context.settings, context.run_dir, tuple(names), reconstructed)))
+    met = float(np.nanmean(reconstructed["error"]))
+    if not replayed <= met + _REPLAY_TOLERANCE:
         log.warning(
-            "%s: replayed, the forces lead %.2f mm away from the markers, %.2f mm when they were found: raise "
+            "%s: replaying the forces gives a marker error of %.2f mm, reconstruction gave %.2f mm: raise "
             "reconstruction.regularisation, or set reconstruction.modes.",
             *(context.name, replayed, met),
         )
@@ -84,16 +84,16 @@ def _replay(context: StageContext, names: Sequence[str], found: Mapping[str, Flo
 
 
 def reconstructing_simulator(experiment: Experiment, model: str) -> Simulator:
-    """The simulator of a model, see `without_ringing`."""
+    """Simulator of a model for reconstruction, see `without_ringing`."""
     return without_ringing(experiment.model_simulator(model), experiment.observe)
 
 
 class Reconstructing(ResumableRollout):
-    """Bodies that are brought to what was observed of them, each step from the force of the one before.
+    """Roll-out in which forces bring bodies to the observed points; each step starts from the force of the last one.
 
     Attributes:
-        method: of reconstruction.
-        force: (B, N, 3) that led to the last state [N].
+        method: reconstruction method.
+        force: (B, N, 3) force of the last step [N].
     """
 
     method: Reconstructor
@@ -101,7 +101,7 @@ class Reconstructing(ResumableRollout):
 
     @torch.enable_grad()
     def bring_to(self, observed: torch.Tensor, inputs: Inputs | None = None) -> State:
-        """The next state, near (B, M, 3) observed points [m]."""
+        """Returns the next state, close to the observed points (B, M, 3) [m]."""
         result = self.method.step(self.state, observed, inputs, self.force)
         self.force, self.shown = result.force, {"iterations": result.iterations}
         return result.state.detach()
@@ -117,9 +117,9 @@ class Reconstructing(ResumableRollout):
 
 
 class _OfTrials(Reconstructing):
-    """Trials that begin alike.
+    """Reconstruction of trials that begin in the same way.
 
-    What is kept are q, v and the force (B, N, 3), and the distance of what is observed (B,) [mm].
+    Saves q, v and the force (B, N, 3), and the mean distance of the observed points (B,) [mm].
     """
 
     def __init__(self, part: TrialPart) -> None:
@@ -130,8 +130,8 @@ class _OfTrials(Reconstructing):
         self._start, self.like = experiment.start(replay, settings.model), simulator.rest_positions
         self._constants, self._inputs, self._resting = replay.setting(experiment.parameters(settings.model))
         self._observed = experiment.targets(replay, self._start)
-        if replay.is_static:  # A pose is where one step leads that lasts so long that inertia has no say.
-            simulator = dataclasses.replace(simulator, time_step=_FOR_EVER, integrator="implicit_euler")
+        if replay.is_static:  # One very long step leads to the static pose.
+            simulator = dataclasses.replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
             self._observed = torch.cat([torch.full_like(self._observed, torch.nan), self._observed], 1)
             self._inputs = self._resting
         method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
@@ -160,17 +160,17 @@ class _OfTrials(Reconstructing):
 
 
 def replayed_errors(
-    settings: ReconstructStage, run_dir: Path, names: tuple[str, ...], found: Mapping[str, FloatArray]
+    settings: ReconstructStage, run_dir: Path, names: tuple[str, ...], reconstructed: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """(B, K + 1) distance of the markers [mm] of simulations with reconstructed forces; infinite from where one fails.
+    """(B, K + 1) marker errors [mm] when reconstructed forces are replayed; infinite after a failed step.
 
-    The forces turn with the body, from where it was to where it is, if those that are learned do (``force_frame``).
+    With ``force_frame: corotated``, forces rotate with the body from its reconstructed to its replayed state.
 
     Args:
-        settings: of the stage.
-        run_dir: with the imported trials and the identified parameters.
-        names: of trials that begin alike.
-        found: q [m], v [m/s] and the force [N] that leads there, each (B, K + 1, N, 3).
+        settings: settings of the stage.
+        run_dir: folder with the imported trials and the identified parameters.
+        names: names of trials that begin in the same way.
+        reconstructed: q [m], v [m/s] and the force [N] of the step that ends there, each (B, K + 1, N, 3).
     """
     experiment = Experiment(settings, run_dir, "count")
     simulator = reconstructing_simulator(experiment, settings.model)
@@ -179,16 +179,16 @@ def replayed_errors(
     constants, inputs, resting = replay.setting(experiment.parameters(settings.model))
     observed = experiment.targets(replay, start)
     frames = experiment.frames(simulator)
-    steps = (found["q"][:, :-1], found["v"][:, :-1], found["force"][:, 1:])
-    known = [torch.from_numpy(each).to(simulator.rest_positions).unbind(1) for each in steps]
+    steps = reconstructed["q"][:, :-1], reconstructed["v"][:, :-1], reconstructed["force"][:, 1:]
+    series = [torch.from_numpy(values).to(simulator.rest_positions).unbind(1) for values in steps]
 
     def predict(state: State, step: int) -> torch.Tensor:
-        q, v, force = (series[step] for series in known)
+        q, v, force = (values[step] for values in series)
         return force if frames is None else frames.to_world(state.q, state.v, frames.to_rest(q, v, force))
 
     rollout = Rollout(simulator, predict, inputs, constants)
-    errors: FloatArray = np.full(found["q"].shape[:2], np.inf)
-    errors[:, observed.shape[1] :] = np.nan  # Other trials last longer.
+    errors: FloatArray = np.full(reconstructed["q"].shape[:2], np.inf)
+    errors[:, observed.shape[1] :] = np.nan  # Other trials are longer.
     with torch.no_grad():
         state = replay.begin(start, constants, resting)
         for k in range(min(errors.shape[1], observed.shape[1])):
@@ -200,6 +200,6 @@ def replayed_errors(
 
 
 def frame_error(reached: FloatArray, observed: FloatArray) -> float:
-    """Mean distance of the points (M, 3) of a frame that were seen [mm]; NaN if none was."""
-    found = marker_errors(reached[None], observed[None])
-    return float(found[0]) if len(found) else float("nan")
+    """Mean distance of the points (M, 3) that were seen in a frame [mm]; NaN if none was seen."""
+    errors = marker_errors(reached[None], observed[None])
+    return float(errors[0]) if len(errors) else float("nan")

@@ -44,12 +44,13 @@ from .experiment.files import (
 from .experiment.folds import Fold, run_folds
 from .experiment.identify import identify
 from .experiment.importing import import_recordings, import_scaled
+from .experiment.laboratory import run_laboratory
 from .experiment.learn import refine, train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
-from .experiment.simulate import run_laboratory, simulate
+from .experiment.simulate import simulate
 from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
 from .io.errors import DataFileError

@@ -21,7 +21,7 @@ from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings
-from warp_resphys.experiment.simulate import laboratory_simulator, make_setup
+from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
@@ -256,7 +256,7 @@ def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
     shelf.write("bare", rate=130.0)
     with caplog.at_level(logging.INFO):
         found = shelf.bring_in()
-    assert "bare.h5 has 130 frames a second and the simulation 100 steps" in caplog.text
+    assert "bare.h5 has 130 frames per second and the simulation 100 steps" in caplog.text
     steps = np.diff(found["times"][0])
     np.testing.assert_allclose(steps[steps > 0.0], 1.0 / 130.0)
     assert "load52.h5 has" not in caplog.text
@@ -446,7 +446,7 @@ def test_pressures_that_nothing_uses_are_named(shelf):
 
 def test_too_few_frames_a_second_are_refused(shelf):
     shelf.write("load52", rate=25.0)
-    refuse(shelf, r"load52\.h5 has 25 frames a second, too few .* record 40 or more")
+    refuse(shelf, r"load52\.h5 has 25 frames per second, too few .* record at least 40")
 
 
 @pytest.mark.parametrize("up", ["-x", "y", [0.0, 0.0, 1.0]])
@@ -571,7 +571,7 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
     for line, (name, each) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
-        assert line == f"import: {name} is let go in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+        assert line == f"import: {name} is released in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
 
 
 def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
@@ -587,7 +587,7 @@ def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, ca
     check_run(run)
     with caplog.at_level("INFO"):
         run_stages(acquisition_stages(run), tmp_path)
-    assert [each for each in caplog.messages if "are told by where they are" in each] == log
+    assert [each for each in caplog.messages if "are assigned by their places" in each] == log
 
 
 def test_an_experiment_may_set_gravity(tmp_path):

@@ -11,7 +11,7 @@ from typing_extensions import override
 from ..data.rigid import RigidTransform, kabsch
 from ..experiment.build import bound_markers
 from ..experiment.files import REGISTRATION
-from ..experiment.simulate import laboratory_simulator, make_setup, substeps_of
+from ..experiment.laboratory import laboratory_simulator, make_setup, substeps_of
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
 from ..robot.state import RobotState

@@ -1,6 +1,6 @@
-"""The study of how many markers a reconstruction needs: its stages, and what it reports.
+"""Study of the number of markers that a reconstruction needs: stages and results.
 
-One motion is observed through random subsets of the surface vertices alone, and reconstructed from each of them.
+One simulated motion is reconstructed from random subsets of its surface vertices.
 """
 
 from collections.abc import Mapping
@@ -43,19 +43,19 @@ _MM = 1e3
 
 
 def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
-    """The stages of the study.
+    """Stages of the study.
 
     Args:
-        run: with the group ``ablation``.
+        run: settings with the group ``ablation``.
         files: see `SimulationStage`.
     """
     assert run.ablation is not None
     own = run.ablation
     workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
-    work, known = partial(ablate, workers=workers), AblationStage.of(run, files=files, drawn=DrawSettings.of(own))
+    work, settings = partial(ablate, workers=workers), AblationStage.of(run, files=files, drawn=DrawSettings.of(own))
     return [
         Stage("generate", generate_motion, (MOTION,), MotionStage.of(run, files=files)),
-        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), known, ("generate",)),
+        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), settings, ("generate",)),
         Stage("report", report_ablation, (REPORT,), ReportStage(config=run), ("ablation",)),
     ]
 
@@ -74,10 +74,10 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
 
 
 def generate_motion(context: StageContext) -> None:
-    """Writes motion.h5: q (T + 1, N, 3) from the held state on, and what the uncorrected simulator makes of it."""
+    """Writes motion.h5: q (T + 1, N, 3) from the held state on, by the target and the uncorrected simulator."""
     settings: MotionStage = context.settings
     data = settings.data
-    target, simulation = (build_simulator(settings, each) for each in (settings.target, settings.simulation))
+    target, simulation = (build_simulator(settings, material) for material in (settings.target, settings.simulation))
     with torch.no_grad():
         start = held_state(target, data.load, 1e-3 * np.array(data.weights_g.observed))
         motion = {"q": target.rollout(start, data.steps).q[:, 0]}
@@ -89,7 +89,7 @@ def generate_motion(context: StageContext) -> None:
 
 
 def ablate(context: StageContext, workers: Workers = ALONE) -> None:
-    """Writes ablation.h5, with the sets of markers and the error of each at every step, and tables of the errors.
+    """Writes ablation.h5, with the marker sets and their errors at every step, and tables of the errors.
 
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
@@ -97,16 +97,16 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     counts = list(context.settings.drawn.counts)
     motion, uncorrected = read_motion(context.run_dir)
     parts = {}
-    for count in sorted(counts, reverse=True):  # The longest first, so that no process is left with it.
+    for count in sorted(counts, reverse=True):  # Longest first, to balance the load of the processes.
         (parts[count],) = split_into_parts(context, (str(count),), len(motion), f"markers_{count}", count)
     work_on([*parts.values()], _FromMarkers, workers)
-    found = {name: np.stack([parts[count].read(name) for count in counts]) for name in ("markers", "error", "misfit")}
-    found |= {name: found[name][..., 1:] for name in ("error", "misfit")}  # The first frame is given.
+    draws = {name: np.stack([parts[count].read(name) for count in counts]) for name in ("markers", "error", "misfit")}
+    draws |= {name: draws[name][..., 1:] for name in ("error", "misfit")}  # The first frame is given.
     with atomic_hdf5(context.run_dir / DRAWS, "marker ablation", {"fingerprint": context.fingerprint}) as file:
         create(file, "count", counts)
-        for name, values in found.items():
+        for name, values in draws.items():
             create(file, name, values, "1" if name == "markers" else "m")
-    error, misfit = (_MM * found[name].mean(-1) for name in ("error", "misfit"))
+    error, misfit = (_MM * draws[name].mean(-1) for name in ("error", "misfit"))
     distance = np.linalg.norm(uncorrected[1:] - motion[1:], axis=-1).mean()
     rows = [summarise_draws(count, e, m) for count, e, m in zip(counts, error, misfit, strict=True)]
     write_json(context.run_dir / SUMMARY, {"uncorrected_mm": _MM * float(distance), "by_markers": rows})
@@ -124,9 +124,9 @@ def read_motion(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class _FromMarkers(Reconstructing):
-    """The motion, reconstructed from random sets of as many markers.
+    """Reconstruction of the motion from random sets of a given number of markers.
 
-    What is kept are the mean distances (draws,) of all vertices and of the markers [m], and the sets.
+    Saves the mean distances (draws,) of all vertices and of the markers [m], and the marker sets.
     """
 
     def __init__(self, part: TrialPart) -> None:
@@ -168,10 +168,10 @@ class _FromMarkers(Reconstructing):
 
 
 def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDArray[np.int64]:
-    """(draws, count) vertices of the surface, each set without repetition.
+    """(draws, count) random surface vertices, without repetition within a set.
 
-    They are drawn from those that are free, or from all where these are too few. A set depends on the seed and its
-    count alone, not on the other counts.
+    They are drawn from the free vertices, or from all if there are too few. A set depends only on the seed and its
+    count.
     """
     surface = surface_vertices(simulator.body.mesh)
     free = np.setdiff1d(surface, simulator.body.fixed_vertices)
@@ -181,7 +181,7 @@ def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDA
 
 
 def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDArray[np.float64]) -> dict[str, Any]:
-    """One row of the table: the spread of the draws' errors, and the errors themselves."""
+    """One row of the table: quantiles of the draws' errors, and the errors themselves."""
     lower, median, upper = np.quantile(errors_mm, [0.25, 0.5, 0.75])
     return {
         "markers": count,
@@ -206,7 +206,7 @@ def report_ablation(context: StageContext) -> None:
 
 
 def _metrics(folder: Path, run: RunSettings) -> dict[str, Any]:
-    """Errors, time and memory of the stages that are done, versions and device."""
+    """Contents of metrics.json: errors, time and memory of finished stages, versions and device."""
     return {
         **read_json(folder / SUMMARY),
         **resources_used(folder, _STAGES),

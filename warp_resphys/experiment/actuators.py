@@ -1,4 +1,4 @@
-"""What drives a body: its chambers, tendons and muscles from their groups of a configuration, and which input acts."""
+"""Actuators of a body from the configuration (chambers, tendons, muscles), and the input that drives them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, Place
 from ..settings.stages import PlayedSettings
 from ..stepping.quantity import Quantity
 
-Actuated = BodySettings | PlayedSettings  # settings with the groups of what drives a body
+Actuated = BodySettings | PlayedSettings  # settings with the groups of the actuators
 
-# By group, and the word of its key ``commanded``: the input.
+# Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
     "muscles": {"stress": STRESS, "contraction": MUSCLE_CONTRACTION},
@@ -37,7 +37,7 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 
 
 def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSettings | None) -> list[Energy]:
-    """The energies of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium`` and ``payload_string``.
+    """Builds the energies of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium`` and ``payload_string``.
 
     Args:
         settings: of the body.
@@ -45,13 +45,13 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
         payload_at: vertices that the string is tied to.
 
     Raises:
-        InputError: another number of chambers than the mesh has, or tendons or muscles that do not fit.
+        InputError: the number of chambers differs from the mesh, or tendons or muscles do not fit.
     """
     chambers = build_chambers(settings.chambers, mesh)
     energies: list[Energy] = [Pressure(chambers)] if chambers else []
     if settings.fibres is not None:
         if settings.chambers is None:
-            raise InputError("fibres are wound around chambers, but chambers is null: leave the fibres out.")
+            raise InputError("fibres is set, but chambers is null: fibres need chambers, so leave them out.")
         energies.append(Fibres(chambers, axis=settings.chambers.axis, **dict(settings.fibres)))
     if settings.tendons is not None:
         energies.append(build_tendons(settings.tendons))
@@ -67,37 +67,37 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
 
 
 def build_chambers(settings: ChamberSettings | None, mesh: Mesh) -> tuple[Chamber, ...]:
-    """The closed chambers of a mesh, from the group ``chambers``; none without the group.
+    """Finds the closed chambers of a mesh, if the group ``chambers`` is set.
 
     Raises:
-        InputError: the mesh has another number of them.
+        InputError: their number differs from ``chambers.count``.
     """
     if settings is None:
         return ()
-    found = find_chambers(mesh, settings.axis)
-    if len(found) != settings.count:
+    chambers = find_chambers(mesh, settings.axis)
+    if len(chambers) != settings.count:
         raise InputError(
-            f"the mesh has {len(found)} closed chambers, but chambers.count is {settings.count}: a chamber that is "
-            "open to the outside is none, so close it in the mesh, or set chambers.count."
+            f"the mesh has {len(chambers)} closed chambers, but chambers.count is {settings.count}: open chambers do "
+            "not count, so close them in the mesh, or change chambers.count."
         )
-    return found
+    return chambers
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The input that recordings and simulated laboratories drive a body by."""
+    """Input that drives a body in recordings and simulated laboratories."""
 
     quantity: Quantity
-    parts: tuple[str, ...]  # that have a value each, such as chambers
+    parts: tuple[str, ...]  # names of the driven parts, e.g. chambers
 
     @property
     def per(self) -> str:
-        """What a part is, such as chamber."""
+        """Noun for a part, e.g. chamber."""
         return self.quantity.per
 
 
 def driving_quantity(settings: Actuated) -> Quantity | None:
-    """The input of the body that is driven; None for a body without actuators."""
+    """Quantity that drives the body; None without actuators."""
     if settings.chambers is not None:
         return PRESSURE
     for group, quantities in _COMMANDED.items():
@@ -108,7 +108,7 @@ def driving_quantity(settings: Actuated) -> Quantity | None:
 
 
 def driven_parts(settings: Actuated) -> int:
-    """Number of values of the driven input."""
+    """Number of values of the driving input."""
     if settings.chambers is not None:
         return settings.chambers.count
     if settings.tendons is not None:
@@ -118,16 +118,16 @@ def driven_parts(settings: Actuated) -> int:
 
 
 def drive_of(settings: Actuated, body: Body) -> Drive | None:
-    """The input that drives a body; None for one without actuators."""
+    """Input that drives a body; None without actuators."""
     quantity = driving_quantity(settings)
     if quantity is None:
         return None
-    (energy,) = (each for each in cast(Sequence[Energy], body.energies) if quantity in each.inputs)
-    return Drive(quantity, energy.names)
+    names = next(energy.names for energy in cast(Sequence[Energy], body.energies) if quantity in energy.inputs)
+    return Drive(quantity, names)
 
 
 def build_tendons(settings: TendonSettings) -> Tendons:
-    """The tendons of a group: every straight piece of a route is divided into as many as asked for, and its offsets.
+    """Builds the tendons of a group; routes and their offsets are subdivided into ``pieces`` between guides.
 
     Raises:
         InputError: see `Tendons`.
@@ -136,28 +136,28 @@ def build_tendons(settings: TendonSettings) -> Tendons:
     for route in settings.routes.values():
         guides = np.asarray(route.guides, dtype=np.float64)
         routes.append(_divided(guides, route.pieces))
-        own = [np.broadcast_to(np.asarray(each, dtype=np.float64), guides.shape) for each in route.offsets]
-        directions.append([_divided(each, route.pieces) for each in own])
+        own = [np.broadcast_to(np.asarray(offset, dtype=np.float64), guides.shape) for offset in route.offsets]
+        directions.append([_divided(offset, route.pieces) for offset in own])
     more: dict[str, Any] = {"directions": directions} if any(directions) else {}
     labels = tuple(settings.routes)
     return Tendons(routes, settings.stiffness, labels=labels, toe=settings.toe, reach=settings.reach, **more)
 
 
 def _divided(values: NDArray[np.float64], pieces: int) -> NDArray[np.float64]:
-    """(G, 3) values at guides, and so many times as many between them."""
+    """Interpolates values (G, 3) at guides linearly, with `pieces` intervals between neighbours."""
     share = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
     return np.concatenate([*(first + share * (last - first) for first, last in pairwise(values)), values[-1:]])
 
 
 def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:
-    """The muscles of a group, through the cells whose centres lie within their boxes.
+    """Builds the muscles of a group from the cells whose centres lie within their boxes.
 
     Raises:
         InputError: see `Muscles`.
         MeshError: no cell lies within a box.
     """
-    found = [
-        Muscle(select_cells(mesh, **each.within.arguments()), each.direction, name)
-        for name, each in settings.bundles.items()
+    muscles = [
+        Muscle(select_cells(mesh, **bundle.within.arguments()), bundle.direction, name)
+        for name, bundle in settings.bundles.items()
     ]
-    return Muscles(found, settings.stiffness, toe=settings.toe)
+    return Muscles(muscles, settings.stiffness, toe=settings.toe)

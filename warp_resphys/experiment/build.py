@@ -1,6 +1,6 @@
 """Builds meshes, bodies, materials and simulators from settings.
 
-A mesh and a body are built once a process for the same settings, as checks, stages and reports ask for the same ones.
+Meshes and bodies are cached by their settings, since checks, stages and reports need the same ones.
 """
 
 import json
@@ -57,10 +57,10 @@ _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
 def choose_device(name: str) -> torch.device:
-    """The named device; ``auto`` is CUDA where torch finds one.
+    """Returns the named device; ``auto`` is CUDA if available.
 
     Raises:
-        InputError: an unknown device, or CUDA without a CUDA device.
+        InputError: the device is unknown or unavailable.
     """
     available = torch.cuda.is_available()
     if name == "auto":
@@ -76,12 +76,12 @@ def choose_device(name: str) -> torch.device:
 
 
 def simulation_device(name: str) -> torch.device:
-    """Where bodies are simulated: ``auto`` is the CPU."""
+    """Device of the simulation; ``auto`` is the CPU."""
     return choose_device("cpu" if name == "auto" else name)
 
 
 def build_mesh(settings: MeshSettings) -> Mesh:
-    """The mesh of the group ``mesh``.
+    """Builds the mesh of the group ``mesh``.
 
     Raises:
         InputError: an unknown arm.
@@ -91,20 +91,20 @@ def build_mesh(settings: MeshSettings) -> Mesh:
 
 
 def _file_of(settings: MeshSettings) -> str | None:
-    """Digest of the file that a mesh is read from, if there is one: what is built is built anew where it changes."""
+    """Digest of the file of a mesh, if any, so that a changed file is read again."""
     path = getattr(settings, "path", None)
     return digest(path) if path is not None and Path(path).is_file() else None
 
 
 @lru_cache(maxsize=8)
 def _built_mesh(content: str, file: str | None) -> Mesh:
-    """The mesh of settings as JSON; ``file`` is the digest of the file that it is read from."""
-    mesh = _read_or_made(parse(MeshGroup, {"mesh": json.loads(content)}).mesh)
+    """Builds a mesh from settings as JSON; ``file`` is the digest of its file."""
+    mesh = _read_or_generate(parse(MeshGroup, {"mesh": json.loads(content)}).mesh)
     check_mesh(mesh)
     return mesh
 
 
-def _read_or_made(settings: MeshSettings) -> Mesh:
+def _read_or_generate(settings: MeshSettings) -> Mesh:
     match settings:
         case HexahedralBox():
             return box_hexahedra(settings.size, settings.divisions, settings.nodes)
@@ -121,20 +121,20 @@ def _read_or_made(settings: MeshSettings) -> Mesh:
         case RodMesh():
             return rod(**{key: value for key, value in dict(settings).items() if key != "kind"})
         case GeneratedArm():
-            geometry = ArmGeometry(**{each.name: getattr(settings, each.name) for each in fields(ArmGeometry)})
+            geometry = ArmGeometry(**{field.name: getattr(settings, field.name) for field in fields(ArmGeometry)})
             mesh, _ = mesh_arm(geometry, settings.size, settings.cells, settings.layers)
             return quadratic(mesh) if settings.order == 2 else mesh
 
 
 def finer(settings: MeshSettings, times: float) -> MeshSettings:
-    """The group ``mesh`` with so many times as many cells along the edges of a box, along a rod's axis, or everywhere.
+    """Refines the group ``mesh`` by a factor: along the edges of a box, along a rod's axis, or everywhere.
 
     Raises:
-        InputError: a mesh whose cells are given.
+        InputError: the mesh is read from a file.
     """
     match settings:
         case HexahedralBox() | TetrahedralBox():
-            return settings.changed(divisions=[math.ceil(times * each) for each in settings.divisions])
+            return settings.changed(divisions=[math.ceil(times * cells) for cells in settings.divisions])
         case BoxesMesh() | SurfaceMesh():
             return settings.changed(size=settings.size / times)
         case RodMesh():
@@ -143,62 +143,61 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
             layers = None if settings.layers is None else settings.layers / times
             return settings.changed(size=settings.size / times, layers=layers)
     raise InputError(
-        f"mesh_check: the cells of a mesh of the kind {settings.kind!r} are given and cannot be made finer: take null."
+        f"mesh_check: a mesh of the kind {settings.kind!r} cannot be refined, as its cells are given: set it to null."
     )
 
 
 def shipped_arm(name: str) -> Mesh:
-    """One of the meshes that come with the package.
+    """Reads a mesh that is shipped with the package.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: the name is unknown.
     """
     folder = resources.files("warp_resphys") / "meshes"
-    known = sorted(each.name.removesuffix(".msh") for each in folder.iterdir() if each.name.endswith(".msh"))
-    if name not in known:
-        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(known)}.")
+    names = sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
+    if name not in names:
+        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}.")
     with resources.as_file(folder / f"{name}.msh") as path:
         return read_mesh(path)
 
 
 def build_material(settings: MaterialSettings, key: str) -> Material | dict[str, Material]:
-    """The material of a group, or those of its regions by name; errors begin with the group's dotted key.
+    """Builds the material of a group, or the materials of its regions by name; errors begin with the dotted key.
 
     Raises:
-        InputError: an unknown constant, or one out of range.
+        InputError: a constant is unknown or out of range.
     """
-    found = {}
+    materials = {}
     for region, own in settings.by_region.items():
         try:
-            found[region] = make_material(own.model, **own.constants)
+            materials[region] = make_material(own.model, **own.constants)
         except InputError as error:
             raise InputError(f"{key}.regions.{region}: {error}" if region else f"{key}: {error}") from error
-    return found.get("", found)
+    return materials.get("", materials)
 
 
 def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, mesh: Mesh | None = None) -> Body:
-    """The body of a configuration.
+    """Builds the body of a configuration.
 
     Args:
-        settings: its mesh, masses, fixed vertices, and what acts on it.
-        payload_at: vertices that carry the payloads of a string.
-        mesh: in place of that of the settings.
+        settings: mesh, masses, fixed vertices and actuators of the body.
+        payload_at: vertices that carry the payload of a string.
+        mesh: mesh to use instead of the configured one.
 
     Raises:
-        InputError: another number of chambers than the mesh has, or tendons or muscles that do not fit.
-        MeshError: a mesh that cannot be read or simulated, or no vertex where the body is fixed.
+        InputError: the number of chambers differs from the mesh, or tendons or muscles do not fit.
+        MeshError: the mesh cannot be read or simulated, or has no vertex where the body is fixed.
     """
     if mesh is not None:
         return _body(settings, payload_at, mesh)
-    of_body = BodySettings.of(settings)
     place = None if payload_at is None else payload_at.model_dump_json()
     files = tuple(_file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values())))
-    return _built_body(of_body.model_dump_json(), place, files)
+    return _built_body(BodySettings.of(settings).model_dump_json(), place, files)
 
 
 @lru_cache(maxsize=8)
 def _built_body(content: str, place: str | None, files: tuple[str | None, ...]) -> Body:
-    """The body of settings as JSON; ``files`` are the digests of the files of its meshes."""
+    """Builds a body from settings as JSON; ``files`` are the digests of the files of its meshes."""
     settings = parse(BodySettings, json.loads(content))
     payload_at = None if place is None else parse(PlaceSettings, json.loads(place))
     return _body(settings, payload_at, whole_mesh(settings))
@@ -247,7 +246,7 @@ def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
 
 
 def _with_regions(mesh: Mesh, boxes: Mapping[str, BoxSettings]) -> Mesh:
-    """A mesh with the regions of the group ``regions`` beside its own."""
+    """Adds the regions of the group ``regions`` to a mesh."""
     regions = dict(mesh.regions)
     for name, box in boxes.items():
         try:
@@ -258,11 +257,11 @@ def _with_regions(mesh: Mesh, boxes: Mapping[str, BoxSettings]) -> Mesh:
 
 
 def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
-    """Markers at places (M, 3) on the undeformed body [m], in float64 on the CPU, from the group ``markers``.
+    """Binds markers at places (M, 3) on the undeformed body [m], in float64 on the CPU, by the group ``markers``.
 
     Raises:
         InputError: see `bind_markers`.
-        MeshError: no vertex lies where ``markers.bind_to`` says.
+        MeshError: no vertex lies at ``markers.bind_to``.
     """
     to = settings.bind_to
     return bind_markers(
@@ -279,12 +278,12 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
 def marker_view_of(
     settings: MarkerSettings, labels: Sequence[str], sets: tuple[tuple[int, ...], ...] = ()
 ) -> MarkerView:
-    """How much recordings tell of where these tracked markers are, from the group ``markers``.
+    """View of tracked markers in the recordings, by the group ``markers``: coordinates that are seen, and the frame.
 
     Args:
         settings: the group.
-        labels: of the markers.
-        sets: the numbers of those that are seen together, if not all are.
+        labels: labels of the markers.
+        sets: sets of marker indices that are seen together; by default all are.
 
     Raises:
         InputError: see `MarkerView`.
@@ -299,17 +298,17 @@ def build_simulator(
     payload_at: PlaceSettings | None = None,
     on_failure: str | None = None,
 ) -> Simulator:
-    """The simulator of a configuration.
+    """Builds the simulator of a configuration.
 
     Args:
-        settings: of the simulator and its body.
-        material: of the body.
-        body: in place of that of the settings.
-        payload_at: vertices that carry the payloads of a string.
-        on_failure: in place of the configured one.
+        settings: settings of the simulator and its body.
+        material: material of the body.
+        body: body to use instead of the configured one.
+        payload_at: vertices that carry the payload of a string.
+        on_failure: behaviour after a failed step, instead of the configured one.
 
     Raises:
-        InputError: a value that cannot be simulated.
+        InputError: a value cannot be simulated.
     """
     solver = dict(settings.solver) | ({} if on_failure is None else {"on_failure": on_failure})
     return Simulator(

@@ -34,8 +34,8 @@ from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, marker_view_of
 from .files import STATIC, payload_inputs
 from .identify import ELASTIC
+from .laboratory import input_sequences, laboratory_settings, substeps_of
 from .reading import standing_enough
-from .simulate import input_sequences, laboratory_settings, substeps_of
 from .trials import folds_of, known_trials, split_of, trials_of
 
 _LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed

@@ -1,4 +1,4 @@
-"""Trials as they were recorded: when each begins, where its markers are in the frame of the body, and what drove it."""
+"""Recorded trials: time zero, registration to the frame of the body, and inputs."""
 
 import logging
 from collections.abc import Sequence
@@ -31,31 +31,30 @@ log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 
-_LEAST_RATE = 40.0  # Hz; the first tenth of a second tells how a body was let go, and four frames are few for that
+_LEAST_RATE = 40.0  # Hz; the release is estimated from the first tenth of a second, i.e. at least four frames
 _MILLI = 1e3
-_START = Release(0.0, (0, 1))  # of a recording that begins with it
+_START = Release(0.0, (0, 1))  # of a recording that begins with its release
 
 
 @dataclass(frozen=True)
 class Observed:
-    """A trial as it was recorded.
+    """A recorded and registered trial.
 
     Attributes:
-        trial: what is configured of it.
-        raw: the configured markers that it has, the tracked ones first, as measured.
-        columns: which of all tracked markers these are.
-        view: how much it tells of where they are.
-        moving: the tracked ones from time zero on, short gaps filled, long ones NaN.
-        still: (M', 3) where its markers were before time zero, in the frame of the recording [m].
-        registration: of the markers at rest.
-        driven: (T, C) the input that drives the body at the frames, such as pressures [Pa]; None without any.
-        release: when the body was let go; None of others.
-        tells_places: whether it shows where markers sit on the body, held undeformed or under nothing but gravity.
-        base: (T, 6) how what the body is fixed to has moved at the frames, in the frame of the body; None where it
-            stands still.
+        settings: configuration of the trial.
+        raw: its configured markers as measured, tracked markers first.
+        columns: indices of its tracked markers among all tracked markers.
+        view: view of its tracked markers.
+        moving: its tracked markers from time zero on, with short gaps filled and long gaps NaN.
+        still: (M', 3) its markers before time zero, in the frame of the recording [m].
+        registration: registration of its markers at rest.
+        driven: (T, C) driving inputs at the frames, e.g. pressures [Pa]; None without actuators.
+        release: release of a held body; None for other trials.
+        shows_places: whether it shows the places of markers on the body, i.e. undeformed or under gravity only.
+        base: (T, 6) motion of the base at the frames, in the frame of the body; None if the base stands still.
     """
 
-    trial: Trial
+    settings: Trial
     raw: Recording
     columns: list[int]
     view: MarkerView
@@ -64,17 +63,17 @@ class Observed:
     registration: Registration
     driven: FloatArray | None = None
     release: Release | None = None
-    tells_places: bool = True
+    shows_places: bool = True
     base: FloatArray | None = None
 
     def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
-        """What (..., M, 3) points of its markers tell in the frame of the body, moved by (M, 3) [m]."""
+        """Transforms marker points (..., M, 3) to the frame of the body, shifted by (M, 3), as seen in its view [m]."""
         moved = self.registration.transform.apply(points.reshape(-1, 3)).reshape(points.shape)
         return self.view.of_arrays(self.view.of_arrays(moved) + shift)
 
     @property
     def places(self) -> FloatArray:
-        """(M, 3) what is told of where its tracked markers are while it is registered, in the frame of the body [m]."""
+        """(M, 3) its tracked markers at registration, in the frame of the body and as seen in its view [m]."""
         return self.view.of_arrays(self.registration.positions[: len(self.columns)])
 
 
@@ -82,7 +81,7 @@ class Observer:
     """Reads and registers trials.
 
     Args:
-        context: of the stage.
+        context: context of the stage.
     """
 
     def __init__(self, context: StageContext) -> None:
@@ -99,39 +98,40 @@ class Observer:
         """Reads every trial, finds time zero and registers it.
 
         Raises:
-            DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+            DataFileError: a recording cannot be read or used; the message names the file and the marker.
         """
-        ready = [self._timed(*each) for each in zip(trials, self.reader.read(trials), strict=True)]
+        ready = [*map(self._timed, trials, self.reader.read(trials))]
         self._check_reference(trials, ready)
-        return self._beside_each_other(
+        return self._with_common_reference(
             [
                 self._driven(trial, recording) if release is None else self._released(trial, recording, release)
                 for trial, (recording, release) in zip(trials, ready, strict=True)
             ]
         )
 
-    def _beside_each_other(self, observed: list[Observed]) -> list[Observed]:
-        """Trials that are loaded from their first frame on, registered to where the others have the reference markers.
+    def _with_common_reference(self, observed: list[Observed]) -> list[Observed]:
+        """Registers trials that are loaded from their first frame on by the reference markers of the other trials.
 
-        These alone can be where they should be, and a third of a millimetre between nominal and true places would turn
-        a body by a millimetre at its tip, otherwise than in the trials that are registered by all markers.
+        In loaded trials only the reference markers are at known places. Their nominal places may be wrong by a third of
+        a millimetre, which would rotate a body by a millimetre at its tip compared with the other trials, which are
+        registered by all markers.
         """
-        known = [each.registration.positions[len(each.columns) :] for each in observed if each.tells_places]
+        known = [x.registration.positions[len(x.columns) :] for x in observed if x.shows_places]
         if not known or len(known) == len(observed) or len(self.markers.reference) < self.reader.enough:
             return observed
         seen = np.isfinite(np.stack(known)).all(-1).any(0)
         mean = np.nanmean(np.stack(known)[:, seen], axis=0)
 
-        def beside_others(each: Observed) -> Observed:
-            expected = self.reader.expected(each.trial)
-            expected[len(each.columns) :][seen] = mean
-            registration = self._register(each.trial, each.still, each.raw, expected, only_reference=True)
-            return replace(each, registration=registration)
+        def registered(loaded: Observed) -> Observed:
+            expected = self.reader.expected(loaded.settings)
+            expected[len(loaded.columns) :][seen] = mean
+            registration = self._register(loaded.settings, loaded.still, loaded.raw, expected, only_reference=True)
+            return replace(loaded, registration=registration)
 
-        return [each if each.tells_places else beside_others(each) for each in observed]
+        return [x if x.shows_places else registered(x) for x in observed]
 
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
-        """A recording, at the steps of the simulation if the body is driven, and when the body is let go if it is."""
+        """Resamples the recording of a driven body to the steps of the simulation; finds the release of a held body."""
         if not trial.is_released:
             return resample(recording, 1.0 / self.settings.time_step), None
         self._check_rate(recording)
@@ -140,22 +140,22 @@ class Observer:
         return recording, release_of(recording, self.reader.tracked_in(trial), self.data.longest_gap)
 
     def _check_rate(self, recording: Recording) -> None:
-        """Refuses a recording that is too slow, and says whether frames fall between the steps of the simulation."""
+        """Refuses a frame rate that is too low, and logs whether frames fall between the steps of the simulation."""
         if recording.rate < _LEAST_RATE:
             raise DataFileError(
-                f"{recording.source} has {recording.rate:g} frames a second, too few to tell how the body was let "
-                f"go: record {_LEAST_RATE:g} or more, or set data.rate if the file is wrong."
+                f"{recording.source} has {recording.rate:g} frames per second, too few to estimate the release of "
+                f"the body: record at least {_LEAST_RATE:g}, or set data.rate if the file is wrong."
             )
         ratio = recording.rate * self.settings.time_step
         if abs(max(ratio, 1.0 / ratio) - round(max(ratio, 1.0 / ratio))) > 1e-6:
             log.info(
-                "import: %s has %g frames a second and the simulation %g steps: it is read off at the times of the "
-                "frames, between its steps",
+                "import: %s has %g frames per second and the simulation %g steps: simulated motions are interpolated "
+                "at the frames",
                 *(recording.source.name, recording.rate, 1.0 / self.settings.time_step),
             )
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
-        """Refuses recordings whose reference markers moved against each other between trials."""
+        """Refuses recordings if reference markers moved relative to each other between trials."""
         reference, still = list(self.markers.reference), []
         for trial, (recording, release) in zip(trials, ready, strict=True):
             if release is not None:
@@ -171,14 +171,14 @@ class Observer:
         return max(round(self.data.rest_seconds * recording.rate), 1)
 
     def _base_motion(self, trial: Trial) -> BaseMotion:
-        """How the base of a trial moves; that of a laboratory's trial may have to be found out."""
+        """Configured motion of the base of a trial; in a laboratory the base may be measured instead."""
         common = self.data.base_motion
         return common if trial.base_motion is None or isinstance(common, str) else trial.base_motion
 
     def _base(
         self, trial: Trial, whole: Recording, moving: Recording, still: FloatArray, transform: RigidTransform
     ) -> FloatArray | None:
-        """(T, 6) how the base has moved at the frames, in the frame of the body; ``whole`` has all of their markers."""
+        """(T, 6) motion of the base at the frames, in the frame of the body; ``whole`` has all markers."""
         motion = self._base_motion(trial)
         if motion is None:
             return None
@@ -191,22 +191,22 @@ class Observer:
             poses = in_frame(moving.base, transform)
         else:
             raise DataFileError(
-                f"{whole.source} has no array 'base' that tells how what the body is fixed to moves: add it "
+                f"{whole.source} has no array 'base' with the motion of the base: add it "
                 "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
             )
         early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
         moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
         if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers.largest_residual:
             raise DataFileError(
-                f"{whole.source}: the base has moved the body by {_MILLI * furthest:.1f} mm while that is registered: "
-                "let it stand still until the release, or in the first data.rest_seconds."
+                f"{whole.source}: the base moves the body by {_MILLI * furthest:.1f} mm during registration: "
+                "keep it still until the release, or in the first data.rest_seconds."
             )
         return poses
 
     def _turned_back(self, places: FloatArray, view: MarkerView) -> FloatArray:
-        """(M', 3) places in the frame of the recording, those of the tracked markers turned as the view of them is.
+        """(M', 3) places in the frame of the recording, with tracked markers as seen in their own frame if it is used.
 
-        What is told in a frame of their own is the same wherever they are: any motion that registers it will do.
+        In their own frame, markers do not depend on the pose of the body: any motion registers them.
         """
         rotation, count = self.reader.rotation, len(view.nominal)
         if not view.own or rotation is None:
@@ -232,14 +232,14 @@ class Observer:
         )
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
-        """A body that was held, undeformed or as the file says, and let go."""
+        """Observes a body that was held, undeformed or deformed, and then released."""
         tracked = self.reader.tracked_in(trial)
         still = _median(_frames(recording, *release.rest), tracked)
         places = _rest_of(recording, tracked) if self.data.rest == "file" else still
         registration = self._register(trial, places, recording, self.reader.expected(trial))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
-            "import: %s is let go in frame %.1f, registered to %.2f mm%s",
+            "import: %s is released in frame %.1f, registered to %.2f mm%s",
             *(trial.name, release.frame, _MILLI * registration.rms, off),
         )
         filled = fill_gaps(recording.select(tracked), self.data.longest_gap, mask_long=True)
@@ -251,7 +251,7 @@ class Observer:
                 "leave it out of markers.tracked."
             )
         check_motion(moving, tracked)
-        # Constant: how a valve moves while a body swings is not told by this.
+        # Inputs of released bodies are taken as constant.
         driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
         first = int(np.ceil(release.frame))
         whole = _frames(recording, first, first + len(moving.positions))
@@ -260,18 +260,18 @@ class Observer:
         return Observed(trial, recording, columns, view, moving, still, registration, driven, release, base=base)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
-        """A body that rests until its inputs come, or one in a pose."""
+        """Observes a body that rests until its inputs begin, or a static pose."""
         static, tracked = trial.begins == STATIC, self.reader.tracked_in(trial)
         if not static:
             assert self.data.steps is not None
             check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
-        tells = trial.payload == 0.0 and not loaded
+        unloaded = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
         still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven)
-        # Where the body is without what hangs on it, the other trials tell.
-        only_reference = not tells and len(self.markers.reference) >= self.reader.enough
+        # The reference markers show where the unloaded body is.
+        only_reference = not unloaded and len(self.markers.reference) >= self.reader.enough
         registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
         moving = filled.select(tracked)
         if static:
@@ -282,14 +282,14 @@ class Observer:
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
         view, columns = self.reader.view(trial), trial.tracked(self.tracked)
         fields = (trial, recording, columns, view, moving, still, registration, driven)
-        return Observed(*fields, tells_places=tells, base=base)
+        return Observed(*fields, shows_places=unloaded, base=base)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
-        """(T,) whether (T, C) inputs are what a gauge shows of none."""
+        """(T,) whether inputs (T, C) are zero up to the noise of a gauge."""
         return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self._limit)
 
     def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
-        """(M', 3) mean positions of the markers before the inputs come [m], NaN for one that is not seen."""
+        """(M', 3) mean positions of the markers before the inputs begin [m], NaN for markers that are not seen."""
         acts = np.zeros(0, dtype=np.int64) if driven is None else np.flatnonzero(~self._is_at_rest(driven))
         until = int(acts[0]) if len(acts) else len(recording.positions)
         if until < 1:
@@ -302,32 +302,31 @@ class Observer:
         return _central(resting, self.reader.tracked_in(trial), np.mean, "rests")
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
-        """(T, C) of the body's parts; refuses those of another number of parts, or beyond the limit."""
+        """(T, C) inputs of the body's parts; refuses a wrong number of parts and values beyond the limit."""
         count = len(drive.parts)
-        found = recording.actuation
-        if found is None:
+        if recording.actuation is None:
             if trial.is_released:
                 return np.zeros((len(recording.positions), count))
             raise DataFileError(
                 f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
                 "add it (docs/recordings.md)."
             )
-        values = check_inputs(found, drive.quantity, count, trial.scale * self._limit, recording.source)
+        values = check_inputs(recording.actuation, drive.quantity, count, trial.scale * self._limit, recording.source)
         if self.data.valve == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.reader.tracked_in(trial))
-            # Commanded inputs from that moment on; the step in which the valve opens has its share.
+            # Inputs begin at the opening of the valve; they act during a part of that step.
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
         return values
 
 
 def _frames(recording: Recording, first: int, last: int | None) -> Recording:
-    """The markers of some of the frames."""
+    """The markers in a range of frames."""
     return replace(recording, positions=recording.positions[first:last])
 
 
 def _median(recording: Recording, tracked: Sequence[str]) -> FloatArray:
-    """(M', 3) median positions of the markers of a body that is held [m], NaN for one that is not seen."""
+    """(M', 3) median positions of the markers of a held body [m], NaN for markers that are not seen."""
     return _central(recording, tracked, np.median, "is held")
 
 
@@ -337,17 +336,17 @@ def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it
     lost = [recording.labels[column] for column in hidden if recording.labels[column] in tracked]
     if lost:
         raise DataFileError(
-            f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so where it sits is not "
-            "known; leave it out of markers.tracked."
+            f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so its place on the body is "
+            "unknown; leave it out of markers.tracked."
         )
     return central_places(recording, centre)
 
 
 def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
-    """(M', 3) the markers on the undeformed body, as the file has them [m]."""
+    """(M', 3) markers on the undeformed body from the file [m]."""
     if recording.rest is None:
         raise DataFileError(
-            f"{recording.source} has no array 'rest' that tells where its markers are on the undeformed body: add it "
+            f"{recording.source} has no array 'rest' with its markers on the undeformed body: add it "
             "(docs/recordings.md), or set data.rest to held if the body is held undeformed."
         )
     lost = [label for label in tracked if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]

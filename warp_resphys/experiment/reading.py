@@ -1,4 +1,4 @@
-"""From files to recordings in which the configured markers have their names, with what drove the body."""
+"""Reads recordings, with names of the configured markers and the inputs that drove the body."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -24,32 +24,32 @@ from ..stepping.inputs import Inputs
 from .actuators import Drive
 from .build import bound_markers, marker_view_of
 from .files import STATIC, payload_inputs
-from .simulate import vertical
 
 log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 
-POSE_SECONDS = 0.2  # at the end of a recording, that tell a pose
-_HELD_SECONDS = 0.1  # at the beginning of one, in which a body is held
+POSE_SECONDS = 0.2  # at the end of a recording, from which a static pose is read
+_HELD_SECONDS = 0.1  # at the beginning of a recording, while a body is held
 _MILLI = 1e3
 
 
 class Reader:
-    """Reads recordings, and knows where their markers should be.
+    """Reads recordings, and computes the expected places of their markers.
 
     Args:
-        settings: of the import.
-        run_dir: where the recordings of a laboratory are.
-        simulator: of the body.
-        drive: what drives it; None if nothing does.
+        settings: settings of the import.
+        run_dir: folder of the recordings of a laboratory.
+        simulator: simulator of the body.
+        drive: input that drives the body; None without actuators.
 
     Attributes:
-        tracked: names of the markers that errors are measured on.
-        nominal: (M, 3) where they are on the undeformed body [m].
-        rotation: (3, 3) from the frame of the recordings to that of the body; None where markers tell.
-        vertical: upwards in the frame of the recordings and in that of the body; None where either is not known.
-        enough: how many markers that stand still register a recording.
+        tracked: labels of the tracked markers.
+        nominal: (M, 3) nominal places of the tracked markers on the undeformed body [m].
+        rotation: (3, 3) rotation from the frame of the recordings to the frame of the body; None if registration
+            determines it.
+        vertical: upward directions in the frames of the recordings and of the body; None if either is unknown.
+        enough: number of reference markers that suffice to register a recording.
     """
 
     def __init__(self, settings: ImportStage, run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
@@ -66,21 +66,21 @@ class Reader:
         self._hanging: FloatArray | None = None
 
     def tracked_in(self, trial: Trial) -> list[str]:
-        """Those of the tracked markers that a trial has."""
+        """Labels of the tracked markers of a trial."""
         return [self.tracked[number] for number in trial.tracked(self.tracked)]
 
     def labels(self, trial: Trial) -> list[str]:
-        """Of the configured markers that a trial has, the tracked ones first."""
+        """Labels of the configured markers of a trial, tracked markers first."""
         return [*self.tracked_in(trial), *self.markers.reference]
 
     def view(self, trial: Trial) -> MarkerView:
-        """How much the recording of a trial tells of where its tracked markers are."""
+        """View of the tracked markers in the recording of a trial."""
         return marker_view_of(self.markers, self.tracked_in(trial))
 
     def expected(self, trial: Trial) -> FloatArray:
-        """(M', 3) where the markers of a trial are when they are registered, on the undeformed body or as it hangs [m].
+        """(M', 3) expected places of a trial's markers at registration, on the undeformed or the hanging body [m].
 
-        What is not told of them is as it is nominally.
+        Coordinates that are not seen have their nominal values.
         """
         if trial.is_released:
             return np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])
@@ -89,19 +89,19 @@ class Reader:
         return self._seen(trial, self._hanging)
 
     def _seen(self, trial: Trial, places: FloatArray) -> FloatArray:
-        """(M', 3) what is told of the markers of a trial, of where all tracked ones are."""
-        told = self.view(trial).of_arrays(places[trial.tracked(self.tracked)])
-        return np.concatenate([told, self._reference])
+        """(M', 3) places of a trial's markers as seen in its recording, from places (M, 3) of all tracked ones."""
+        seen = self.view(trial).of_arrays(places[trial.tracked(self.tracked)])
+        return np.concatenate([seen, self._reference])
 
     def read(self, trials: Sequence[Trial]) -> list[Recording]:
-        """The recordings of trials, with all configured markers in their order.
+        """Reads the recordings of trials, with their configured markers in order.
 
         Raises:
-            DataFileError: a recording that cannot be read or used; the sentence names the file and the marker.
+            DataFileError: a recording cannot be read or used; the message names the file and the marker.
         """
-        found = [self._read(trial) for trial in trials]
+        recordings = [self._read(trial) for trial in trials]
         if self.markers.labels == "assigned":
-            found = self._assigned(trials, found)
+            recordings = self._assigned(trials, recordings)
         for trial in trials:
             if absent := [label for label in self.tracked if label not in self.labels(trial)]:
                 others = [label for label in trial.labels or () if label not in self.labels(trial)]
@@ -109,13 +109,13 @@ class Reader:
                     logging.WARNING if others else logging.INFO,
                     "import: %s has no %s, by data.trials.%s.labels%s",
                     *(trial.name, listed(absent), trial.name),
-                    f", and of its {listed(others)} nothing is configured" if others else "",
+                    f", and {listed(others)} of it are not configured" if others else "",
                 )
-        pairs = zip(trials, found, strict=True)
+        pairs = zip(trials, recordings, strict=True)
         return [self._with_depth(trial, recording.select(self.labels(trial))) for trial, recording in pairs]
 
     def _with_depth(self, trial: Trial, recording: Recording) -> Recording:
-        """The same, with what is not seen of each marker as it is nominally."""
+        """Returns a recording in which the unseen coordinate of every marker has its nominal value."""
         unseen = self.view(trial).unseen
         if unseen is None:
             return recording
@@ -138,7 +138,7 @@ class Reader:
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(
-                    f"data.trials.{trial.name}.inputs drives nothing: the body has no chambers, tendons or muscles."
+                    f"data.trials.{trial.name}.inputs is set, but the body has no chambers, tendons or muscles."
                 )
             check_passive(recording)
         elif trial.inputs is not None:
@@ -148,8 +148,8 @@ class Reader:
             recording = replace(recording, actuation=(np.ones_like(frames) * share)[:, None] * inputs)
         if abs(trial.input_delay) * recording.rate >= len(recording.positions):
             raise InputError(
-                f"data.trials.{trial.name}.input_delay is {trial.input_delay:g} s, longer than the recording: its "
-                "unit is s."
+                f"data.trials.{trial.name}.input_delay is {trial.input_delay:g} s, longer than the recording: give "
+                "it in s."
             )
         if self._drive is None or recording.actuation is None:
             return recording
@@ -161,7 +161,7 @@ class Reader:
         return replace(recording, actuation=driven)
 
     def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
-        """(T, C) inputs of the parts of the body, of the columns (T, A) that a recording has of them."""
+        """(T, C) inputs of the parts of the body, from the columns (T, A) of a recording."""
         parts, count = self.data.parts, len(drive.parts)
         if columns.shape[1] != (count if parts is None else len(parts)):
             names = "the body has" if parts is None else "data.parts names"
@@ -171,25 +171,25 @@ class Reader:
             )
         if parts is None:
             return columns
-        found = np.zeros((len(columns), count))
-        found[:, np.array(parts) - 1] = columns
-        return found
+        inputs = np.zeros((len(columns), count))
+        inputs[:, np.array(parts) - 1] = columns
+        return inputs
 
     def _assigned(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> list[Recording]:
-        """The same, with the markers of each named by where they are while the body rests or is held."""
+        """Labels the markers of recordings by their places while the body rests or is held."""
         expected = [self.expected(trial) for trial in trials]
         poses = [row for row, trial in enumerate(trials) if trial.begins == STATIC and trial.labels is None]
         if poses:
             posed = self._posed(self._held([trials[row] for row in poses], [recordings[row] for row in poses]))
             for row, places in zip(poses, posed, strict=True):
                 expected[row] = self._seen(trials[row], places)
-        found = []
+        labelled = []
         for row, (trial, recording) in enumerate(zip(trials, recordings, strict=True)):
             if trial.labels is not None:
-                found.append(recording)
+                labelled.append(recording)
                 continue
             unseen, labels = self.view(trial).unseen, self.labels(trial)
-            if unseen is not None:  # no depth, as the recordings have it
+            if unseen is not None:  # The recordings have no depth.
                 expected[row][:, unseen] = 0.0
             standing = list(range(len(self.tracked), len(labels)))
             bent = trial.begins == STATIC or len(standing) >= self.enough
@@ -202,17 +202,17 @@ class Reader:
                 rotation=self.rotation,
             )
             log.info(
-                "import: the markers of %s are told by where they are, to %.1f mm (with others, %.1f mm at best)",
+                "import: the markers of %s are assigned by their places, to %.1f mm (next best assignment: %.1f mm)",
                 *(trial.name, _MILLI * pairs.rms, _MILLI * pairs.next_rms),
             )
             columns = pairs.columns.tolist()
             rest = None if recording.rest is None else recording.rest[columns]
-            named = replace(recording, labels=tuple(labels), positions=recording.positions[:, columns], rest=rest)
-            found.append(named)
-        return found
+            positions = recording.positions[:, columns]
+            labelled.append(replace(recording, labels=tuple(labels), positions=positions, rest=rest))
+        return labelled
 
     def _held(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> Inputs:
-        """What acts on the body in poses."""
+        """Inputs of the body in static poses."""
         like, fields = self._simulator.rest_positions, {}
         if self._drive is not None:
             last = []
@@ -220,48 +220,62 @@ class Reader:
                 driven = recording.actuation
                 if driven is None:
                     raise DataFileError(
-                        f"{recording.source} does not say what drove the body: add it to the file, or as "
+                        f"{recording.source} has no inputs of the body: add them to the file, or as "
                         "data.trials.NAME.inputs."
                     )
                 last.append(np.median(driven[-_count(POSE_SECONDS, recording) :], axis=0))
             fields[self._drive.quantity.name] = like.new_tensor(np.stack(last))
         loads = np.array([trial.payload for trial in trials])
         hung = payload_inputs(self._simulator.body, self._payload_at, loads)
-        return Inputs(**fields, **{key: like.new_tensor(each) for key, each in hung.items()})
+        return Inputs(**fields, **{key: like.new_tensor(masses) for key, masses in hung.items()})
 
     def _posed(self, inputs: Inputs) -> FloatArray:
-        """(R, M, 3) the tracked markers of the uncorrected simulator in equilibrium [m]."""
+        """(R, M, 3) tracked markers of the uncorrected simulator in equilibrium [m]."""
         simulator = self._simulator
-        read = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
-        found: FloatArray = read.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q).cpu().numpy()
-        return found
+        markers = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
+        places = markers.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q)
+        return np.asarray(places.cpu().numpy())
 
 
 def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
-    """How many markers that stand still register a recording: one where its rotation is known, two where its up is.
+    """Number of reference markers that suffice for registration: 1 with known rotation, 2 with known vertical, else 3.
 
     Args:
         data: how recordings are read.
-        gravity: (3,) in the frame of the body [m/s^2].
+        gravity: (3,) gravity in the frame of the body [m/s^2].
     """
     if data.axes is not None:
         return 1
     return 3 if vertical_of(data.up, gravity) is None else 2
 
 
-def vertical_of(up: str | Sequence[float] | None, gravity: Sequence[float]) -> tuple[FloatArray, FloatArray] | None:
-    """(3,) upwards in the frame of the recordings, and in that of the body by its gravity; None if one is not known.
+def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
+    """(3,) upward unit vector in the frame of the recordings; None if it is unknown.
 
     Args:
-        up: see `simulate.vertical`.
-        gravity: (3,) in the frame of the body [m/s^2].
+        up: ``x``, ``-x``, ``y`` and so on, or a vector (3,).
+    """
+    if up is None:
+        return None
+    if isinstance(up, str):
+        return np.eye(3)["xyz".index(up.removeprefix("-"))] * (-1.0 if up.startswith("-") else 1.0)
+    vector = np.asarray(up, dtype=np.float64)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def vertical_of(up: str | Sequence[float] | None, gravity: Sequence[float]) -> tuple[FloatArray, FloatArray] | None:
+    """(3,) upward directions in the frames of the recordings and of the body; None if either is unknown.
+
+    Args:
+        up: see `vertical`.
+        gravity: (3,) gravity in the frame of the body [m/s^2].
     """
     upwards, down = vertical(up), np.asarray(gravity, dtype=np.float64)
     return None if upwards is None or not down.any() else (upwards, -down)
 
 
 def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArray:
-    """(M, 3) means or medians of the positions of each marker [m], NaN for one that is never seen."""
+    """(M, 3) mean or median position of each marker [m], NaN for a marker that is never seen."""
     places = np.full(recording.positions.shape[1:], np.nan)
     for column, frames in enumerate(recording.seen.T):
         if frames.any():
@@ -270,7 +284,7 @@ def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArr
 
 
 def _still_frames(trial: Trial, recording: Recording) -> FloatArray:
-    """(T', M, 3) while the body is in a pose, rests or is held [m]."""
+    """(T', M, 3) marker positions while the body is in a static pose, rests or is held [m]."""
     if trial.begins == STATIC:
         return recording.positions[-_count(POSE_SECONDS, recording) :]
     return recording.positions[: _count(_HELD_SECONDS, recording)]

@@ -1,0 +1,330 @@
+"""Stage: simulated laboratory, which records trials of a simulation that takes the place of the real body.
+
+The laboratory is for users without one. Compared with the simulator to be corrected, its mesh is finer, its time step
+smaller and its material different, and fibres may be wound around its chambers. Its body is slightly tilted, its
+markers deviate slightly from their nominal places, and cameras see the markers in their own frame, with noise.
+"""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+from typing_extensions import override
+
+from ..data.actuation import InputSequences
+from ..data.base_motion import in_frame, rigid
+from ..data.recordings.arrays import write_recording
+from ..data.recordings.recording import Recording
+from ..data.rigid import RigidTransform
+from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
+from ..io.fan_out import ALONE, Workers
+from ..io.files import write_json
+from ..io.resumable import Field
+from ..io.stages import StageContext
+from ..learning.replay import sample
+from ..mesh.mesh import select_vertices
+from ..settings.body import SimulatorSettings
+from ..settings.stages import LaboratoryStage, PlayedSettings
+from ..settings.trials import Trial
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .actuators import driven_parts, driving_quantity
+from .build import bound_markers, build_simulator
+from .files import STATIC, TRUTH, payload_inputs
+from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
+from .reading import vertical
+from .simulate import base_of, distributed, fixed_positions
+
+FloatArray = NDArray[np.float64]
+
+_LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
+_POSE_SECONDS = 0.25  # duration of the recording of a static pose
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Pose of the body in the laboratory, and places of its markers.
+
+    Attributes:
+        gravity: (3,) gravity in the frame of the body [m/s^2].
+        rotation: rotation from the frame of the body to the frame of the recordings.
+        translation: (3,) translation between these frames [m].
+        tracked: (M, 3) places of the tracked markers on the undeformed body [m].
+        reference: (S, 3) places of the reference markers [m].
+    """
+
+    gravity: FloatArray
+    rotation: Rotation
+    translation: FloatArray
+    tracked: FloatArray
+    reference: FloatArray
+
+    @property
+    def frame(self) -> RigidTransform:
+        """Transform from the frame of the body to the frame of the recordings."""
+        return RigidTransform(self.rotation.as_matrix(), self.translation)
+
+    def recorded(self, positions: FloatArray, base: FloatArray) -> FloatArray:
+        """(T, M + S, 3) all markers in the frame of the recordings [m].
+
+        Args:
+            positions: (T, M, 3) tracked markers in the frame of the body [m].
+            base: (T, 6) motion of the base, with which the reference markers move.
+        """
+        reference = rigid(base).apply(np.broadcast_to(self.reference, (len(positions), *self.reference.shape)))
+        return self.frame.apply(np.concatenate([positions, reference], axis=1))
+
+
+def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
+    """Writes the recording of every trial, and truth.json unless the inputs are scaled.
+
+    Args:
+        context: context of the stage.
+        workers: workers that share the trials.
+
+    Raises:
+        InputError: a configured value is invalid.
+        ConvergenceError, WorkerError: a step of the simulation fails.
+    """
+    settings: LaboratoryStage = context.settings
+    trials, parts = settings.trials, list[TrialPart]()
+    for begins in dict.fromkeys(trial.begins for trial in trials):
+        names = [trial.name for trial in trials if trial.begins == begins]
+        parts += split_into_parts(context, names, _frame_count(settings, begins), begins, batch=settings.batch)
+    work_on(parts, _Played, workers)
+    setup = make_setup(settings)
+    markers = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
+    noise = [_record(context, setup, trial, markers[trial.name]) for trial in trials]
+    if all(trial.scale == 1.0 for trial in trials):
+        write_json(context.run_dir / TRUTH, _truth(settings, setup, trials, float(np.mean(noise))))
+    remove_parts(context)
+
+
+def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
+    """Writes the recording of a trial; returns the mean distance by which noise moves its tracked markers [m]."""
+    settings: LaboratoryStage = context.settings
+    laboratory, common = settings.laboratory, settings.data.base_motion
+    draw = _random_of(settings, trial)
+    released = _released_at(settings, trial, draw)
+    rate = _rate_of(settings) if trial.is_released else 1.0 / settings.time_step
+    times = np.arange(len(series)) / rate  # s since the release
+    if released is not None:
+        assert laboratory.held_seconds is not None
+        assert laboratory.seconds is not None
+        frames = int((laboratory.held_seconds + laboratory.seconds) * rate) + 1
+        times = np.maximum(np.arange(frames) / rate - released, 0.0)
+        sampled = sample(torch.from_numpy(series)[None], torch.from_numpy(times)[None], laboratory.time_step)
+        series = sampled[0].numpy()
+    poses = base_of(common, trial, times)
+    positions = setup.recorded(series, poses)
+    noise = laboratory.noise * draw.standard_normal(positions.shape)
+    actuation = None if trial.sequence is None else _inputs_of(settings, trial)
+    if actuation is not None and len(actuation) != len(positions):
+        actuation = np.repeat(actuation[-1:], len(positions), axis=0)
+    rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
+    base = in_frame(poses, setup.frame) if common == "recorded" else None
+    path = context.run_dir / trial.recording
+    labels = (*settings.binding.tracked, *settings.binding.reference)
+    recording = Recording(labels, positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
+    write_recording(path, recording, {"payload_kg": trial.payload})
+    return float(np.linalg.norm(noise[:, : series.shape[1]], axis=-1).mean())
+
+
+def _random_of(settings: PlayedSettings, trial: Trial) -> np.random.Generator:
+    return np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
+
+
+def _released_at(settings: PlayedSettings, trial: Trial, draw: np.random.Generator) -> float | None:
+    """Time at which a held body is released, between two frames [s]; None for other trials."""
+    if trial.begins != "held":
+        return None
+    assert settings.laboratory.held_seconds is not None
+    return float(settings.laboratory.held_seconds + draw.random() / _rate_of(settings))
+
+
+def _rate_of(settings: PlayedSettings) -> float:
+    """Frame rate of the cameras [Hz]."""
+    return settings.laboratory.rate or 1.0 / settings.time_step
+
+
+def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], noise: float) -> dict[str, Any]:
+    """Contents of truth.json: what the recordings were made with; ``noise`` in metres."""
+    material, fibres = settings.laboratory.material, settings.laboratory.fibres
+    wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
+    released = {trial.name: _released_at(settings, trial, _random_of(settings, trial)) for trial in trials}
+    return {
+        "material": {"model": material.model, **material.parameters, **wound},
+        "fibre_angles": [] if fibres is None else fibres.angles,
+        "gravity": setup.gravity,
+        "rotation": setup.rotation.as_matrix(),
+        "translation": setup.translation,
+        "bound": dict(zip(settings.binding.tracked, setup.tracked, strict=True)),
+        "noise_mm": 1e3 * noise,
+        "released_s": {name: at for name, at in released.items() if at is not None},
+    }
+
+
+def make_setup(settings: PlayedSettings) -> Setup:
+    """Draws the pose of the body and the places of its markers from the seed.
+
+    The vertical of the recordings is ``data.up``, as with levelled cameras, and the body is tilted by
+    ``laboratory.tilt``. If ``data.up`` is null, the body is not tilted and the frame of the recordings is arbitrary.
+    """
+    laboratory, binding = settings.laboratory, settings.binding
+    draw = np.random.default_rng([settings.seed, 0])
+    gravity = np.asarray(settings.gravity, dtype=np.float64)
+    up = vertical(settings.data.up)
+    rotation = Rotation.random(random_state=draw)
+    heading, turn = draw.uniform(0.0, 2.0 * np.pi, 2)
+    strength = float(np.linalg.norm(gravity))
+    if up is not None and strength > 0.0:
+        across = np.linalg.svd(gravity[None])[2][1:]  # two unit vectors
+        axis = np.cos(heading) * across[0] + np.sin(heading) * across[1]
+        gravity = Rotation.from_rotvec(np.radians(laboratory.tilt) * axis).apply(gravity)
+        upright, _ = Rotation.align_vectors(up[None], -gravity[None] / strength)
+        rotation = Rotation.from_rotvec(turn * up) * upright
+    translation = draw.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, 3)
+    nominal = np.array([*binding.tracked.values(), *binding.reference.values()], dtype=np.float64)
+    places = nominal + laboratory.placement_noise * draw.standard_normal(nominal.shape)
+    count = len(binding.tracked)
+    return Setup(gravity, rotation, translation, places[:count], places[count:])
+
+
+def laboratory_settings(settings: PlayedSettings) -> SimulatorSettings:
+    """Settings of the simulator that takes the place of the real body."""
+    played = settings.laboratory
+    own = {"mesh": played.mesh, "time_step": played.time_step, "integrator": played.integrator, "fibres": played.fibres}
+    return SimulatorSettings.of(settings, **own)
+
+
+def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simulator:
+    """Simulator that takes the place of the real body, for gravity in the frame of the body [m/s^2]."""
+    simulated = laboratory_settings(settings).model_copy(update={"gravity": tuple(gravity.tolist())})
+    return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
+
+
+def input_sequences(settings: PlayedSettings) -> InputSequences:
+    """Distribution of the laboratory's random inputs."""
+    assert settings.data.input_limit is not None
+    return InputSequences(limit=settings.data.input_limit, **dict(settings.laboratory.sequences))
+
+
+def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
+    """(K + 1, C) inputs of a trial at the frames, drawn from the seed and the number of its sequence."""
+    draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
+    assert settings.data.steps is not None
+    drawn = input_sequences(settings).draw(settings.data.steps, settings.time_step, driven_parts(settings), draw)
+    if trial.is_released:
+        drawn = np.zeros_like(drawn)
+    elif trial.begins == STATIC:
+        drawn = np.broadcast_to(drawn.mean(axis=0), drawn.shape)
+    return trial.scale * drawn
+
+
+def _frame_count(settings: PlayedSettings, begins: str) -> int:
+    """Number of simulated frames, or of states of released bodies, of trials that begin in a given way."""
+    if begins == STATIC:
+        return max(int(_POSE_SECONDS * _rate_of(settings)), 5)
+    if begins == "rest":
+        assert settings.data.steps is not None
+        return settings.data.steps + 1
+    laboratory = settings.laboratory
+    assert laboratory.seconds is not None
+    return max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
+
+
+class _Played(ResumableRollout):
+    """Roll-out of bodies in the laboratory: released, driven by their inputs, or in a static pose.
+
+    Saves the tracked markers in the frame of the body: at every step of released bodies, from time zero on, and at the
+    frames of driven bodies, with several steps from frame to frame.
+    """
+
+    def __init__(self, part: TrialPart) -> None:
+        settings: LaboratoryStage = part.context.settings
+        setup, binding = make_setup(settings), settings.binding
+        simulator = self._simulator = laboratory_simulator(settings, setup.gravity)
+        self._constants, self.like = simulator.prepare(), simulator.rest_positions
+        by_name = {trial.name: trial for trial in settings.trials}
+        self._trials = [by_name[name] for name in part.names]
+        self._tip, self._substeps = settings.tip, 1 if self._trials[0].is_released else substeps_of(settings)
+        markers = bound_markers(binding, simulator.body.mesh, setup.tracked, tuple(binding.tracked))
+        self._markers = markers.to(self.like)
+        payload = np.array([trial.payload for trial in self._trials])
+        hung = payload_inputs(simulator.body, settings.payload_at, payload)
+        self._payload = Inputs(
+            **{key: simulator.tensor(masses) for key, masses in hung.items()} if payload.any() else {}
+        )
+        self._driven: torch.Tensor | None = None
+        quantity = driving_quantity(settings)
+        if self._trials[0].sequence is not None and quantity is not None:
+            self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
+            self._name = quantity.name
+        self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}
+        self.frames = part.frames
+        self._fixed: list[torch.Tensor] | None = None
+        common = settings.data.base_motion
+        if common is not None or any(trial.base_motion is not None for trial in self._trials):
+            times = simulator.time_step * np.arange(1, (part.frames - 1) * self._substeps + 1)
+            poses = [base_of(common, trial, times) for trial in self._trials]
+            self._fixed = fixed_positions(simulator, np.stack(poses, axis=1))
+
+    def _inputs(self, frame: int, share: float = 0.0) -> Inputs:
+        """Inputs at a share of the time from a frame to the next, interpolated linearly."""
+        if self._driven is None:
+            return self._payload
+        before, after = self._driven[:, frame], self._driven[:, frame + (share > 0.0)]
+        return self._payload.replace(**{self._name: torch.lerp(before, after, share)})
+
+    @override
+    def begin(self) -> State:
+        """Returns held bodies undeformed or pulled at the tip, other bodies in equilibrium with their inputs."""
+        simulator, batch = self._simulator, len(self._trials)
+        if not self._trials[0].is_released:
+            return simulator.static_equilibrium(self._inputs(0), self._constants, batch=batch)
+        pulls = np.array([trial.pull or (0.0, 0.0, 0.0) for trial in self._trials])
+        if not any(trial.pull for trial in self._trials):
+            return simulator.rest_state(batch)
+        tip = select_vertices(simulator.body.mesh, **self._tip.arguments())
+        force = distributed(simulator, tip, simulator.tensor(pulls))
+        held = simulator.static_equilibrium(self._inputs(0).plus(force), self._constants)
+        return State(held.q, torch.zeros_like(held.q))
+
+    @override
+    def step(self, number: int) -> State:
+        state, begins = self.state, self._trials[0].begins
+        if begins == STATIC:
+            return state
+        for i in range(1, self._substeps + 1):
+            # Inputs are taken at the end of a substep, or in its middle.
+            share = (i - 0.5 * (self._simulator.integrator == "midpoint")) / self._substeps
+            inputs = self._inputs(number - 1, share) if begins == "rest" else self._inputs(0)
+            if self._fixed is not None:
+                inputs = inputs.replace(fixed_positions=self._fixed[(number - 1) * self._substeps + i - 1])
+            state, _ = self._simulator.step(state, inputs, self._constants)
+        return state
+
+    @override
+    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+        return {"markers": self._markers(self.state.q).cpu().numpy()}
+
+
+def substeps_of(settings: PlayedSettings) -> int:
+    """Number of steps of the laboratory's simulation per time step of the simulator.
+
+    Raises:
+        InputError: the time step is not a multiple of the laboratory's.
+    """
+    ratio = settings.time_step / settings.laboratory.time_step
+    if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
+        raise InputError(
+            f"time_step is {settings.time_step:g} s and laboratory.time_step {settings.laboratory.time_step:g} s: the "
+            "first must be a multiple of the second."
+        )
+    return round(ratio)

@@ -231,7 +231,7 @@ def test_the_published_method_gives_the_same_errors(folder):
     [
         (
             "ablation.counts=[1,43]",
-            "ablation.counts asks for 43 markers, but the mesh has 42 surface vertices: ask for",
+            "ablation.counts asks for 43 markers, but the mesh has 42 surface vertices: use",
         ),
         ("ablation.counts=[]", "ablation.counts is []: it must be a list of different positive whole numbers."),
         ("ablation.counts=[0]", "ablation.counts is [0]: it must be a list"),

@@ -155,7 +155,7 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
         ),
         (
             ["+identify.parameters.tendon_offset_1={lower: -1e-3, upper: 1e-3}"],
-            "names tendon_offset_1 and it of every part, tendon_offset_1_first, tendon_offset_1_second: choose one",
+            "names tendon_offset_1 and its parts, tendon_offset_1_first, tendon_offset_1_second: choose one",
         ),
         (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
         (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0 .* it takes 1"),

@@ -293,7 +293,7 @@ def recorded(tmp_path, finished, change):
         (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "correlation is "),
         (
             ["+identify.parameters.pressure_delay={lower:-0.01,upper:0.1}"],
-            "identify.parameters.pressure_delay.lower is -0.01: nothing comes before its command",
+            "identify.parameters.pressure_delay.lower is -0.01: inputs cannot precede their command",
         ),
         (["+identify.first_guess.youngs_modulus=soft"], "identify.first_guess.youngs_modulus is 'soft'"),
         (["+identify.first_guess.pressure=0.04"], "identify.first_guess names 'pressure': choose from youngs_modulus"),

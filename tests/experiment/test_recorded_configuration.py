@@ -88,7 +88,7 @@ def test_configuration_of_recordings_is_checked(key, value, offending):
     ("key", "value", "offending"),
     [
         ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
-        ("data/rest", "file", "data.rest is file, but simulated bodies are held undeformed"),
+        ("data/rest", "file", "data.rest is file, but the simulated bodies are held undeformed"),
         ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
         ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
         ("laboratory/test", [], "laboratory.test is empty: add at least one of laboratory.trials"),

@@ -77,7 +77,7 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
         ("+tendons.routes.left.offsets=[[[1,0,0],[0,1,0],[0,0,1]]]", "left.offsets has a direction for 3 guides"),
         ("+tendons.routes.left.offsets=[[1,0,0]]", "3 tendons|the tendons have"),
         ("+identify.parameters.tendon_offset_1_left={lower:-1,upper:1}", "'tendon_offset_1_left': choose from"),
-        ("data.input_limit=null", "data.input_limit is not set: say what the tendons take, in N"),
+        ("data.input_limit=null", "data.input_limit is not set: give the largest input of the tendons, in N"),
         ("data.parts=[1,2,4]", "data.parts names tendon 4, but the body has 3"),
         (MUSCLES, "tendons and muscles are two inputs of the body, but recordings have one: take one out"),
         ("chambers={count:1,axis:[0,0,1]}", "chambers and tendons are two inputs"),

@@ -1,6 +1,6 @@
-"""Checks of a run that need its mesh or its trials, before anything is computed, so that a slip costs no stage.
+"""Checks of a run that need its mesh or its trials, made before the first stage so that errors are found early.
 
-Values and the relations between them are checked where settings are made, see `settings.run`.
+The values of settings and their relations are checked when settings are made, see `settings.run`.
 """
 
 import math
@@ -38,25 +38,25 @@ from .laboratory import input_sequences, laboratory_settings, substeps_of
 from .reading import standing_enough
 from .trials import folds_of, known_trials, split_of, trials_of
 
-_LONGEST_STRETCH = 0.3  # rho g L / E from which on the size of a body is not believed
-_BYTES_PER_CELL = 4_000  # that a mesh, its points and its matrix take at least
+_LARGEST_STRAIN = 0.3  # rho g L / E above which a wrong unit is assumed
+_BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
 _SHARE_OF_MEMORY = 0.8
 
 
 def check_run(run: RunSettings) -> None:
-    """Checks what is known without computing anything.
+    """Checks the settings of a run against its mesh, its trials and the memory.
 
     Raises:
-        InputError: values that do not fit the mesh, the trials or the memory.
-        MeshError: a mesh that cannot be read or simulated, or a place where no vertex lies.
-        DataFileError: a folder without recordings.
+        InputError: values do not fit the mesh, the trials or the memory.
+        MeshError: the mesh cannot be read or simulated, or no vertex lies at a place.
+        DataFileError: the folder has no recordings.
     """
     _check_memory(run)
     body = build_body(run, run.payload_at)
     select_vertices(body.mesh, **run.tip.arguments())
     simulator = build_simulator(run, run.simulation, body)
-    for each in simulator.materials.values():
-        _check_size(body, each, run.gravity)
+    for material in simulator.materials.values():
+        _check_size(body, material, run.gravity)
     if isinstance(run.data, RecordedData) and run.markers is not None:
         _check_recorded(run, run.data, run.markers, body)
         _check_reconstruction(run, simulator)
@@ -75,7 +75,7 @@ def check_run(run: RunSettings) -> None:
 
 
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
-    """Checks an experiment whose vertices are all known."""
+    """Checks an experiment with simulated trials, in which all vertices are observed."""
     assert run.target is not None
     build_material(run.target, "target")
     split_of(run)
@@ -86,24 +86,24 @@ def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
 
 
 def _check_reconstruction(run: RunSettings, simulator: Simulator, modes: int | None = None) -> None:
-    """Makes the reconstruction from markers, with one marker."""
+    """Checks the settings of the reconstruction by making one with a single marker."""
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
     more = {} if modes is None else {"modes": modes}
     make_reconstructor(simulator, **dict(run.reconstruction) | more, observation=probe)
 
 
 def _check_control(run: RunSettings, body: Body) -> None:
-    """Refuses figures that cannot be followed."""
+    """Checks that the robot can be controlled."""
     if find_spec("piqp") is None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
     if drive_of(run, body) is None:
-        raise InputError("control is for a robot with pressures, tendons or muscles: set control=none.")
+        raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
     if run.is_laboratory and any(trial.payload for trial in trials_of(run)):
-        raise InputError("control drives a robot without payloads: leave them out of laboratory.trials.")
+        raise InputError("control does not support payloads: remove them from laboratory.trials.")
 
 
 def _check_memory(run: RunSettings) -> None:
-    """Refuses what this machine has no memory for, before it is tried."""
+    """Refuses meshes and networks that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
     meshes: dict[str, MeshSettings] = {"mesh": run.mesh}
     meshes |= {} if run.laboratory is None else {"laboratory.mesh": run.laboratory.mesh}
@@ -112,21 +112,21 @@ def _check_memory(run: RunSettings) -> None:
         needed = cells * _BYTES_PER_CELL / 2**30
         if needed > limit:
             raise InputError(
-                f"{key}.divisions gives {cells:,} cells, which take {needed:.3g} GiB at least, and {limit:.3g} GiB are "
-                "free: take fewer."
+                f"{key}.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
+                "free: use fewer."
             )
     network = run.network
     weights = network.blocks * (network.layers + 1) * network.width**2
     if 16 * weights / 2**30 > limit:  # weights, gradients and two moments of Adam in single precision
         raise InputError(
             f"network.width, layers and blocks make {weights:,} weights, which take {16 * weights / 2**30:.3g} GiB to "
-            f"train, and {limit:.3g} GiB are free: take a smaller network."
+            f"train, but {limit:.3g} GiB are free: use a smaller network."
         )
 
 
 @contextmanager
 def _naming(group: str) -> Iterator[None]:
-    """Errors of the values of a group begin with its name."""
+    """Prefixes errors with the name of a group."""
     try:
         yield
     except InputError as error:
@@ -134,9 +134,9 @@ def _naming(group: str) -> Iterator[None]:
 
 
 def _check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body) -> None:
-    """Checks an experiment that sees its bodies through markers."""
+    """Checks an experiment that observes its bodies through markers."""
     if run.is_laboratory and run.laboratory is not None and not run.laboratory.trials and not data.sequences:
-        raise InputError("laboratory.trials is empty: name each trial, or set data.sequences.")
+        raise InputError("laboratory.trials is empty: name the trials, or set data.sequences.")
     _check_files(data)
     if folds_of(run) is None:
         split_of(run)
@@ -146,9 +146,9 @@ def _check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSetting
     _check_view(run, markers, trials)
     payload_inputs(body, data.payload_at, np.array([trial.payload for trial in trials]))
     if begins & {"held", "released"} and data.seconds is None:
-        raise InputError("data.seconds is not set: say how much of each trial counts after its release, in s.")
+        raise InputError("data.seconds is not set: give the time after the release of each trial that is used, in s.")
     if "rest" in begins and data.steps is None:
-        raise InputError("data.steps is not set: say how many steps of the simulation are read of each recording.")
+        raise InputError("data.steps is not set: give the number of time steps that are read from each recording.")
     drive = drive_of(run, body)
     if drive is not None:
         _check_inputs(data, drive)
@@ -162,19 +162,19 @@ def _check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSetting
         build_material(run.published.simulation, "published.simulation")
     if run.is_laboratory:
         _check_laboratory(run, data, trials, drive)
-    for each in trials:
-        if each.begins == STATIC and (data.base_motion is not None or each.base_motion is not None):
-            raise InputError(f"the trial '{each.name}' is a pose, which has no time: its base cannot move.")
+    for trial in trials:
+        if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
+            raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
     if begins & {"held", "released"}:
         _check_release(run, data)
 
 
 def _check_files(data: RecordedData) -> None:
-    """Refuses a file that two trials name."""
+    """Refuses a file that is used by two trials."""
     files: dict[str, str] = {}
     for name, trial in data.trials.items():
         if trial.file is not None and (other := files.setdefault(trial.file, name)) != name:
-            raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial.file}: name it once.")
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial.file}: use it once.")
 
 
 def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body, begins: set[str]) -> None:
@@ -185,19 +185,19 @@ def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings
     enough = standing_enough(data, run.gravity)
     if count < enough:
         raise InputError(
-            f"markers names {count} in all: registration needs three or more, two with data.up, or one with data.axes."
+            f"markers names {count} in total: registration needs at least 3, or 2 with data.up, or 1 with data.axes."
         )
     if markers.labels == "assigned" and STATIC in begins and standing < enough:
         raise InputError(
-            f"markers.labels is assigned, but markers.reference names {standing} markers that stand still beside a "
-            f"body in a pose: it takes {enough}" + (", or data.axes and one." if data.axes is None else ".")
+            f"markers.labels is assigned, but markers.reference names {standing}: static poses need {enough} "
+            "reference markers" + (", or data.axes and one." if data.axes is None else ".")
         )
     if markers.bind_to is not None:
         select_vertices(body.mesh, **markers.bind_to.arguments())
 
 
 def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Trial]) -> None:
-    """Refuses what cannot be had of the markers that trials have."""
+    """Checks the markers of the trials."""
     tracked = [*markers.tracked]
     for trial in trials:
         if not trial.tracked(tracked):
@@ -208,7 +208,7 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
     everywhere = {number for trial in known_trials(run).values() for number in trial.tracked(tracked)}
     if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
         raise InputError(
-            f"markers.tracked names {listed(nowhere)}, which no trial has by data.trials.NAME.labels: name it there, "
+            f"markers.tracked names {listed(nowhere)}, which no trial has in data.trials.NAME.labels: add it there, "
             "or leave it out."
         )
     if markers.frame == "own":
@@ -217,7 +217,7 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
 
 
 def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:
-    """Refuses trials that have some markers in common, and not all, where shapes of them are compared."""
+    """Refuses trials that have some but not all markers in common, if markers are seen in their own frame."""
     has = {trial.name: {tracked[number] for number in trial.tracked(tracked)} for trial in trials}
     for one, other in combinations(has, 2):
         common, own = has[one] & has[other], has[one] ^ has[other]
@@ -234,8 +234,8 @@ def _check_release(run: RunSettings, data: RecordedData) -> None:
         return
     if data.rest != "held":
         raise InputError(
-            f"release.sideways is {sideways:g} m, but data.rest is {data.rest}: that tells where the markers are on "
-            "the undeformed body, so set release.sideways to 0."
+            f"release.sideways is {sideways:g} m, but data.rest {data.rest} gives the markers on the undeformed body: "
+            "set release.sideways to 0."
         )
     if not any(run.gravity):
         raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
@@ -244,7 +244,9 @@ def _check_release(run: RunSettings, data: RecordedData) -> None:
 def _check_inputs(data: RecordedData, drive: Drive) -> None:
     count = len(drive.parts)
     if data.input_limit is None:
-        raise InputError(f"data.input_limit is not set: say what the {drive.per}s take, in {drive.quantity.unit}.")
+        raise InputError(
+            f"data.input_limit is not set: give the largest input of the {drive.per}s, in {drive.quantity.unit}."
+        )
     if data.parts is not None and max(data.parts) > count:
         raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {count}.")
 
@@ -257,18 +259,18 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
         if trial.pull is not None and data.rest != "file":
             raise InputError(
                 f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so "
-                "that the recordings tell where markers are on the undeformed body."
+                "that the recordings have the markers on the undeformed body."
             )
     if data.rest == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials):
-        raise InputError("data.rest is file, but simulated bodies are held undeformed: set it to held.")
+        raise InputError("data.rest is file, but the simulated bodies are held undeformed: set it to held.")
     if begins & {"held", "released"}:
         for key in ("seconds", "held_seconds"):
             if getattr(laboratory, key) is None:
-                raise InputError(f"laboratory.{key} is missing: trials that are let go need it.")
+                raise InputError(f"laboratory.{key} is missing: released trials need it.")
         if (laboratory.seconds or 0.0) < (data.seconds or 0.0):
             raise InputError(
-                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): follow the body "
-                "for as long as it counts."
+                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): record at "
+                "least as long as the data are used."
             )
     played = PlayedSettings.of(run, files={})
     if "rest" in begins and data.steps is not None:
@@ -278,23 +280,23 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
             input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
     with _naming("laboratory: "):
         body = build_body(laboratory_settings(played), played.payload_at)
-    for each in (material,) if isinstance(material, Material) else material.values():
-        _check_size(body, each, run.gravity)
+    for own in (material,) if isinstance(material, Material) else material.values():
+        _check_size(body, own, run.gravity)
 
 
 def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
-    """Refuses a body that would sag under its own weight beyond belief, as one whose unit was mistaken does.
+    """Refuses a body with very large strains under its own weight, which indicate a wrong unit.
 
-    A body of length L under its weight has strains of rho g L / E: a percent for an arm of silicone.
+    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
     constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
-    each = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
-    shear = 0.5 * sum(float(modulus.mean()) * factor for modulus, factor, rule in each if rule == "shape")
+    terms = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
+    shear = 0.5 * sum(float(modulus.mean()) * factor for modulus, factor, rule in terms if rule == "shape")
     density = float(constants["density"].mean())
     stiffness = float(constants["youngs_modulus"].mean()) if "youngs_modulus" in constants else 3.0 * shear
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
-    if strain > _LONGEST_STRETCH:
+    if strain > _LARGEST_STRAIN:
         raise InputError(
             f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
             f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
@@ -303,11 +305,11 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
 
 
 def _check_identification(identify: IdentifySettings, known: Sequence[str], simulator: Simulator) -> None:
-    """Checks the names in the group ``identify``, given the parameters that may be identified."""
+    """Checks the group ``identify``, for the names ``known`` of the parameters that can be identified."""
     if not identify.parameters:
-        raise InputError(f"identify.parameters is empty: give a range of one or more of {', '.join(known)}.")
+        raise InputError(f"identify.parameters is empty: give a range for at least one of {', '.join(known)}.")
     elastic = [name for name in ELASTIC if name in known]
-    grid = () if identify.grid is None else [name for name, each in dict(identify.grid).items() if each is not None]
+    grid = () if identify.grid is None else [name for name, axis in dict(identify.grid).items() if axis is not None]
     for group, names, choice in (
         ("parameters", identify.parameters, known),
         ("elastic", identify.elastic or (), elastic),
@@ -318,23 +320,23 @@ def _check_identification(identify: IdentifySettings, known: Sequence[str], simu
             if name not in choice:
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
-    for name, each in identify.parameters.items():
-        if command_of(simulator, name)[1] in ("delay", "rise") and each.lower < 0.0:
+    for name, limits in identify.parameters.items():
+        if command_of(simulator, name)[1] in ("delay", "rise") and limits.lower < 0.0:
             raise InputError(
-                f"identify.parameters.{name}.lower is {each.lower:g}: nothing comes before its command, so it must be "
-                "zero or more, in s; data.trials.NAME.onset says when a command comes."
+                f"identify.parameters.{name}.lower is {limits.lower:g}: inputs cannot precede their command, so it "
+                "must be zero or more, in s; data.trials.NAME.onset is the time of a command."
             )
 
 
 def _check_parts(identify: IdentifySettings, simulator: Simulator) -> None:
-    """Checks parameters of parts, and where the ends of their ranges take tendons."""
+    """Checks parameters of parts, and the routes of tendons at the limits of their ranges."""
     names, of_parts = [*identify.parameters], parameters_of_parts(simulator)
     for whole in names:
-        parts = [name for name, (each, _) in of_parts.items() if each == whole]
+        parts = [name for name, (parameter, _) in of_parts.items() if parameter == whole]
         if parts and set(parts) <= set(names):
-            raise InputError(f"identify.parameters names {whole} and it of every part, {', '.join(parts)}: choose one.")
-    found = [each for each in cast(Sequence[Energy], simulator.body.energies) if isinstance(each, Tendons)]
-    for tendons, (name, range_) in product(found, identify.parameters.items()):
+            raise InputError(f"identify.parameters names {whole} and its parts, {', '.join(parts)}: choose one.")
+    groups = [energy for energy in cast(Sequence[Energy], simulator.body.energies) if isinstance(energy, Tendons)]
+    for tendons, (name, range_) in product(groups, identify.parameters.items()):
         whole, part = of_parts.get(name, (name, None))
         for number, quantity in enumerate(OFFSETS[: tendons.offset_count]):
             for end in ("lower", "upper") if quantity.name == whole else ():
@@ -352,7 +354,7 @@ def _check_ablation(run: RunSettings, simulator: Simulator) -> None:
     counts, surface = run.ablation.counts, len(surface_vertices(simulator.body.mesh))
     if max(counts) > surface:
         raise InputError(
-            f"ablation.counts asks for {max(counts)} markers, but the mesh has {surface} surface vertices: ask for "
+            f"ablation.counts asks for {max(counts)} markers, but the mesh has {surface} surface vertices: use "
             "fewer, or refine the mesh."
         )
     _check_reconstruction(run, simulator, run.ablation.modes)

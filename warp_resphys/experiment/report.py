@@ -1,6 +1,6 @@
-"""Stage: the report page of a split, and the one over the folds; they show what the run folder holds.
+"""Stage: writes the report page of a split, and of a cross-validation, from the files of the run folder.
 
-What reads a file raises a DataFileError where that is missing or damaged.
+Functions that read a file raise a DataFileError if the file is missing or damaged.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,10 +57,10 @@ FloatArray = NDArray[np.float64]
 
 
 def make_report(context: StageContext) -> None:
-    """Writes report.html of a split of the trials, with its figures and, where there is one, the video.
+    """Writes report.html of a split, with its figures and, if there is one, its video.
 
     Raises:
-        DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
+        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
     folder, run = context.run_dir, context.settings.config
     metrics, truth = collect_metrics(folder, run), read_if_there(common_folder(folder) / TRUTH)
@@ -96,10 +96,10 @@ def make_report(context: StageContext) -> None:
 
 
 def make_folds_report(context: StageContext) -> None:
-    """Writes report.html over the folds, from metrics.json and what is common to them.
+    """Writes report.html of a cross-validation, from metrics.json and the files that all folds share.
 
     Raises:
-        DataFileError: a file of an earlier stage is missing or damaged, or one could not be written.
+        DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
     folder, run = context.run_dir, context.settings.config
     metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
@@ -115,7 +115,7 @@ def make_folds_report(context: StageContext) -> None:
 
 
 def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> dict[str, Any]:
-    """What all pages show."""
+    """Data that all pages show."""
     return {
         "metrics": metrics,
         "settings": run,
@@ -126,31 +126,32 @@ def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> d
 
 
 def common_folder(folder: Path) -> Path:
-    """Where the files lie that do not depend on the fold: here, or beside the folders of the folds."""
+    """Folder of the files that do not depend on the fold: the folder itself, or the parent of a fold's folder."""
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
 def _histories(folder: Path, refined: bool) -> dict[str, Any]:
-    """The epochs of the trainings, or of the refinements, by model."""
+    """Training histories, or refinement histories, by model."""
     files = {model: folder / training_file(model, refined) for model in LEARNED}
     return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
 
 
 def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> dict[str, Any]:
-    """What metrics.json of a split says.
+    """Contents of metrics.json of a split.
 
-    Errors, the noise in them where known, which weights were kept, what was identified and reconstructed, time and
-    memory of the stages (those that are done in the order of their end, if left out), versions and device.
+    These are errors, noise of the observations if known, selected weights, results of identification and
+    reconstruction, time and memory of the stages (by default all finished stages, in order of completion), versions and
+    device.
     """
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-        stages = [path.stem for path in records if "." not in path.stem]  # not what interrupted stages keep
+        stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
     files = {
         f"{model}_refined" if refined else model: folder / training_file(model, refined)
         for model in LEARNED
         for refined in (False, True)
     }
-    identified, truth = (read_if_there(each) for each in (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
+    identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     more = {
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
         "control": read_if_there(folder / CONTROL) if run.control is not None else {},
@@ -161,8 +162,8 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     return {
         **read_json(folder / ERRORS),
         "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
-        "parameters": {name: each["parameters"] for name, each in identified.items() if "parameters" in each},
-        "first_guesses": {name: each["first_guess"] for name, each in identified.items() if "first_guess" in each},
+        "parameters": {name: x["parameters"] for name, x in identified.items() if "parameters" in x},
+        "first_guesses": {name: x["first_guess"] for name, x in identified.items() if "first_guess" in x},
         **{key: value for key, value in more.items() if value},
         **resources_used(folder, stages),
         "versions": package_versions(),
@@ -171,25 +172,25 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
 
 
 def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str, float]:
-    """What the simulator has of all that was identified, and of what the landscape is drawn over."""
-    names = {name for found in identification.values() for name in found.get("parameters", {})}
+    """Configured values of the identified parameters, and of the axes of the loss landscape."""
+    names = {name for model in identification.values() for name in model.get("parameters", {})}
     simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
     return configured_parameters(simulator, (*names, "youngs_modulus", "poissons_ratio"))
 
 
 def read_trials(folder: Path, run: RunSettings) -> TrialResults:
-    """What was observed in the test trials of a split and what the models made of them, as long as it counts.
+    """Observations of the test trials of a split and roll-outs of the models, up to the evaluated duration.
 
-    Roll-outs at other inputs than those of the data set are left out.
+    Roll-outs with scaled inputs are left out.
 
     Raises:
-        DataFileError: a file is missing or damaged, or the two do not belong together.
+        DataFileError: a file is missing or damaged, or the dataset and the roll-outs do not belong together.
     """
     path = common_folder(folder) / DATASET
     dataset = read_dataset(path)
     bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-        rolled = tuple(str(each) for each in file.attrs["names"])
+        rolled = tuple(map(str, file.attrs["names"]))
         scaled = _read_scaled(folder)
         test = [name for name in rolled if scaled is None or name not in scaled.names]
         models = [model for model in MODELS if f"{model}_observed" in file]
@@ -206,7 +207,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
     if seconds is not None:
         target = np.where((times <= seconds)[..., None, None], target, np.nan)
         length = max(1, int((times <= seconds).any(axis=0).sum()))
-    if set(begins) == {STATIC}:  # Beside motions, poses have as many frames, of one time.
+    if set(begins) == {STATIC}:  # Static poses beside motions are padded to the same number of frames.
         length = 1
     return TrialResults(
         names=tuple(test),
@@ -214,7 +215,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         begins=begins,
         times=times[:, :length],
         target=target[:, :length],
-        positions={model: each[:, :length] for model, each in positions.items()},
+        positions={model: points[:, :length] for model, points in positions.items()},
         bound=bound,
         gravity=dataset.gravity,
         time_step=dataset.time_step,
@@ -223,7 +224,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
 
 
 def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
-    """How markers are seen, for the pictures."""
+    """View of the markers, for the figures."""
     labels = dataset.labels
     if run.markers is None:
         return {}
@@ -232,13 +233,13 @@ def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
 
 
 def _read_scaled(folder: Path) -> Dataset | None:
-    """The trials at other inputs than those of the data set."""
+    """Dataset of the trials with scaled inputs, if there are any."""
     path = common_folder(folder) / SCALED_DATASET
     return read_dataset(path) if path.is_file() else None
 
 
 def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
-    """The bodies of the film, where their markers are seen; None where there is none."""
+    """Bodies of the film, placed as their markers are seen; None if there is no film."""
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         if "film_steps" not in file:
             return None
@@ -251,7 +252,7 @@ def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
 
 
 def _as_seen(film: Film, dataset: Dataset, run: RunSettings, mesh: Mesh) -> Film:
-    """The same, with the bodies carried to where their markers are seen."""
+    """Moves the bodies of a film to where their markers are seen, if markers have their own frame."""
     if dataset.bound is None or run.markers is None:
         return film
     view = marker_view_of(run.markers, dataset.labels, dataset.sets)
@@ -260,35 +261,35 @@ def _as_seen(film: Film, dataset: Dataset, run: RunSettings, mesh: Mesh) -> Film
     has = np.flatnonzero(dataset.present[dataset.names.index(film.trial)]).tolist()
     markers = bound_markers(run.markers, mesh, dataset.bound, dataset.labels)
     view = view.select(has)
-    at = {model: torch.from_numpy(each) for model, each in film.positions.items()}
+    at = {model: torch.from_numpy(positions) for model, positions in film.positions.items()}
     return replace(film, positions={model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
 
 
 def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
-    """How controllers have driven a simulated laboratory; nothing where they have not."""
+    """Paths that controllers followed in a simulated laboratory; empty without control."""
     if run.control is None or not run.is_laboratory:
         return []
-    found = []
+    followed = []
     with read_hdf5(folder / DRIVEN, "driven") as file:
-        controllers = [str(each) for each in file.attrs["controllers"]]
+        controllers = [*map(str, file.attrs["controllers"])]
         for name in map(str, file.attrs["names"]):
             shape, seconds = name.removesuffix("s").rsplit("_", 1)
             path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
             points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
             by_name = dict(zip(controllers, points, strict=True))
-            found.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
-    return found
+            followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+    return followed
 
 
 def read_driven(folder: Path, run: RunSettings) -> Driven | None:
-    """What drives all trials of a split; None where nothing does."""
+    """Driving inputs of all trials of a split; None without actuators."""
     dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
     quantity = driving_quantity(run)
     if quantity is None or quantity.name not in dataset.inputs:
         return None
     values: dict[str, Any] = {}
-    for each in (dataset, *([] if scaled is None else [scaled])):
-        values |= dict(zip(each.names, each.inputs[quantity.name], strict=True))
+    for trials in (dataset, *([] if scaled is None else [scaled])):
+        values |= dict(zip(trials.names, trials.inputs[quantity.name], strict=True))
     return Driven(
         quantity,
         dataset.channels[quantity.name],
@@ -300,34 +301,34 @@ def read_driven(folder: Path, run: RunSettings) -> Driven | None:
 
 
 def _routes(body: Body) -> dict[str, FloatArray]:
-    """(G, 3) guides of the body's tendons, or a line through each of its muscles [m], by name."""
-    found: dict[str, FloatArray] = {}
+    """(G, 3) guides of the body's tendons, and lines through its muscles [m], by name."""
+    routes: dict[str, FloatArray] = {}
     for energy in body.energies:
         if isinstance(energy, Tendons):
-            found |= dict(zip(energy.names, energy.guides, strict=True))
+            routes |= dict(zip(energy.names, energy.guides, strict=True))
         elif isinstance(energy, Muscles):
-            found |= energy.lines(body.mesh)
-    return found
+            routes |= energy.lines(body.mesh)
+    return routes
 
 
 def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
-    """Those of a body's chambers that are under pressure, in the order of the pressures."""
+    """Chambers under pressure, in the order of the pressures."""
     if not chambers:
         return ()
-    found = {chamber.name: chamber for chamber in chambers}
-    unknown = [name for name in names if name not in found]
+    by_name = {chamber.name: chamber for chamber in chambers}
+    unknown = [name for name in names if name not in by_name]
     if unknown:
         raise DataFileError(
             f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
-            f"{', '.join(found) or 'none'}: take the mesh that the trials were imported for."
+            f"{', '.join(by_name) or 'none'}: use the mesh with which the trials were imported."
         )
-    return tuple(found[name] for name in names)
+    return tuple(by_name[name] for name in names)
 
 
 def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
-    """The body as it rests, and how far each marker has moved there (3,) [m], by label.
+    """Mesh of the body at rest, and displacement (3,) of each marker there [m], by label.
 
-    Where trials begin at rest, that is how the simulator to correct has it before anything drives it; else it is
+    If trials begin at rest, this is the equilibrium of the uncorrected simulator without inputs; otherwise the body is
     undeformed.
     """
     model = "simulation"
@@ -341,26 +342,26 @@ def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh,
 
 
 def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
-    """Quality and registration of all trials, and the trial that fits worst; None where there are no recordings.
+    """Quality and registration of all trials, with the worst registration in detail; None without recordings.
 
     Args:
-        folder: of the split.
-        run: its settings.
-        mesh: the body as it is at rest.
-        moved: (3,) how far nominal places, which are on the undeformed body, move until it is at rest, by label [m].
+        folder: folder of the split.
+        run: settings of the run.
+        mesh: mesh of the body at rest.
+        moved: (3,) displacements of the markers from the undeformed body to the body at rest [m], by label.
     """
     if run.markers is None:
         return None
     path = common_folder(folder) / REGISTRATION
     residuals = read_json(path)
     worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
-    each = residuals[worst]
-    if "positions" not in each:
+    drawn = residuals[worst]
+    if "positions" not in drawn:
         raise DataFileError(f"{path} has no positions: delete it and run the same command again.")
     nominal: dict[str, Any] = {**run.markers.tracked, **run.markers.reference}
-    labels = [label for label in each["positions"] if label in nominal]
-    # What JSON has as null was not seen.
-    places = np.array([each["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
+    labels = [label for label in drawn["positions"] if label in nominal]
+    # Markers that were not seen are null in JSON.
+    places = np.array([drawn["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
     seen = np.isfinite(places).all(axis=1)
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
@@ -370,8 +371,8 @@ def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[s
         drawn=worst,
         labels=tuple(labels),
         positions=places,
-        residual_mm=np.array([each["residual_mm"].get(label) for label in labels], dtype=np.float64),
-        outliers=tuple(each["outliers"]),
+        residual_mm=np.array([drawn["residual_mm"].get(label) for label in labels], dtype=np.float64),
+        outliers=tuple(drawn["outliers"]),
         nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
         feet=feet,
         mesh=mesh,

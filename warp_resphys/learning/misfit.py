@@ -1,0 +1,311 @@
+"""The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
+
+The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
+all motions at once. Parameters are fractions of their ranges, "units" from 0 to 1.
+
+Prior knowledge, normal distributions of parameters (`Prior`) and of marker places (`placement`), adds its squares,
+weighted as much as one independent residual of the data: by their mean square, times the number of frames that are
+correlated. That weight is computed at the start of a search and again at the minimum.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..data.markers import Markers
+from ..data.trials import Trials
+from ..io.errors import ConvergenceError, InputError
+from .bounds import Bounds
+from .parameters import check_names
+from .placement import Accuracy, DisplacedMarkers, Placement, estimate_placement
+from .replay import Replay, Start
+from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
+
+_MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
+_DIFFERENCE = 1e-3  # of a range, for derivatives by differences
+_LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
+
+FloatArray = NDArray[np.float64]
+
+
+class Misfit:
+    """Loss, residuals and their derivatives.
+
+    Args:
+        replays: groups of trials that begin alike, such as motions or static poses, with their starts; all with one
+            simulator.
+        bounds: range of each of the P parameters to identify.
+        seconds: length of each motion that is compared [s]; the whole motion if None.
+        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
+        centre: (3,) about which recordings may be rotated [m].
+
+    Attributes:
+        simulator: of all replays; it raises where a solve fails.
+        bounds: see above.
+        prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
+
+    Raises:
+        InputError: an unknown parameter, or none; or a motion in which nothing moves.
+    """
+
+    def __init__(
+        self,
+        replays: Sequence[tuple[Replay, Start]],
+        bounds: Mapping[str, Bounds],
+        seconds: float | None = None,
+        accuracy: Accuracy | None = None,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if not bounds:
+            raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
+        first = replays[0][0]
+        check_names(bounds, first.parameter_names)
+        simulator, self.bounds = first.simulator, dict(bounds)
+        most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
+        settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
+        self.simulator = replace(simulator, solver=settings)
+        self.prior_weight = 0.0
+        self._accuracy, self._centre = accuracy, self.simulator.tensor(list(centre))
+        self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
+        self._replays: list[tuple[Replay, Start]] = []
+        self._weights: list[torch.Tensor] = []
+        count = sum(len(replay.trials.names) for replay, _ in replays)
+        for replay, start in replays:
+            trials = replay.trials if seconds is None else replay.trials.first(seconds)
+            for name, moved in zip(trials.names, trials.amplitude.tolist(), strict=True):
+                if not moved > 0.0:
+                    raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
+            self._replays.append(self._prepared(replay, start, trials))
+            self._weights.append(trials.loss_weight * (len(trials.names) / count))
+        self.forget()
+
+    def _prepared(self, replay: Replay, start: Start, trials: Trials) -> tuple[Replay, Start]:
+        """The replay with this simulator and, where marker places are uncertain, with displaced markers."""
+        if self._accuracy is None:
+            return Replay(self.simulator, replay.observe, trials), start
+        if not isinstance(replay.observe, Markers):
+            raise InputError("where the markers sit can be identified of markers alone: leave identify.placement out.")
+        displaced = DisplacedMarkers(replay.observe, trials.observed.shape[2])
+        shift = None if start.shift is None else start.shift.repeat(1, displaced.copies, 1)
+        return Replay(self.simulator, displaced, trials), replace(start, shift=shift)
+
+    def forget(self) -> None:
+        """Forgets the equilibria of earlier parameters, from which the next equilibria are predicted."""
+        self._equilibria: list[_Equilibria | None] = [None] * len(self._replays)
+
+    def to_unit(self, values: Mapping[str, float]) -> FloatArray:
+        """(P,) values as fractions of their ranges, clipped to the bounds."""
+        clipped = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
+        return np.array([b.to_unit(value) for b, value in clipped])
+
+    def from_unit(self, unit: Sequence[float] | FloatArray) -> dict[str, float]:
+        """Values of the parameters at (P,) fractions of their ranges."""
+        return {
+            name: float(range_.from_unit(torch.tensor(float(u), dtype=torch.float64)))
+            for (name, range_), u in zip(self.bounds.items(), unit, strict=True)
+        }
+
+    def losses(self, unit: torch.Tensor) -> torch.Tensor:
+        """(E,) losses of (E, P) parameters, differentiable."""
+        residuals, prior = self._residuals(unit)
+        weighted = [
+            (errors.square().sum((2, 3, 4)) * w).sum(1) for errors, w in zip(residuals, self._weights, strict=True)
+        ]
+        return torch.stack(weighted).sum(0) + prior.square().sum(1)
+
+    def losses_or_infinite(self, points: FloatArray) -> FloatArray:
+        """(E,) losses of (E, P) parameters, without gradients; infinite where the simulation fails.
+
+        After a failure, the other parameters are simulated again without the failed ones.
+        """
+        losses, left = np.full(len(points), np.inf), np.arange(len(points))
+        while len(left):
+            try:
+                with torch.no_grad():
+                    losses[left] = self.losses(self.simulator.tensor(points[left])).cpu().numpy()
+                break
+            except ConvergenceError as error:
+                left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
+        return losses
+
+    def loss_and_gradient(self, unit: FloatArray) -> tuple[float, FloatArray]:
+        """Loss of (P,) parameters and its gradient; infinite and zero where the simulation fails."""
+        x = self.simulator.tensor(unit)[None].requires_grad_()
+        try:
+            with torch.enable_grad():
+                loss = self.losses(x)[0]
+                (gradient,) = torch.autograd.grad(loss, x)
+        except ConvergenceError:
+            return np.inf, np.zeros_like(unit)
+        self._keep_equilibria(x)
+        return float(loss.detach()), gradient[0].double().cpu().numpy()
+
+    def linearise(
+        self, unit: FloatArray, central: bool = False, derivatives: bool = True
+    ) -> tuple[list[Linearised], FloatArray] | None:
+        """Weighted residuals of every trial and their derivatives by (P,) parameters, from finite differences.
+
+        One-sided differences point into the range; central ones are taken at least one step away from its bounds.
+
+        Returns:
+            For every trial, its residuals (T, 3 M), derivatives (3 T M, P) and number of seen coordinates; and the
+            derivatives (K, P) of the prior residuals. None where a simulation fails.
+        """
+        count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
+        if central:
+            unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
+        sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
+        used = sides[: 3 if central else 2] if derivatives else sides[:1]
+        points = self.simulator.tensor(np.concatenate(used))
+        try:
+            with torch.no_grad():
+                if derivatives and not any(self._equilibria):
+                    self._find_equilibria(points[:1])
+                residuals, prior = self._residuals(points)
+        except ConvergenceError:
+            return None
+        self._keep_equilibria(points[: count + 1])
+
+        def slopes(values: FloatArray) -> FloatArray:
+            """(..., P) derivatives of values (E, ...) at the points."""
+            if not derivatives:
+                return np.zeros((*values.shape[1:], count))
+            behind, width = (values[count + 1 :], 2.0 * steps) if central else (values[:1], steps)
+            change = values[1 : count + 1] - behind
+            return np.moveaxis(change / width.reshape(-1, *[1] * (change.ndim - 1)), 0, -1)
+
+        trials = list[Linearised]()
+        for (replay, _), errors, weight in zip(self._replays, residuals, self._weights, strict=True):
+            weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
+            jacobian = slopes(weighted.reshape(*weighted.shape[:2], -1))
+            seen = 3 * replay.trials.seen.sum((1, 2)).cpu().numpy()
+            rows = weighted[0].reshape(*weighted.shape[1:3], -1)
+            trials += zip(rows, jacobian, seen.tolist(), strict=True)
+        return trials, slopes(prior.double().cpu().numpy())
+
+    def update_prior_weight(self, unit: FloatArray) -> float:
+        """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
+        before = self.prior_weight
+        if self._accuracy is None and not any(self._priors):
+            return 1.0
+        linearised = self.linearise(unit, derivatives=False)
+        if linearised is None:
+            return 1.0
+        trials, _ = linearised
+        seen = sum(count for *_, count in trials)
+        squares = [np.square(rows).sum() * redundancy(rows) for rows, _, _ in trials]
+        self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
+        return self.prior_weight / before if before else math.inf
+
+    def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
+        """Uncertainty of (P,) parameters; None if a simulation close by fails."""
+        linearised = self.linearise(unit, central=True)
+        return None if linearised is None else uncertainty_of(*linearised, self.prior_weight, self.bounds, unit)
+
+    def placement(self, unit: FloatArray) -> Placement | None:
+        """The best placement of the markers with (P,) parameters; None where it is exact."""
+        if self._accuracy is None:
+            return None
+        with torch.no_grad():
+            x = self.simulator.tensor(unit)[None]
+            series = self._simulated(x)
+            self._keep_equilibria(x)
+            return self._placed([points[0] for points in series])[0]
+
+    def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+        """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
+        series = self._simulated(unit)
+        weight = math.sqrt(self.prior_weight)
+        priors = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
+        columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in priors]
+        rows = torch.stack(columns, 1) if columns else unit.new_zeros(len(unit), 0)
+        replays = [replay for replay, _ in self._replays]
+        if self._accuracy is None:
+            return [replay.errors(points) for replay, points in zip(replays, series, strict=True)], rows
+        placed, placement_rows = [], []
+        for row in range(len(unit)):
+            displaced = [points[row] for points in series]
+            if not self.prior_weight:  # The weight of the placement's prior is not known yet: nominal places.
+                placed.append([DisplacedMarkers.split(points)[0] for points in displaced])
+                placement_rows.append(unit.new_zeros(1))
+                continue
+            placement, deviations, moved = self._placed(displaced)
+            placement_rows.append(weight * deviations)
+            placed.append([placement.apply(points) for points in moved])
+        errors = [
+            replay.errors(torch.stack(points)) for replay, points in zip(replays, zip(*placed, strict=True), strict=True)
+        ]
+        return errors, torch.cat([rows, torch.stack(placement_rows)], 1)
+
+    def _placed(self, series: Sequence[torch.Tensor]) -> tuple[Placement, torch.Tensor, list[torch.Tensor]]:
+        """The best placement for one set of parameters, the same in standard deviations, and the moved markers."""
+        assert self._accuracy is not None
+        parts = [DisplacedMarkers.split(points) for points in series]
+        with torch.no_grad():  # At the best placement, the loss is stationary in it.
+            markers, rotations = [points for points, _ in parts], [rotation for _, rotation in parts]
+            errors = [r.errors(points[None])[0] for (r, _), points in zip(self._replays, markers, strict=True)]
+            seen = [r.trials.seen for r, _ in self._replays]
+            placement, deviations = estimate_placement(
+                self._accuracy, self._centre, errors, seen, markers, rotations, self._weights, self.prior_weight
+            )
+        moved = [points + (rotation @ placement.offsets[..., None])[..., 0] for points, rotation in parts]
+        return placement, deviations, moved
+
+    def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
+        """(E,) values of each parameter."""
+        return {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
+
+    def _simulated(self, unit: torch.Tensor) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m]."""
+        values, simulated = self._values(unit), []
+        for (replay, start), equilibria in zip(self._replays, self._equilibria, strict=True):
+            begin = start if equilibria is None else start.near(equilibria.predicted(unit.detach()))
+            simulated.append(replay(begin, values))
+        return simulated
+
+    def _find_equilibria(self, unit: torch.Tensor) -> None:
+        """Solves the equilibria for (1, P) parameters, from which those of nearby parameters are predicted."""
+        for replay, start in self._replays:
+            if start.at_rest:
+                constants, _, resting = replay.prepare(self._values(unit))
+                replay.initial_state(start, constants, resting)
+        self._keep_equilibria(unit)
+
+    def _keep_equilibria(self, unit: torch.Tensor) -> None:
+        """Keeps the equilibria of the last simulation.
+
+        Args:
+            unit: (1, P) parameters, or (1 + P, P) with one parameter changed in each further row. Equilibria of other
+                rows that were simulated are ignored.
+        """
+        unit, before = unit.detach(), self._equilibria
+        self.forget()
+        for number, (replay, start) in enumerate(self._replays):
+            if not start.at_rest or replay.settled is None:
+                continue
+            first, *others = replay.settled.split(len(replay.trials.names))[: len(unit)]
+            earlier = before[number]
+            slopes = None if earlier is None else earlier.slopes
+            if others:
+                steps = (unit[1:] - unit[:1]).diagonal()
+                slopes = (torch.stack(others) - first) / steps[:, None, None, None]
+            self._equilibria[number] = _Equilibria(unit[0], first, slopes)
+
+
+@dataclass(frozen=True)
+class _Equilibria:
+    """Equilibria of R trials and their derivatives by the parameters."""
+
+    unit: torch.Tensor  # (P,) the parameters, as fractions of their ranges
+    q: torch.Tensor  # (R, N, 3) [m]
+    slopes: torch.Tensor | None  # (P, R, N, 3) derivatives [m]; None where not known
+
+    def predicted(self, unit: torch.Tensor) -> torch.Tensor:
+        """(E R, N, 3) equilibria with (E, P) other parameters, to first order [m]."""
+        if self.slopes is None:
+            return self.q.repeat(len(unit), 1, 1)
+        return (self.q + torch.einsum("ep,prni->erni", unit - self.unit, self.slopes)).flatten(0, 1)

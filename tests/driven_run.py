@@ -9,7 +9,7 @@ from measured_run import describe_recordings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.metrics import median_filter, summarise, summarise_each
+from warp_resphys.learning.metrics import median_filter, summarise, summarise_trajectories
 from warp_resphys.report.data import mean_distance
 from warp_resphys.settings.run import RunSettings
 
@@ -176,7 +176,7 @@ def _errors(simulated, measured, names, test, labels, scales, horizons):
 
     content = {
         "errors_mm": part(nominal),
-        "per_trajectory": summarise_each(names[:test], nominal),
+        "per_trajectory": summarise_trajectories(names[:test], nominal),
         "per_marker": {
             model: dict(zip(labels, np.nanmean(1e3 * np.linalg.norm(m - measured, axis=3), axis=(0, 1)), strict=True))
             for model, m in simulated.items()

@@ -8,7 +8,7 @@ from configured import composed
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, write_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.metrics import marker_errors, summarise, summarise_each
+from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
 from warp_resphys.settings.run import RunSettings
 
 STEPS, STEP = 40, 0.01
@@ -75,7 +75,7 @@ def write_errors(folder, test, runs, target):
         {
             "errors_mm": summaries,
             "errors_vs_reconstruction_mm": {m: rows for m, rows in summaries.items() if m != "reconstruction"},
-            "per_trajectory": summarise_each(test, errors),
+            "per_trajectory": summarise_trajectories(test, errors),
         },
     )
 

@@ -114,7 +114,7 @@ class TestEvaluator:
         inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
         range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))
         for guard in (None, range_):
-            wanted = network.standardised(inputs if guard is None else guard.hold(inputs))[0]
+            wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))[0]
             np.testing.assert_allclose(Evaluator(network, guard)(inputs.numpy()), wanted.detach().numpy(), atol=1e-12)
 
 

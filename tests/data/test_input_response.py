@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.data.input_response import InputResponse, told_of
+from warp_resphys.data.input_response import InputResponse, with_means
 
 STEP = 0.01
 
@@ -39,14 +39,14 @@ def test_a_delay_is_differentiable():
 def test_means_remember_what_the_pressure_was():
     pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
     pressure[20:, :, 0] = 1e4
-    told = told_of(*InputResponse(STEP, filters=[0.1, 1.0]).from_rest(pressure))
+    told = with_means(*InputResponse(STEP, filters=[0.1, 1.0]).from_rest(pressure))
     assert told.shape == (100, 1, 6)
     torch.testing.assert_close(told[..., :2], pressure)
     assert not told[:20].any()
     fast, slow = told[-1, 0, 2], told[-1, 0, 4]
     assert float(fast) == pytest.approx(1e4, rel=1e-3)
     assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
-    torch.testing.assert_close(told_of(*InputResponse(STEP).from_rest(pressure)), pressure)
+    torch.testing.assert_close(with_means(*InputResponse(STEP).from_rest(pressure)), pressure)
 
 
 @pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.001), (0.02, 0.03), (0.025, 0.04), (0.07, 0.05)])
@@ -70,4 +70,4 @@ def test_constant_commands_are_remembered_as_if_they_had_always_been_given():
     commands = np.array([[1.0, 2.0]])
     response = InputResponse(STEP, 0.8, 0.013, 0.02, [0.3])
     acting, means, _ = response(response.still(commands), commands[None])
-    np.testing.assert_allclose(told_of(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))
+    np.testing.assert_allclose(with_means(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))

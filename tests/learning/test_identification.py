@@ -15,6 +15,7 @@ from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.bounds import Bounds
 from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs
@@ -119,13 +120,13 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
     bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
-    identifier = Identifier([(replay, release)], bounds)
-    uncertainty = identifier.uncertainty(identifier._units(truth))
+    misfit = Misfit([(replay, release)], bounds)
+    uncertainty = misfit.uncertainty(misfit.to_unit(truth))
     assert uncertainty.correlation[0][1] > 0.999
     assert uncertainty.poorest_deviation > 1.0
     replay, release = replay_of(simulator(), truth, masses=(0.0, 0.05), noise=5e-5)
-    told = Identifier([(replay, release)], bounds).uncertainty(np.array([0.13, 0.39]))
-    assert told.poorest_deviation < 0.1
+    weighted = Misfit([(replay, release)], bounds).uncertainty(np.array([0.13, 0.39]))
+    assert weighted.poorest_deviation < 0.1
 
 
 def test_a_parameter_outside_its_range_ends_on_the_bound():
@@ -214,9 +215,8 @@ def test_only_the_first_seconds_count():
     spoilt = replay.trials.observed.clone()
     spoilt[:, 20:] += 1.0
     motions = replace(replay.trials, observed=spoilt)
-    identifier = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES, seconds=0.19)
-    unit = replay.simulator.tensor(identifier._units(TRUTH))[None]
-    assert float(identifier.losses(unit)) < 1e-12
+    misfit = Misfit([(Replay(replay.simulator, MARKERS, motions), release)], RANGES, seconds=0.19)
+    assert misfit.losses_or_infinite(misfit.to_unit(TRUTH)[None])[0] < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -257,16 +257,16 @@ def test_bounds_there_and_back(bounds):
     assert float(values[-1]) == pytest.approx(bounds.upper)
 
 
-def test_groups_of_trials_weigh_what_their_trials_do():
-    """Trials in groups of their own, as those that begin otherwise are, give what one group of them gives."""
+def test_groups_of_trials_are_weighted_by_their_number_of_trials():
+    """Trials split into groups have the loss and uncertainty of one group of all trials."""
     replay, release = replay_of(simulator(), TRUTH, masses=(0.0, 0.05, 0.1), frames=12, noise=5e-5)
     apart = [
         (Replay(replay.simulator, MARKERS, replay.trials.select(rows)), release.select(rows)) for rows in ([2], [0, 1])
     ]
-    whole, groups = Identifier([(replay, release)], RANGES), Identifier(apart, RANGES)
+    whole, groups = Misfit([(replay, release)], RANGES), Misfit(apart, RANGES)
     unit = replay.simulator.tensor([[0.2, 0.1], [0.5, 0.3]])
     torch.testing.assert_close(groups.losses(unit), whole.losses(unit), rtol=1e-6, atol=0.0)
-    one, other = (each.uncertainty(np.array([0.3, 0.1])) for each in (whole, groups))
+    one, other = (misfit.uncertainty(np.array([0.3, 0.1])) for misfit in (whole, groups))
     assert other.deviation == pytest.approx(one.deviation, rel=1e-3)
     np.testing.assert_allclose(other.correlation, one.correlation, atol=1e-3)
 

@@ -36,7 +36,7 @@ def test_ninety_per_cent_hold_on_other_trials(noise, scale):
         found, scales = [], []
         for seed in range(40):
             intervals = Intervals.calibrated(*trials(count, seed, noise), REST)
-            found.append(intervals.holds(*trials(20, 1000 + seed, noise), REST)["coverage"])
+            found.append(intervals.coverage(*trials(20, 1000 + seed, noise), REST)["coverage"])
             scales.append(intervals.scale)
         assert 0.85 < np.mean(found) < 0.95, count
         assert scales.count(scale) > 30
@@ -50,7 +50,7 @@ def test_wider_for_a_marker_that_is_further_off():
     assert intervals.factor[1] > 1.5 * intervals.factor[0]
     again = Intervals.from_plain(intervals.plain())
     assert again == intervals
-    held = again.holds(simulated, observed, REST)
+    held = again.coverage(simulated, observed, REST)
     assert held["coverage"] > 0.9
     assert 1.5 < held["half_width_mm"] < 6.0
 
@@ -63,7 +63,7 @@ def test_what_was_not_seen_counts_nowhere():
     some = Intervals.calibrated(simulated, observed, REST)
     assert some.factor == pytest.approx(whole.factor, rel=0.3)
     observed[0][:] = np.nan
-    assert np.isfinite(some.holds(simulated, observed, REST)["coverage"])
+    assert np.isfinite(some.coverage(simulated, observed, REST)["coverage"])
 
 
 def test_a_model_that_diverges_has_no_intervals():

@@ -134,5 +134,5 @@ def test_what_cannot_be_compared_is_refused(robot):
     motion = wr.ObservedMotion(robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         wr.identify(robot, motion, {"mass": (1.0, 2.0)})
-    with pytest.raises(wr.InputError, match="no recurrent network"):
+    with pytest.raises(wr.InputError, match="does not train recurrent networks"):
         wr.fit_force(robot, wr.reconstruct(robot, motion), network=NetworkSettings(recurrent=4))

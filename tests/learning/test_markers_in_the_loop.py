@@ -10,7 +10,7 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
+from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start
@@ -144,7 +144,7 @@ def observed_motions(frames=8):
 @pytest.fixture(scope="module")
 def loss():
     motions, release = observed_motions()
-    return MotionLoss([Watched(Replay(simulator(), MARKERS, motions), release, LOADS)], {})
+    return MotionLoss([TrialGroup(Replay(simulator(), MARKERS, motions), release, LOADS)], {})
 
 
 def network(seed=0, **changes):
@@ -253,7 +253,7 @@ class TestMarkersInTheLoop:
         sim = simulator()
         with torch.no_grad():
             exact = Replay(sim, MARKERS, motions)(release)[0]
-        other = MotionLoss([Watched(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
+        other = MotionLoss([TrialGroup(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
         config, seen = CONFIG.changed(epochs=3), []
         assert cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
@@ -280,7 +280,8 @@ class TestMarkersInTheLoop:
         motions, release = observed_motions()
         sim, model = simulator(), network()
         watched = [
-            Watched(Replay(sim, MARKERS, motions.select([row])), release.select([row]), LOADS[[row]]) for row in (1, 0)
+            TrialGroup(Replay(sim, MARKERS, motions.select([row])), release.select([row]), LOADS[[row]])
+            for row in (1, 0)
         ]
         apart = MotionLoss(watched, {})
         for each in (None, model):

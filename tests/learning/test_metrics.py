@@ -11,8 +11,8 @@ from warp_resphys.learning.metrics import (
     marker_errors,
     paired_gain,
     summarise,
-    summarise_each,
     summarise_folds,
+    summarise_trajectories,
 )
 
 
@@ -52,7 +52,7 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
         1,
         2,
     )
-    each = summarise_each(["a", "b"], {"resphys": [good, errors]})
+    each = summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
     assert [entry["errors_mm"]["resphys"] for entry in each] == [pytest.approx(1.0), None]
     json.dumps([summary, each], allow_nan=False)
 
@@ -61,7 +61,7 @@ def test_what_cannot_be_summarised_is_refused() -> None:
     with pytest.raises(InputError, match="at least one step"):
         summarise([])
     with pytest.raises(InputError, match="1 roll-outs for 2"):
-        summarise_each(["a", "b"], {"resphys": [np.ones(3)]})
+        summarise_trajectories(["a", "b"], {"resphys": [np.ones(3)]})
 
 
 def test_published_numbers() -> None:

@@ -113,7 +113,7 @@ class TestPOD:
 
     def test_nothing_has_no_modes(self):
         with pytest.raises(
-            InputError, match="2 modes were asked for of what is zero in all 5 samples, such as the vel"
+            InputError, match="2 modes were asked for of a field that is zero in all 5 samples, such as the vel"
         ):
             pod_coder(torch.zeros(5, 4, 3), 2)
 

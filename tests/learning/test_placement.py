@@ -14,7 +14,8 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import Identifier
-from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement, Stems, estimate
+from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement, estimate_placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.mesh.poses import twisted
@@ -48,7 +49,7 @@ def test_markers_elsewhere_are_where_they_sit_and_turn_with_their_stems(kind):
     q = poses()
     turns = torch.stack([markers.moved(axis.expand(4, 3))(q) - markers(q) for axis in torch.eye(3).double()], -1)
     np.testing.assert_allclose(turns.mT @ turns, torch.eye(3).double().expand(3, 4, 3, 3), atol=1e-9)
-    at, found = Stems.parts(Stems(markers, 4)(q))
+    at, found = DisplacedMarkers.split(DisplacedMarkers(markers, 4)(q))
     np.testing.assert_allclose(found, turns, atol=1e-12)
     moved = at + (found @ MOVED[..., None])[..., 0]
     np.testing.assert_allclose(markers.moved(MOVED)(q), moved, atol=1e-12)
@@ -79,7 +80,10 @@ def test_the_estimate_is_the_minimum_of_its_squares():
     """With turns of degrees, which are not linear; and what is known exactly stays."""
     draw = torch.Generator().manual_seed(1)
     errors = [1e-2 * torch.randn(2, 3, 4, 3, generator=draw, dtype=torch.float64)]
-    at, turns = (x[None].expand(2, -1, *[-1] * (x.ndim - 1)) for x in Stems.parts(Stems(bind(), 4)(poses())))
+    at, turns = (
+        x[None].expand(2, -1, *[-1] * (x.ndim - 1))
+        for x in DisplacedMarkers.split(DisplacedMarkers(bind(), 4)(poses()))
+    )
     seen = [torch.rand(2, 3, 4, generator=draw) > 0.3]
     errors[0] = torch.where(seen[0][..., None], errors[0], 0.0)
     weights, accuracy = [torch.tensor([3.0, 5.0]).double()], Accuracy(1e-3, 2e-3, 0.1)
@@ -91,7 +95,7 @@ def test_the_estimate_is_the_minimum_of_its_squares():
         scaled = torch.cat([b[:12] / 1e-3, b[12:15] / 2e-3, b[15:] / 0.1])
         return (left.square().sum((1, 2, 3)) * weights[0]).sum() + 1e-5 * scaled.square().sum()
 
-    found, inside = estimate(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    found, inside = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
     assert float(found.turn.norm()) > 0.02
     gradients = []
     for b in (torch.zeros(18).double(), torch.cat([found.offsets.flatten(), found.shift, found.turn])):
@@ -99,7 +103,7 @@ def test_the_estimate_is_the_minimum_of_its_squares():
         gradients.append(torch.autograd.grad(loss(b), b)[0])
     assert float(gradients[1].norm()) < 1e-4 * float(gradients[0].norm())
     np.testing.assert_allclose(inside[12:15], found.shift / 2e-3, rtol=1e-9)
-    held, _ = estimate(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    held, _ = estimate_placement(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5)
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
 
@@ -161,12 +165,13 @@ def test_recordings_without_any_error_are_no_trouble():
 
 
 def test_the_gradient_takes_the_placement_with_it():
-    search = identifier(posed(PlacedMarkers.of(bind(), ASKEW)))
+    pair = posed(PlacedMarkers.of(bind(), ASKEW))
+    misfit = Misfit([pair], RANGES, accuracy=ACCURACY, centre=CENTRE.tolist())
     unit = np.array([0.5])
-    search._weigh_priors(unit)
-    search._weigh_priors(unit)
-    _, gradient = search._loss_and_gradient(unit)
-    losses = [search._loss_and_gradient(unit + step)[0] for step in (1e-4, -1e-4)]
+    misfit.update_prior_weight(unit)
+    misfit.update_prior_weight(unit)
+    _, gradient = misfit.loss_and_gradient(unit)
+    losses = [misfit.loss_and_gradient(unit + step)[0] for step in (1e-4, -1e-4)]
     assert gradient[0] == pytest.approx((losses[0] - losses[1]) / 2e-4, rel=1e-4)
 
 
@@ -213,5 +218,5 @@ def test_vertices_cannot_sit_elsewhere_and_priors_lie_in_their_range():
         Identifier([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY)
     with pytest.raises(InputError, match="can be placed elsewhere"):
         MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
-    with pytest.raises(InputError, match=r"2e\+06 is expected beforehand, outside of the range"):
+    with pytest.raises(InputError, match=r"the prior has the mean 2e\+06, outside of the range"):
         Bounds(1e5, 1e6, prior=Prior(2e6, 1.0))

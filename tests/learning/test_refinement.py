@@ -41,11 +41,11 @@ def motion(integrator="implicit_euler", seed=0):
     return motion_of(q, v, q)
 
 
-def motion_of(q, v, target, inputs=None, told=None):
+def motion_of(q, v, target, inputs=None, context=None):
     """Two trials at the steps of the simulator, and what should be observed of them."""
     times = real_time(target.shape[1]).expand(2, -1)
     trials = Trials(("a", "b"), times, target, target[:, 0], Inputs() if inputs is None else inputs)
-    return RefinementBatch(q, v, target, trials, told)
+    return RefinementBatch(q, v, target, trials, context)
 
 
 def real_time(frames):
@@ -74,7 +74,7 @@ class Formula:
     def __init__(self, force):
         self.rest, self.force = simulator().rest_positions, force
 
-    def encode(self, q, v, told):
+    def encode(self, q, v, context):
         return q, v
 
     def decode(self, state, hidden=None):
@@ -91,7 +91,7 @@ def trainer(model=None, error=None, **changes):
     loss = window_loss(model, config.window, config.batch_size)
 
     def drift(model):
-        return loss.measure(loss.side_by_side([VALIDATION]), [VALIDATION])[0] ** 0.5
+        return loss.measure(loss.consecutive([VALIDATION]), [VALIDATION])[0] ** 0.5
 
     return SolverInTheLoop(model, loss, [TRAIN], [VALIDATION], error or drift, config)
 
@@ -132,7 +132,7 @@ class TestLoss:
         no_force = Formula(lambda q, v: torch.zeros_like(q))
         loss = WindowLoss(no_force, lambda: simulator(REALITY, integrator), 4, 3)
         target = motion(integrator)
-        windows = loss.side_by_side([target])
+        windows = loss.consecutive([target])
         assert windows.frame.tolist() == 2 * ([1, 5] if integrator == "bdf2" else [0, 4])
         assert loss.measure(windows, [target])[0] < 1e-12  # mm^2
         assert window_loss(no_force, 4, integrator=integrator).measure(windows, [target])[0] > 1e-3
@@ -146,10 +146,10 @@ class TestLoss:
         q, v = found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous()
         loss = WindowLoss(no_force, lambda: simulator(creeping, integrator), 4, 3)
         target = motion_of(q, v, q)
-        assert loss.measure(loss.side_by_side([target]), [target])[0] < 1e-12  # mm^2
+        assert loss.measure(loss.consecutive([target]), [target])[0] < 1e-12  # mm^2
         q[0, :2] = torch.nan  # It is first known in frame 2, and counts as relaxed there.
         late = motion_of(q, v, q)
-        value = loss.measure(loss.side_by_side([late]), [late])[0]
+        value = loss.measure(loss.consecutive([late]), [late])[0]
         assert 0.0 < value < 1e-1
 
     def test_it_is_the_mean_squared_distance_of_separate_roll_outs(self):
@@ -204,7 +204,7 @@ class TestLoss:
         no_force = Formula(lambda q, v: torch.zeros_like(q))
         loss = WindowLoss(no_force, simulator, 3, 3, observe=lambda q: q[:, -2:])
         acting = motion_of(q, v, target, Inputs(force))
-        windows = loss.side_by_side([motion_of(q, v, target), acting])
+        windows = loss.consecutive([motion_of(q, v, target), acting])
         assert windows.motion.tolist() == [0, 0, 0, 1, 1, 1]  # In the first three steps of the second nothing was seen.
         assert list(zip(windows.trial.tolist(), windows.frame.tolist(), strict=True)) == 2 * [(0, 0), (0, 3), (1, 3)]
         with_force, without = windows.pick(torch.tensor([3, 4, 5])), windows.pick(torch.tensor([0, 1, 2]))

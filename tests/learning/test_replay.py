@@ -128,14 +128,14 @@ def test_parts_have_parameters_of_their_own():
     tendons = Tendons(routes, stiffness=[300.0, 400.0], labels=("low", "high"))
     sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=(tendons,)))
     replay = Replay(sim, lambda q: q, blank(masses=(0.0, 0.0)))
-    assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {*replay.known}
+    assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {*replay.parameter_names}
     value = double([1.0, 2.0])
     for given, wanted in (
         ({"tendon_stiffness_high": value}, [[300.0, 1.0], [300.0, 2.0]]),
         ({"tendon_stiffness_low": value, "tendon_stiffness_high": 3.0 * value}, [[1.0, 3.0], [2.0, 6.0]]),
         ({"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value}, [[1.0, 5.0], [2.0, 10.0]]),
     ):
-        constants, _, _ = replay.setting(given)
+        constants, _, _ = replay.prepare(given)
         found = constants.values["tendon_stiffness"]  # two trials for each set of parameters
         torch.testing.assert_close(found, double(wanted).repeat_interleave(2, 0))
 
@@ -176,7 +176,9 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
 
     def losses(values):
         return (
-            replay.errors(replay(release, dict(zip(replay.known, values.mT, strict=True)))).square().sum((1, 2, 3, 4))
+            replay.errors(replay(release, dict(zip(replay.parameter_names, values.mT, strict=True))))
+            .square()
+            .sum((1, 2, 3, 4))
         )
 
     x = at[None].clone().requires_grad_()

@@ -8,7 +8,7 @@ from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, selec
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import NextState, build_next_state, restore
 from warp_resphys.learning.predictors import LearnedPredictor
-from warp_resphys.learning.rollout import FURTHEST, Rollout, closed_loop
+from warp_resphys.learning.rollout import DIVERGENCE_DISTANCE, Rollout, closed_loop
 from warp_resphys.settings.learning import NetworkSettings
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
@@ -78,7 +78,7 @@ def test_a_saved_model_predicts_the_same(system, kind, tmp_path):
             assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("value", [float("nan"), 1.01 * FURTHEST])
+@pytest.mark.parametrize("value", [float("nan"), 1.01 * DIVERGENCE_DISTANCE])
 def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
     """The second of three environments leaves at its third step, and would come back if it was asked."""
     calls = []
@@ -103,7 +103,7 @@ def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
 
 
 def test_just_short_of_diverging_is_no_divergence():
-    far = REST.expand(1, -1, -1) + 0.99 * FURTHEST * 0.1
+    far = REST.expand(1, -1, -1) + 0.99 * DIVERGENCE_DISTANCE * 0.1
     rollout = Rollout(SIMULATOR, lambda state, step: State(far, state.v))
     positions = closed_loop(rollout, SIMULATOR.rest_state(1), 2)
     assert torch.equal(positions[:, 1], far)

@@ -292,7 +292,7 @@ class TestModes:
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"regularisation": 0.0}, "reconstruction.regularisation is 0: it must be positive, as markers leave most"),
+        ({"regularisation": 0.0}, "reconstruction.regularisation is 0: it must be positive, as markers do not"),
         (
             {"method": "adam"},
             "reconstruction.method is 'adam': choose one of gauss_newton, levenberg_marquardt, lbfgsb.",

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from ..data.input_response import told_of
+from ..data.input_response import with_means
 from ..learning.networks import SkipMLP, StateMap
 from ..learning.predictors import Range
 from .polynomials import Monomials, Polynomial
@@ -115,7 +115,7 @@ class ReducedForce:
         """Derivatives (S, r, i) of ``left @ outputs`` with respect to the inputs (S, i), with left (S, r, c)."""
         with torch.enable_grad():
             unheld = torch.as_tensor(inputs).to(self.network.linear).requires_grad_()
-            outputs = self.network.standardised(unheld if self.range_ is None else self.range_.hold(unheld))[0]
+            outputs = self.network.standardised(unheld if self.range_ is None else self.range_.clamp(unheld))[0]
             weights = torch.as_tensor(left).to(outputs).swapaxes(0, 1)  # (r, S, c)
             (slopes,) = torch.autograd.grad(outputs, unheld, weights, is_grads_batched=True)
         return np.asarray(slopes.swapaxes(0, 1).double().cpu().numpy())
@@ -138,7 +138,7 @@ class ForceAlong:
         self._seen, self._usual, self._push = force.seen(u), force.usual(u), force.push(u)
         conditions = np.tile(force.conditions, (len(base), 1))
         if len(force.conditions_by):
-            conditions = conditions + told_of(u.points, means) @ force.conditions_by.T
+            conditions = conditions + with_means(u.points, means) @ force.conditions_by.T
         places = force.places(u) - (self._seen @ self._base[..., None])[..., 0]
         self._offset, self._modes = np.concatenate([places, conditions], axis=1), places.shape[1]
         self.restart()

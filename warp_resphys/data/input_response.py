@@ -104,7 +104,7 @@ def response_of(name: str, parameters: Mapping[str, torch.Tensor]) -> tuple[Numb
     return factor, delay, rise
 
 
-def told_of(acting: Array, means: Array) -> Array:
+def with_means(acting: Array, means: Array) -> Array:
     """(..., C (1 + F)) inputs (..., C), then their means (F, ..., C), as networks take them."""
     return _library(acting).concatenate([acting, *means], -1)
 

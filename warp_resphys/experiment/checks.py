@@ -22,7 +22,7 @@ from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError, listed
 from ..io.memory import available_memory_gib
-from ..learning.parameters import MASS_FACTOR, command_of, known_parameters, parameters_of_parts
+from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
 from ..settings.body import HexahedralBox, MeshSettings, TetrahedralBox
@@ -69,7 +69,9 @@ def check_run(run: RunSettings) -> None:
     if run.control is not None:
         _check_control(run, body)
     if run.identify is not None:
-        known = [name for name in known_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR]
+        known = [
+            name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
+        ]
         _check_identification(run.identify, known, simulator)
         _check_parts(run.identify, simulator)
 

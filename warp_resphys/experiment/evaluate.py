@@ -19,7 +19,7 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.intervals import LEVEL, Intervals
-from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_each
+from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
 from ..learning.replay import Start
 from ..settings.run import models_of
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
@@ -115,7 +115,7 @@ def _intervals(
     for model, parts in calibrating.items():
         intervals = Intervals.calibrated(list(_all_observed(experiment, model, parts)), list(observed), rest)
         if intervals is not None:
-            coverage = intervals.holds(list(tested[model][: len(target)]), list(target), rest)
+            coverage = intervals.coverage(list(tested[model][: len(target)]), list(target), rest)
             models[model] = {**intervals.plain(), **coverage}
     split = "training" if learned else "validation"
     return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
@@ -169,7 +169,7 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
         for out in range(len(names)):
             others, observed = (series[:out] + series[out + 1 :] for series in (simulated, target))
             intervals = Intervals.calibrated(others, observed, data.bound)
-            coverage += [] if intervals is None else [intervals.holds([simulated[out]], [target[out]], data.bound)]
+            coverage += [] if intervals is None else [intervals.coverage([simulated[out]], [target[out]], data.bound)]
         if len(coverage) == len(names):
             models[model] = {key: mean(fold[key] for fold in coverage) for key in coverage[0]}
     return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
@@ -217,7 +217,7 @@ def summary(
     errors = {model: _errors(x, observed, first) for model, x in test.items()}
     content: dict[str, Any] = {
         "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
-        "per_trajectory": summarise_each(tuple(names), errors),
+        "per_trajectory": summarise_trajectories(tuple(names), errors),
     }
     if dataset.bound is None:
         target = test["reconstruction"]

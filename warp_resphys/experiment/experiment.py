@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ..data.input_response import InputResponse, told_of
+from ..data.input_response import InputResponse, with_means
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
 from ..data.observation import WHOLE_STATE, Observation
@@ -201,7 +201,7 @@ class Experiment:
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
-                constants, _, resting = replay.setting(self.parameters(model))
+                constants, _, resting = replay.prepare(self.parameters(model))
                 guess = simulator.static_equilibrium(resting, constants).q
         return Start.resting(guess)
 
@@ -243,7 +243,7 @@ class Experiment:
             (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs with their
             exponential means, and motion of the base (`base_movement`). (R, A) for static poses, under steady inputs.
         """
-        _, inputs, resting = replay.setting(parameters)
+        _, inputs, resting = replay.prepare(parameters)
         assert isinstance(self.settings, NetworkStage)
         actuation, constant = self.settings.actuation, list[torch.Tensor]()
         if self.settings.payload_at is not None and (payload or actuation.sees_payload):
@@ -258,7 +258,7 @@ class Experiment:
             constant += [] if moving is None else [moving[0]]
             return torch.cat(constant, -1) if constant else None
         response = InputResponse(replay.simulator.time_step, filters=filters)
-        series = [told_of(*response.from_rest(values)) for values in driven]
+        series = [with_means(*response.from_rest(values)) for values in driven]
         series += [] if moving is None else [moving]
         if not series:
             return constant[0] if constant else None

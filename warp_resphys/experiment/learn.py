@@ -16,7 +16,7 @@ from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, Watched, cross_validated_epochs
+from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
 from ..learning.refinement import RefinementBatch, SolverInTheLoop, WindowLoss
@@ -230,7 +230,7 @@ def _in_the_loop(
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
                 inputs = experiment.conditions(part, parameters)
                 base = experiment.base(part.trials.names, simulator)
-                watched.append(Watched(part, start.select(rows), inputs, frames, base))
+                watched.append(TrialGroup(part, start.select(rows), inputs, frames, base))
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:

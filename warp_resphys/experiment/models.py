@@ -106,7 +106,7 @@ class ModelRollout(ResumableRollout):
         self.replay = experiment.replay(self.simulator, names, model)
         self.start = experiment.start(self.replay, model) if start is None else start
         parameters = experiment.parameters(model)
-        self._constants, self._inputs, self._resting = self.replay.setting(parameters)
+        self._constants, self._inputs, self._resting = self.replay.prepare(parameters)
         self._conditions = None if learned is None else experiment.conditions(self.replay, parameters, model == SIMFREE)
         self._first: State | None = None
         self._failed = False
@@ -152,9 +152,9 @@ class ModelRollout(ResumableRollout):
         """
         if self.replay.is_static and self.predictor is not None and self.model != SIMFREE:
             force: Any = self.predictor
-            return self.replay.begin(self.start, self._constants, self._resting, force=force)
+            return self.replay.initial_state(self.start, self._constants, self._resting, force=force)
         if self._first is None:
-            self._first = self.replay.begin(self.start, self._constants, self._resting)
+            self._first = self.replay.initial_state(self.start, self._constants, self._resting)
         return self._first
 
     @override

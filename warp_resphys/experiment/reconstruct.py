@@ -128,7 +128,7 @@ class _OfTrials(Reconstructing):
         simulator = reconstructing_simulator(experiment, settings.model)
         replay = self._replay = experiment.replay(simulator, part.names, settings.model)
         self._start, self.like = experiment.start(replay, settings.model), simulator.rest_positions
-        self._constants, self._inputs, self._resting = replay.setting(experiment.parameters(settings.model))
+        self._constants, self._inputs, self._resting = replay.prepare(experiment.parameters(settings.model))
         self._observed = experiment.targets(replay, self._start)
         if replay.is_static:  # One very long step leads to the static pose.
             simulator = dataclasses.replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
@@ -145,7 +145,7 @@ class _OfTrials(Reconstructing):
 
     @override
     def begin(self) -> State:
-        return self._replay.begin(self._start, self._constants, self._resting)
+        return self._replay.initial_state(self._start, self._constants, self._resting)
 
     @override
     def step(self, number: int) -> State:
@@ -176,7 +176,7 @@ def replayed_errors(
     simulator = reconstructing_simulator(experiment, settings.model)
     replay = experiment.replay(simulator, names, settings.model)
     start = experiment.start(replay, settings.model)
-    constants, inputs, resting = replay.setting(experiment.parameters(settings.model))
+    constants, inputs, resting = replay.prepare(experiment.parameters(settings.model))
     observed = experiment.targets(replay, start)
     frames = experiment.frames(simulator)
     steps = reconstructed["q"][:, :-1], reconstructed["v"][:, :-1], reconstructed["force"][:, 1:]
@@ -190,7 +190,7 @@ def replayed_errors(
     errors: FloatArray = np.full(reconstructed["q"].shape[:2], np.inf)
     errors[:, observed.shape[1] :] = np.nan  # Other trials are longer.
     with torch.no_grad():
-        state = replay.begin(start, constants, resting)
+        state = replay.initial_state(start, constants, resting)
         for k in range(min(errors.shape[1], observed.shape[1])):
             state = rollout.step(state) if k > 0 else state
             reached, seen = replay.observe(state.q).cpu().numpy(), observed[:, k].cpu().numpy()

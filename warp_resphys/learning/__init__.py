@@ -1,5 +1,5 @@
-"""What a simulator lacks: parameters that are identified, forces that are reconstructed, networks that predict them.
+"""Identification of parameters, reconstruction of residual forces, and networks that predict these forces.
 
-From outside: `library` (functions without configuration and run folders), `identification.Identifier`,
+Entry points: `library` (functions without configuration and run folders), `identification.Identifier`,
 `reconstruction.make_reconstructor`, `networks.build_model`, `rollout.Rollout`.
 """

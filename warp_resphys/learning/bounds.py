@@ -1,4 +1,4 @@
-"""Ranges of parameters that are identified, as fractions from 0 to 1, and normal priors in them."""
+"""Ranges of the parameters to identify, as fractions from 0 to 1, and their normal priors."""
 
 import math
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from ..io.errors import InputError
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a parameter beforehand: a normal distribution, of its logarithm where that is searched."""
+    """Prior knowledge of a parameter: a normal distribution, of its logarithm where that is searched."""
 
     mean: float  # in the parameter's unit
-    deviation: float  # standard deviation, the same
+    deviation: float  # standard deviation, in the parameter's unit
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Bounds:
     """The range of a parameter."""
 
     lower: float  # in the parameter's unit
-    upper: float  # the same
+    upper: float  # in the parameter's unit
     logarithmic: bool = False  # whether it is searched on a logarithmic scale
-    prior: Prior | None = None  # known beforehand
+    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -37,30 +37,30 @@ class Bounds:
             raise InputError(f"a logarithmic range from {self.lower:g}: its lower bound must be positive.")
         if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
             raise InputError(
-                f"{self.prior.mean:g} is expected beforehand, outside of the range from {self.lower:g} to "
+                f"the prior has the mean {self.prior.mean:g}, outside of the range from {self.lower:g} to "
                 f"{self.upper:g}: widen the range, or correct the prior."
             )
 
-    def expected(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the prior, as fractions of the range."""
+    def unit_prior(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the prior, as fractions of the range; None without a prior."""
         if self.prior is None:
             return None
         mean = self.to_unit(self.prior.mean)
         return mean, self.prior.deviation / self.slope(mean)
 
     def to_unit(self, value: float) -> float:
-        """A value as a fraction of the range, 0 to 1."""
+        """Returns a value as a fraction of the range, 0 to 1."""
         low, high, x = (math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value))
         return (x - low) / (high - low)
 
     def from_unit(self, unit: torch.Tensor) -> torch.Tensor:
-        """Values of fractions, differentiable."""
+        """Returns the values at fractions of the range; differentiable."""
         if self.logarithmic:
             return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
         return self.lower + unit * (self.upper - self.lower)
 
     def slope(self, unit: float) -> float:
-        """Derivative of a value by its fraction."""
+        """Derivative of the value by its fraction of the range."""
         if self.logarithmic:
             return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
         return self.upper - self.lower

@@ -1,7 +1,7 @@
-"""Training on one smooth function of the weights: an epoch is one iteration of L-BFGS with its line search.
+"""Training on the full batch: an epoch is one iteration of L-BFGS with its line search.
 
-Adam's first steps move every weight by its rate, however small the gradient: from a network that is nearly right they
-lead away. Where the loss comes out of the simulator, a line search costs less than finding a schedule.
+Adam's first steps move every weight by the learning rate, however small the gradient, which spoils a network that is
+nearly right. Where the loss comes from the simulator, a line search costs less than tuning a learning-rate schedule.
 """
 
 from abc import abstractmethod
@@ -15,11 +15,11 @@ from ..settings.learning import FullBatchSettings
 from .networks import ResidualForce
 from .training import EpochTrainer
 
-_EVALUATIONS = 12  # of the loss, the most that an epoch takes
+_EVALUATIONS = 12  # of the loss, at most, in one epoch
 
 
 class FullBatchTrainer(EpochTrainer[ResidualForce]):
-    """Minimises a loss of the network's weights, of those that require a gradient, by L-BFGS.
+    """Minimises a loss over those weights of the network that require a gradient, by L-BFGS.
 
     `FullBatchSettings.memory` is the number of pairs that L-BFGS keeps.
     """
@@ -47,15 +47,15 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
 
     @abstractmethod
     def _backward(self) -> float:
-        """The loss at the current weights; adds its gradient to theirs."""
+        """Returns the loss at the current weights and accumulates its gradient in them."""
 
     def _iterate(self) -> float:
-        """One iteration; returns the loss that it led to."""
+        """Makes one iteration; returns the loss after it."""
         self._optimiser.step(self._evaluate)  # type: ignore[arg-type]
         return float(self._evaluate())
 
     def _evaluate(self) -> torch.Tensor:
-        """The loss at the current weights, and its gradient; L-BFGS asks twice for that of the weights it accepts."""
+        """Returns the loss and sets its gradient; cached, as L-BFGS evaluates the weights that it accepts twice."""
         if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
             self._optimiser.zero_grad()
             loss = self._backward()

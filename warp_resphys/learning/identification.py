@@ -88,7 +88,7 @@ class Identifier:
             axes: number of points of each parameter of the grid, over its whole range.
             others: values of the remaining parameters; if values of all are given, the priors are weighted there.
             chunk: sets of parameters that are simulated at once.
-            finished: losses that an interrupted call with the same arguments reported last; they are not computed again.
+            finished: losses that an interrupted call with the same arguments reported; they are not computed again.
             report: called with the losses so far, in the order of the grid's points, after every chunk.
 
         Returns:

@@ -1,14 +1,14 @@
 """Identification, reconstruction, training and evaluation as four functions, without configuration or run folder.
 
-The commands do the same work in stages, through files. Here observations are tensors and results stay in memory::
+The commands do this work in stages, through files. Here observations are tensors and results stay in memory::
 
     identified = identify(simulator, motion, {"youngs_modulus": (1e5, 1e6)}).parameters
     samples = reconstruct(simulator, motion, parameters=identified)
     force = fit_force(simulator, samples)
     errors = evaluate(simulator, held_out, force, parameters=identified)
 
-Every function takes whole states and markers alike. Forces are in the world's frame, and start from the simulator's
-own parameters unless others are given. `tests/learning/test_library.py` checks them on a beam.
+Every function accepts whole states and markers. Forces are in the world's frame. Parameters are the simulator's own
+unless others are given. `tests/learning/test_library.py` checks them on a beam.
 """
 
 import math
@@ -41,20 +41,20 @@ class ObservedMotion:
     """B motions of one body, observed at the start and after every time step of the simulator.
 
     Raises:
-        InputError: observations of another shape, of other vertices than the body has, or of which nothing was seen.
+        InputError: observations of a wrong shape or number of vertices, or a motion of which nothing was seen.
     """
 
-    # (T + 1, B, M, D) what `observation` measured [its unit], NaN where a point was not seen; by default the positions
-    # of all vertices, as `Trajectory.q` has them. (T + 1, M, D) are one motion
+    # (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by default the positions
+    # of all vertices, as in `Trajectory.q`. (T + 1, M, D) is one motion
     observed: torch.Tensor
-    # positions and velocities with which the motions begin; None: at rest in equilibrium under `resting`
+    # initial positions and velocities; None: at rest in equilibrium under `resting`
     start: State | None = None
-    inputs: Inputs = field(default_factory=Inputs)  # that act during the motion, with or without an axis of time
-    resting: Inputs = field(default_factory=Inputs)  # that hold the body before the motion, where `start` is None
-    observation: Observation = WHOLE_STATE  # what was measured of the body, such as `bind_markers` returns
+    inputs: Inputs = field(default_factory=Inputs)  # during the motion, with or without a time axis
+    resting: Inputs = field(default_factory=Inputs)  # before the motion, where `start` is None
+    observation: Observation = WHOLE_STATE  # the sensor, such as markers from `bind_markers`
 
     def __post_init__(self) -> None:
-        """Adds the axis of motions where there is one motion."""
+        """Adds the batch axis to a single motion and checks the shape."""
         if self.observed.ndim == 3:
             object.__setattr__(self, "observed", self.observed[:, None])
         dimension, unit = self.observation.dimension, self.observation.unit
@@ -65,7 +65,7 @@ class ObservedMotion:
             )
 
     def replay(self, simulator: Simulator) -> tuple[Replay, Start]:
-        """Returns what simulates these motions, and how they begin."""
+        """Returns the replay that simulates these motions, and their start."""
         like = simulator.rest_positions
         observed = self.observed.to(like).transpose(0, 1)
         count, frames = observed.shape[:2]
@@ -96,14 +96,14 @@ def identify(
     """Finds the parameters with which a simulator comes closest to observed motions.
 
     Args:
-        simulator: gives every value that is not identified.
-        motion: from whole states or markers.
-        parameters: range of every parameter to identify, by a name of `Replay.known`, in its unit. A pair is searched
-            on a logarithmic scale where both its numbers are positive.
-        first_guess: where the search begins; the simulator's own values where left out.
-        starts: searches; those after the first begin at the best of four times as many random candidates.
-        max_evaluations: of the loss and its gradient, a start.
-        tolerance: relative decrease of the loss that is still worth a step.
+        simulator: gives all other parameters.
+        motion: observed states or markers.
+        parameters: range of every parameter to identify, by a name of `Replay.parameter_names`, in its unit. A pair of
+            positive numbers is searched on a logarithmic scale.
+        first_guess: start of the search; the simulator's own values where left out.
+        starts: number of searches; those after the first start at the best of four times as many random candidates.
+        max_evaluations: of the loss and its gradient, for each start.
+        tolerance: relative decrease of the loss below which a search ends.
         seed: of the random candidates.
 
     Returns:
@@ -116,8 +116,7 @@ def identify(
     ranges = {n: b if isinstance(b, Bounds) else Bounds(*b, logarithmic=min(b) > 0.0) for n, b in parameters.items()}
     identifier = Identifier([motion.replay(simulator)], ranges)
     guess = {**configured_parameters(simulator, ranges), **(first_guess or {})}
-    begun = identifier.starts(guess, starts, 4 * starts, seed)
-    return identifier.run(begun, max_evaluations, tolerance=tolerance)
+    return identifier.run(identifier.starts(guess, starts, 4 * starts, seed), max_evaluations, tolerance=tolerance)
 
 
 def reconstruct(
@@ -127,17 +126,17 @@ def reconstruct(
     parameters: Mapping[str, float] | None = None,
     settings: ReconstructionSettings | None = None,
 ) -> Samples:
-    """Finds the forces that bring a simulator, step by step, to observed motions.
+    """Finds the forces with which a simulator follows observed motions, step by step.
 
     Args:
-        simulator: the one to correct. One by the midpoint rule steps by BDF2 where markers are observed.
-        motion: from whole states or markers.
+        simulator: to correct. With markers, BDF2 replaces the midpoint rule.
+        motion: observed states or markers.
         parameters: values in place of the simulator's own, such as `Identification.parameters`.
         settings: method, regularisation [m^2/N^2], tolerance and iterations; the defaults of the class.
 
     Returns:
-        The S = B T steps, motion after motion: where they start, q (S, N, 3) [m] and v (S, N, 3) [m/s], the force of
-        the step as the only output (S, N, 3) [N], and the inputs that act (S, A).
+        The S = B T steps, motion after motion: initial positions (S, N, 3) [m] and velocities (S, N, 3) [m/s], the
+        force as the only output (S, N, 3) [N], and the inputs (S, A).
 
     Raises:
         InputError: a setting out of range, or an input that the body does not take.
@@ -146,22 +145,21 @@ def reconstruct(
     used = without_ringing(simulator, motion.observation)
     replay, start = motion.replay(used)
     with torch.no_grad():
-        constants, inputs, resting = replay.setting(_values(used, parameters))
-        state = replay.begin(start, constants, resting)
-        chosen = dict(settings or ReconstructionSettings())
-        method = make_reconstructor(used, **chosen, observation=motion.observation)
+        constants, inputs, resting = replay.prepare(_values(used, parameters))
+        state = replay.initial_state(start, constants, resting)
+        method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), observation=motion.observation)
         method = method.with_constants(constants)
         force, rows = torch.zeros_like(state.q), []
         for step in range(replay.trials.observed.shape[1] - 1):
             with torch.enable_grad():
-                found = method.step(state, replay.trials.observed[:, step + 1], inputs.at(step), force)
-            force = found.force.detach()
+                reconstruction = method.step(state, replay.trials.observed[:, step + 1], inputs.at(step), force)
+            force = reconstruction.force.detach()
             rows.append((state.q, state.v, force))
-            state = found.state.detach()
-        q, v, f = (torch.stack(each, 1).flatten(0, 1) for each in zip(*rows, strict=True))
-        acting = _told(inputs, len(rows))
-        told = None if acting is None else acting.transpose(0, 1).flatten(0, 1)
-    return Samples(q, v, (f,), told, (len(rows),) * replay.trials.observed.shape[0])
+            state = reconstruction.state.detach()
+        q, v, f = (torch.stack(series, 1).flatten(0, 1) for series in zip(*rows, strict=True))
+        context = _context(inputs, len(rows))
+        actuation = None if context is None else context.transpose(0, 1).flatten(0, 1)
+    return Samples(q, v, (f,), actuation, (len(rows),) * replay.trials.observed.shape[0])
 
 
 def fit_force(
@@ -174,21 +172,21 @@ def fit_force(
     trainer: TrainerSettings | None = None,
     seed: int = 0,
 ) -> ResidualForce:
-    """Trains a network that predicts the force which a simulator lacks, from its state and inputs.
+    """Trains a network that predicts the residual force of a simulator from its state and inputs.
 
     Args:
-        simulator: the one to correct.
+        simulator: to correct.
         samples: from `reconstruct`.
-        validation: motions that were held out. The weights with the smallest roll-out error on them are kept; without
-            them, those of the smallest loss on the samples.
+        validation: held-out motions, which select the weights with the smallest roll-out error; if None, the weights
+            with the smallest loss on the samples are kept.
         parameters: as for `reconstruct`.
-        network: its kind and size; the defaults of the class.
-        trainer: epochs, rates and noise; the defaults of the class.
-        seed: of the weights, batches and noise; torch's global generator is left as it was.
+        network: kind and size; the defaults of the class if None.
+        trainer: epochs, rates and noise; the defaults of the class if None.
+        seed: of the weights, batches and noise; torch's global generator is restored.
 
     Returns:
-        The network. Called with q (S, N, 3) [m], v (S, N, 3) [m/s] and the inputs (S, A), it gives forces (S, N, 3)
-        [N]; pass it to `evaluate`.
+        The network, to pass to `evaluate`. It maps q (S, N, 3) [m], v (S, N, 3) [m/s] and the inputs (S, A) to forces
+        (S, N, 3) [N].
 
     Raises:
         InputError: sizes that do not fit the samples, or a recurrent network.
@@ -196,7 +194,7 @@ def fit_force(
     network = network or NetworkSettings()
     trainer = trainer or TrainerSettings()
     if network.recurrent is not None:
-        raise InputError("fit_force trains no recurrent network: leave network.recurrent out.")
+        raise InputError("fit_force does not train recurrent networks: leave network.recurrent out.")
     if validation is None:
         trainer = trainer.changed(selection="validation_loss")
 
@@ -222,36 +220,36 @@ def evaluate(
     *,
     parameters: Mapping[str, float] | None = None,
 ) -> torch.Tensor:
-    """Rolls a simulator out from where motions begin, and compares it with them.
+    """Rolls a simulator out from the start of observed motions and measures its error.
 
     Args:
-        simulator: with the integrator that it has.
-        motion: from whole states or markers.
-        force: what the simulator lacks, from `fit_force`, or a function of the state and the number of the step that
-            gives forces (B, N, 3) [N]; None for the simulator as it is.
+        simulator: to evaluate.
+        motion: observed states or markers.
+        force: residual force from `fit_force`, or a function of the state and the number of the step that returns
+            forces (B, N, 3) [N]; None for the simulator alone.
         parameters: as for `reconstruct`.
 
     Returns:
         (T + 1, B) mean distance of the observed points in the unit of the observation, such as m; NaN where none was
-        seen, infinite from where a simulation diverged.
+        seen, infinite after a simulation diverged.
 
     Raises:
         InputError: an input that the body does not take.
-        ConvergenceError: no equilibrium to begin at.
+        ConvergenceError: no initial equilibrium.
     """
     used = replace(simulator, solver=replace(simulator.settings, on_failure="count"))
     replay, start = motion.replay(used)
     observed = replay.trials.observed
     with torch.no_grad():
-        constants, inputs, resting = replay.setting(_values(used, parameters))
+        constants, inputs, resting = replay.prepare(_values(used, parameters))
         predict: Predictor | None
         if isinstance(force, ResidualForce):
-            predict = LearnedPredictor(force, _told(inputs, observed.shape[1] - 1))
+            predict = LearnedPredictor(force, _context(inputs, observed.shape[1] - 1))
         else:
             predict = force
-        state = replay.begin(start, constants, resting)
+        state = replay.initial_state(start, constants, resting)
         q = closed_loop(Rollout(used, predict, inputs, constants), state, observed.shape[1] - 1)
-        points = torch.stack([replay.observe(each) for each in q.unbind(1)], 1)
+        points = torch.stack([replay.observe(positions) for positions in q.unbind(1)], 1)
         distance = (points - observed).norm(dim=-1).nan_to_num(math.inf)
         mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
     return mean.transpose(0, 1)
@@ -262,7 +260,7 @@ def _values(simulator: Simulator, parameters: Mapping[str, float] | None) -> dic
     return {name: simulator.tensor([value]) for name, value in (parameters or {}).items()}
 
 
-def _told(inputs: Inputs, steps: int) -> torch.Tensor | None:
-    """(K, B, A) actuation during every step, as networks see it; None without any."""
+def _context(inputs: Inputs, steps: int) -> torch.Tensor | None:
+    """(K, B, A) actuation during every step, the network's inputs beside the state; None without actuation."""
     series: list[Any] = [[*inputs.at(step).actuation.values()] for step in range(steps)]
-    return torch.stack([torch.cat(each, 1) for each in series]) if series and series[0] else None
+    return torch.stack([torch.cat(values, 1) for values in series]) if series and series[0] else None

@@ -1,7 +1,7 @@
-"""A residual force trained on what markers saw: the loss is what the corrected simulator gets wrong over whole motions.
+"""A residual force trained on marker motions: the loss is the error of the corrected simulator over whole motions.
 
-Few recordings leave most of a residual force open. The force starts from zero, which is the simulator as it is, and
-every weight is paid for, so that it departs from there only as far as the motions ask for.
+Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
+simulator, and a penalty on the weights keeps it there as far as the motions allow.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,24 +20,16 @@ from .networks import ResidualForce
 from .predictors import LearnedPredictor
 from .replay import Replay, Start
 
-_FAILURE = 1e4  # loss of a simulation that fails: the line search comes back from there
+_FAILURE = 1e4  # loss of a failed simulation, from which the line search steps back
 
 
 @dataclass(frozen=True)
-class Watched:
-    """Trials that begin alike, as a loss sees them.
-
-    Attributes:
-        replay: of the trials.
-        start: how they begin.
-        told: what a model is told of the inputs (`LearnedPredictor`); None for nothing.
-        frames: with which forces turn; None if they do not.
-        base: in whose frame the model predicts; None where that stands still.
-    """
+class TrialGroup:
+    """Trials that begin alike, with the arguments of `LearnedPredictor` for them."""
 
     replay: Replay
     start: Start
-    told: torch.Tensor | None = None
+    context: torch.Tensor | None = None
     frames: VertexFrames | None = None
     base: BaseFrame | None = None
 
@@ -46,61 +38,62 @@ class MotionLoss:
     """Mean over trials of the mean squared distance of markers, in units of each trial's amplitude.
 
     Args:
-        watched: the trials, in groups that begin alike.
-        parameters: (1,) physical parameters that were identified.
+        groups: of trials.
+        parameters: (1,) identified physical parameters.
     """
 
-    def __init__(self, watched: Sequence[Watched], parameters: Mapping[str, torch.Tensor]) -> None:
-        self._watched, self._parameters = watched, parameters
-        counts = [len(each.replay.trials.names) for each in watched]
+    def __init__(self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]) -> None:
+        self._groups, self._parameters = groups, parameters
+        counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
-        self._weights = [w.replay.trials.loss_weight * share for w, share in zip(watched, shares, strict=True)]
+        self._weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
 
     def markers(self, model: ResidualForce | None) -> list[torch.Tensor]:
-        """(R, T, M, 3) at the frames of each group [m], with the force of the model or without any.
+        """Simulated markers (R, T, M, 3) of each group [m], with the force of the model; without a force if None.
 
         Raises:
             ConvergenceError: the simulation fails.
         """
-        found = []
-        for each in self._watched:
-            force: Any = None if model is None else LearnedPredictor(model, each.told, None, each.frames, each.base)
-            found.append(each.replay(each.start, self._parameters or None, force=force)[0])
-        return found
+        markers = []
+        for group in self._groups:
+            force: Any = None
+            if model is not None:
+                force = LearnedPredictor(model, group.context, None, group.frames, group.base)
+            markers.append(group.replay(group.start, self._parameters or None, force=force)[0])
+        return markers
 
     def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
         """(R, T, M, 3) simulated less observed markers of each group [m]."""
-        pairs = zip(self._watched, self.markers(model), strict=True)
-        return [each.replay.errors(markers[None])[0] for each, markers in pairs]
+        pairs = zip(self._groups, self.markers(model), strict=True)
+        return [group.replay.errors(markers[None])[0] for group, markers in pairs]
 
     def __call__(self, model: ResidualForce | None) -> torch.Tensor:
-        """The loss, differentiable in the model's weights."""
+        """Returns the loss, differentiable in the model's weights."""
         pairs = zip(self._errors(model), self._weights, strict=True)
         return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
 
     def error_mm(self, model: ResidualForce | None) -> float:
-        """Mean distance of the markers that were seen, trials weighing the same [mm]; infinite where one diverged."""
+        """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged."""
         try:
             with torch.no_grad():
-                errors = [each.norm(dim=-1).sum((1, 2)) for each in self._errors(model)]
+                distances = [errors.norm(dim=-1).sum((1, 2)) for errors in self._errors(model)]
         except ConvergenceError:
             return float("inf")
-        seen = [each.replay.trials.seen.sum((1, 2)) for each in self._watched]
-        return 1e3 * float(torch.cat([e / s for e, s in zip(errors, seen, strict=True)]).mean())
+        seen = [group.replay.trials.seen.sum((1, 2)) for group in self._groups]
+        return 1e3 * float(torch.cat([d / s for d, s in zip(distances, seen, strict=True)]).mean())
 
 
 class MarkersInTheLoop(FullBatchTrainer):
-    """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS from no force at all.
+    """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS from zero force.
 
-    The last layers have no bias: a constant force would make up for how a trial was held, which the next one does not
-    share.
+    The last layers have no bias: a constant force would compensate how one trial was held, which does not generalise.
 
     Args:
-        model: whose network's weights are trained; those of its last layers are set to zero, as is the mean force.
+        model: to train; its last layers and the mean force are set to zero.
         train: loss on the training motions.
-        validation: loss on the validation motions, by which the weights are chosen; None: the training motions are.
+        validation: loss on the validation motions, which selects the weights; the training loss does if None.
         settings: epochs, and the penalty on the weights.
-        epochs: in place of the configured ones; 0 keeps the simulator as it is.
+        epochs: in place of the configured number; 0 keeps the force at zero.
     """
 
     settings: InTheLoopSettings
@@ -122,7 +115,7 @@ class MarkersInTheLoop(FullBatchTrainer):
         self._train = train
 
     def begin(self) -> None:
-        """Keeps the simulator as it is, without a force, as the first candidate; a trainer that has begun stays."""
+        """Records zero force as the first candidate, unless training has begun."""
         if not self.state.history:
             error = self.rollout_error(self.model)
             self._keep({"epoch": 0.0, "train_loss": self._loss_without_gradient(), "rollout_error_mm": error})
@@ -157,17 +150,17 @@ def cross_validated_epochs(
     settings: InTheLoopSettings,
     advance: Callable[[], None],
 ) -> int:
-    """How many epochs serve motions that training did not see: those with the smallest mean error over the parts.
+    """Returns the number of epochs with the smallest mean error on held-out motions, by cross-validation.
 
     Args:
-        make_model: an untrained model, the same every time.
-        parts: losses of the motions to train on, and of those that are held out.
-        settings: of every search; its epochs are the most that are tried, and its patience is after how many
-            without any gain the search ends.
-        advance: called after every epoch of every part.
+        make_model: returns an untrained model, with the same weights every time.
+        parts: losses on the motions to train on and on the held-out ones, for each fold.
+        settings: of every training; epochs is the largest number tried, and patience the number of epochs without an
+            improvement after which the search ends.
+        advance: called after every epoch of every fold.
 
     Returns:
-        0 where no training is better than the simulator as it is.
+        The number of epochs; 0 where training never improves on zero force.
     """
     settings = settings.changed(rollout_every=1)
     trainers = [MarkersInTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
@@ -184,7 +177,7 @@ def cross_validated_epochs(
 
 
 def _remove_force(model: ResidualForce) -> None:
-    """Makes the force vanish, and leaves the first layers as they are, so that gradients reach the last ones."""
+    """Makes the force zero through the last layers alone, so that their gradients stay non-zero."""
     for coder in model.coders:
         coder.mean.zero_()
     for block in model.network.blocks:

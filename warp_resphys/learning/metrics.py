@@ -1,4 +1,4 @@
-"""Roll-out errors as the experiments define them, and the published numbers that stand beside them."""
+"""Roll-out errors of the experiments, and the published numbers to compare them with."""
 
 import math
 import warnings
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
 
-_DRAWS, _TAIL = 10_000, 0.05  # of a bootstrap, and what its interval leaves out at either end
+_DRAWS, _TAIL = 10_000, 0.05  # of the bootstrap: samples, and probability outside of its interval at either end
 
 
 class PublishedError(NamedTuple):
@@ -34,23 +34,23 @@ class ErrorSummary(TypedDict):
 
 
 class Gain(NamedTuple):
-    """By which share the mean error of one model is below that of another on the same trials."""
+    """Relative reduction of the mean error by one model compared with another, on the same trials."""
 
-    share: float  # of the other's error; negative where it is above
-    lower: float  # the middle 90 % of what other draws of as many trials show
-    upper: float
+    share: float  # of the other model's error; negative for an increase
+    lower: float  # lower end of the 90 % interval over resampled trials
+    upper: float  # upper end
     trials: int
 
 
 def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
-    """A gain, and how much of it hangs on the trials that were drawn, by a paired bootstrap.
+    """Returns the gain of a model and its interval from a paired bootstrap over trials.
 
-    The interval is that of expanded percentiles, which allow for few trials as Student's t does (Hesterberg, The
-    American Statistician 69 (2015) 371): of two or three, it is from the worst to the best.
+    Percentiles are expanded for small samples as with Student's t (Hesterberg, The American Statistician 69 (2015)
+    371): with two or three trials, the interval reaches from the worst to the best.
 
     Args:
         before: error of each trial with the other model, positive.
-        after: with this one, in the same unit.
+        after: error of each trial with this model, in the same unit.
     """
     pairs = np.array([before, after], dtype=np.float64)
     rows = np.random.default_rng(0).integers(pairs.shape[1], size=(_DRAWS, pairs.shape[1]))
@@ -95,7 +95,7 @@ PUBLISHED_MM: Final[Mapping[str, Mapping[str, PublishedError]]] = {
         "resphys": PublishedError(6.10, 3.22),
     },
 }
-# The extrapolation's errors at the length that was trained on [s]; those at 10 s stand above.
+# Errors of the extrapolation after the trained length and after the whole length [s].
 PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedError]]]] = {
     "sopra_extrapolation": {
         "5": {
@@ -106,7 +106,7 @@ PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedErro
         "10": PUBLISHED_MM["sopra_extrapolation"],
     },
 }
-# The same paper's tables of parameters, which the first two experiments share but for their trajectories.
+# Parameters in that paper, which the first two experiments share except for their trajectories.
 _PUBLISHED_BEAMS: Final[Mapping[str, float]] = {
     "degrees of freedom": 528,
     "Poisson's ratio, incorrect beam": 0.45,
@@ -131,7 +131,7 @@ PUBLISHED_SETUP: Final[Mapping[str, Mapping[str, float]]] = {
         "testing trajectories": 8,
     },
 }
-# The same paper's time benchmark: a trajectory of the real beam, 140 steps, on a 32-core AMD Ryzen Threadripper 3970X;
+# Time benchmark of that paper: a trajectory of the real beam, 140 steps, on a 32-core AMD Ryzen Threadripper 3970X;
 # mean and standard deviation [s].
 PUBLISHED_SECONDS: Final[Mapping[str, tuple[float, float]]] = {
     "simulation": (0.711, 0.002),
@@ -140,21 +140,21 @@ PUBLISHED_SECONDS: Final[Mapping[str, tuple[float, float]]] = {
     "inference": (0.112, 0.002),
 }
 PUBLISHED_SECONDS_STEPS: Final = 140
-# And of its marker ablation, whose values are not printed: the median error [mm] stays below this from 4 markers on.
+# Marker ablation of that paper, read off its figure: the median error [mm] stays below this from 4 markers on.
 PUBLISHED_MARKER_MEDIAN_MM: Final = 0.1
 PUBLISHED_MARKERS: Final = 4
 PUBLISHED_MARKERS_OF_SMALL_SPREAD: Final = 10
 
 
 def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean distance of the markers or vertices that were seen (the paper's eq. 4 and 7).
+    """Returns the mean distance of the seen markers or vertices (the paper's eq. 4 and 7).
 
     Args:
         simulated: (T, M, 3) [m], NaN where the roll-out diverged.
         observed: (T, M, 3) [m], NaN where a marker was not seen.
 
     Returns:
-        (T',) errors of the frames in which one was seen [mm].
+        (T',) errors of the frames in which a marker was seen [mm].
     """
     seen = np.asarray(np.isfinite(observed).all(-1))
     with np.errstate(over="ignore"):  # A diverged roll-out reaches infinity.
@@ -166,33 +166,33 @@ def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64])
 def errors_per_marker(
     simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: Sequence[str]
 ) -> dict[str, float | None]:
-    """Return the mean error of each marker that was seen [mm]; None where a roll-out diverged.
+    """Returns the mean error of every marker that was seen [mm]; None where a roll-out diverged.
 
     Args:
         simulated: (R, T, M, 3) [m], NaN where a roll-out diverged.
         observed: (R, T, M, 3) [m], NaN where a marker was not seen.
         labels: M names.
     """
-    found: dict[str, float | None] = {}
+    means: dict[str, float | None] = {}
     for m, label in enumerate(labels):
         errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
         if any(map(len, errors)):
-            found[label] = _finite_mean(np.concatenate(errors))
-    return found
+            means[label] = _finite_mean(np.concatenate(errors))
+    return means
 
 
 def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
-    """Return the mean error over trajectories, steps and vertices: E_q of the published source.
+    """Returns the mean error over trajectories, steps and vertices (E_q of the paper), and the standard deviation.
 
-    The deviation is over trajectories and steps, of the mean over the vertices.
+    The deviation is that of the mean over the vertices, over trajectories and steps.
 
     Args:
-        errors: One (T,) array [mm] a trajectory, as `marker_errors` returns it; T may differ.
+        errors: One array (T,) for each trajectory, from `marker_errors` [mm]; T may differ.
 
     Raises:
         InputError: There is no trajectory, or one has no step.
     """
-    rows = [np.asarray(each, dtype=np.float64) for each in errors]
+    rows = [np.asarray(row, dtype=np.float64) for row in errors]
     if not rows or any(row.size == 0 for row in rows):
         raise InputError("no roll-out error to summarise: the test split needs a trajectory of at least one step")
     diverged = sum(not np.isfinite(row).all() for row in rows)
@@ -205,18 +205,20 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     }
 
 
-def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]) -> list[dict[str, Any]]:
-    """Return what `metrics.json` lists under `per_trajectory`: the mean error of every model on each.
+def summarise_trajectories(
+    names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]
+) -> list[dict[str, Any]]:
+    """Returns `per_trajectory` of `metrics.json`: the mean error of every model on every trajectory.
 
     Args:
         names: R names of the trajectories.
-        errors: For each model R arrays (T,) [mm], or one (R, T).
+        errors: For each model R arrays (T,), or one (R, T) [mm].
 
     Returns:
         R entries `{"name": ..., "errors_mm": {model: mean [mm], or None where the roll-out diverged}}`.
 
     Raises:
-        InputError: A model has another number of trajectories than there are names.
+        InputError: A model has a different number of trajectories than names.
     """
     means = {model: [_finite_mean(row) for row in rows] for model, rows in errors.items()}
     for model, rows in means.items():
@@ -226,25 +228,24 @@ def summarise_each(names: Sequence[str], errors: Mapping[str, Iterable[NDArray[n
 
 
 def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
-    """Return the errors of a cross-validation, of every model's in every fold: the mean of the folds' means."""
+    """Returns the errors of a cross-validation for every model: mean and deviation of the folds' means."""
     return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
 
 
 def published_errors(name: str) -> Mapping[str, PublishedError]:
-    """Return the published errors of an experiment, or of the one that it is a variant of, as its name says."""
-    known = [each for each in PUBLISHED_MM if name.startswith(each)]
-    return PUBLISHED_MM[max(known, key=len)] if known else {}
+    """Returns the published errors of the experiment with the longest name that starts `name`; empty without one."""
+    experiments = [experiment for experiment in PUBLISHED_MM if name.startswith(experiment)]
+    return PUBLISHED_MM[max(experiments, key=len)] if experiments else {}
 
 
 def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> NDArray[np.float64]:
-    """Return the median over a window of time around each step, as the published figures of the arm have it.
+    """Returns the running median over a centred time window, as in the published figures of the arm.
 
-    The window is cut at both ends, and holds as many steps before the current one as after it. NaN is left out, and
-    stays where there is nothing else; an infinite value is larger than all others.
+    The window is cut off at both ends of the series. NaN is ignored, unless the whole window is NaN.
 
     Args:
         values: (..., T) at equal steps.
-        time_step: Between two of them [s].
+        time_step: Of the series [s].
         window: Length of the window [s].
 
     Raises:
@@ -262,14 +263,13 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
 
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
-    means = [each["mean"] for each in summaries]
-    known = [mean for mean in means if mean is not None]
-    whole = len(known) == len(means)
+    means = [summary["mean"] for summary in summaries if summary["mean"] is not None]
+    complete = len(means) == len(summaries)
     return {
-        "mean": float(np.mean(known)) if whole else None,
-        "std": float(np.std(known)) if whole and len(known) > 1 else None,
-        "trajectories": sum(each["trajectories"] for each in summaries),
-        "diverged": sum(each["diverged"] for each in summaries),
+        "mean": float(np.mean(means)) if complete else None,
+        "std": float(np.std(means)) if complete and len(means) > 1 else None,
+        "trajectories": sum(summary["trajectories"] for summary in summaries),
+        "diverged": sum(summary["diverged"] for summary in summaries),
     }
 
 

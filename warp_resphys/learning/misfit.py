@@ -237,7 +237,8 @@ class Misfit:
             placement_rows.append(weight * deviations)
             placed.append([placement.apply(points) for points in moved])
         errors = [
-            replay.errors(torch.stack(points)) for replay, points in zip(replays, zip(*placed, strict=True), strict=True)
+            replay.errors(torch.stack(points))
+            for replay, points in zip(replays, zip(*placed, strict=True), strict=True)
         ]
         return errors, torch.cat([rows, torch.stack(placement_rows)], 1)
 

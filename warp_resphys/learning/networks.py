@@ -19,15 +19,15 @@ _ARCHITECTURE = ("blocks", "layers", "width", "activation")
 ACTIVATIONS = ("normalised_elu", "silu")
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3
-# Samples that modes are taken from, evenly picked: neighbours in time tell the same, and more take minutes.
+# Evenly spaced samples for modes: neighbours in time are nearly equal, and more samples take minutes.
 _SAMPLES_FOR_MODES = 2_000
 
 
 class SkipMLP(nn.Module):
     """Blocks of perceptrons with skip connections between blocks.
 
-    Every linear layer but a block's last is followed by LayerNorm and ELU, as published, or by SiLU alone, which makes
-    a smoother function. Blocks after the first add to their input.
+    Every linear layer except a block's last is followed by LayerNorm and ELU, as published, or by SiLU alone, which
+    gives a smoother function. Blocks after the first add to their input.
 
     Args:
         n_in: inputs.
@@ -44,7 +44,7 @@ class SkipMLP(nn.Module):
         self.blocks = nn.ModuleList(_perceptron(size, n_out, layers, width, activation) for size in sizes)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(S, n_in) to (S, n_out)."""
+        """Maps (S, n_in) to (S, n_out)."""
         first, *others = self.blocks
         x = first(x)
         for block in others:
@@ -53,13 +53,13 @@ class SkipMLP(nn.Module):
 
 
 class RecurrentMLP(nn.Module):
-    """A gated recurrent unit beside which a perceptron sees the inputs: what was before has its say, however long ago.
+    """A gated recurrent unit, and a perceptron of the inputs and the hidden state.
 
     Args:
         n_in: inputs.
         n_out: outputs.
         recurrent: size of the hidden state.
-        architecture: of the `SkipMLP` that sees both.
+        architecture: of the perceptron, a `SkipMLP`.
     """
 
     def __init__(self, n_in: int, n_out: int, recurrent: int, **architecture: Any) -> None:
@@ -69,11 +69,11 @@ class RecurrentMLP(nn.Module):
 
     @property
     def blocks(self) -> nn.ModuleList:
-        """Those of the perceptron."""
+        """Blocks of the perceptron."""
         return self.perceptron.blocks
 
     def forward(self, x: torch.Tensor, hidden: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        """(S, n_out) outputs and the next hidden state (S, H), of (S, n_in) inputs and the last one; None at first.
+        """Maps inputs (S, n_in) and hidden state (S, H), None at first, to outputs (S, n_out) and next hidden state.
 
         Raises:
             InputError: a hidden state of another size.
@@ -96,13 +96,13 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str)
 class Coder(nn.Module):
     """An affine map between a field on the vertices and standardised coordinates: c = (x - mean) basis / scale.
 
-    Its constants are in double precision, as states of simulations are, whatever the samples were that it is from.
+    Its constants are in double precision, as the states of simulations.
 
     Args:
-        mean: (D,) flattened field of the origin.
+        mean: (D,) flattened field at c = 0.
         basis: (D, M) columns; None for the coordinates themselves.
-        scale: (M,) deviation of each coordinate.
-        dual: (D, M) columns with dual^T basis = 1, by which fields are decoded; None: the basis, which is orthonormal.
+        scale: (M,) standard deviation of each coordinate.
+        dual: (D, M) columns that decode fields, with dual^T basis = 1; None for an orthonormal basis, its own dual.
     """
 
     mean: torch.Tensor
@@ -123,16 +123,16 @@ class Coder(nn.Module):
 
     @property
     def size(self) -> int:
-        """M."""
+        """Number of coordinates, M."""
         return len(self.scale)
 
     def encode(self, field: torch.Tensor) -> torch.Tensor:
-        """(S, N, 3) to (S, M)."""
+        """Maps fields (S, N, 3) to coordinates (S, M)."""
         x = field.flatten(1) - self.mean
         return (x if self.basis is None else x @ self.basis) / self.scale
 
     def decode(self, coordinates: torch.Tensor) -> torch.Tensor:
-        """(S, M) to (S, N, 3)."""
+        """Maps coordinates (S, M) to fields (S, N, 3)."""
         x = coordinates * self.scale
         if self.basis is not None:
             x = x @ (self.basis if self.dual is None else self.dual).mT
@@ -140,16 +140,16 @@ class Coder(nn.Module):
 
 
 def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
-    """Proper orthogonal decomposition about zero: the M modes that hold most of the energy of samples (S, N, 3).
+    """Proper orthogonal decomposition about zero: the M modes with most of the energy of samples (S, N, 3).
 
     Raises:
         InputError: more modes than samples or coordinates, or samples that are all zero.
     """
-    x = _some(samples).flatten(1).double()
+    x = _thinned(samples).flatten(1).double()
     if not bool(x.any()):
         raise InputError(
-            f"{modes} modes were asked for of what is zero in all {len(x)} samples, such as the velocities of poses: "
-            "set that number of modes to 0."
+            f"{modes} modes were asked for of a field that is zero in all {len(x)} samples, such as the velocities of "
+            "poses: set that number of modes to 0."
         )
     if not 1 <= modes <= min(x.shape):
         raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
@@ -159,29 +159,29 @@ def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
     return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
 
 
-def _some(samples: torch.Tensor) -> torch.Tensor:
-    """At most so many of (S, ...) samples as modes are taken from."""
+def _thinned(samples: torch.Tensor) -> torch.Tensor:
+    """At most `_SAMPLES_FOR_MODES` of (S, ...) samples, evenly spaced."""
     return samples[:: -(-len(samples) // _SAMPLES_FOR_MODES)]
 
 
 def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
-    """Forces by the displacements that they would cause: their main modes Psi, with f = K Psi c and c = Psi^T K^-1 f.
+    """Coder of forces in the modes Psi of their static displacements: f = K Psi c and c = Psi^T K^-1 f.
 
-    A slender body is moved most by forces that are small beside those that cancel. In the modes of the forces
-    themselves, a small error of the large ones moves it more than the small ones do; in those of K^-1 f, the error of a
-    coordinate is the error of the body.
+    A slender body is moved most by small forces, while large ones cancel. In modes of the forces themselves, a small
+    error of a large force moves the body further than the small forces do. In modes of K^-1 f, the error of a
+    coordinate is the error of the displacement.
 
     Args:
         samples: (S, N, 3) forces [N].
-        stiffness: K, of the body at rest.
-        modes: M.
+        stiffness: K of the body at rest.
+        modes: number of modes, M.
 
     Raises:
         InputError: more modes than samples or coordinates.
     """
-    forces = _some(samples).flatten(1).double()
-    moved = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
-    coder = pod_coder(moved.unflatten(1, (-1, 3)), modes)
+    forces = _thinned(samples).flatten(1).double()
+    displacements = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
+    coder = pod_coder(displacements.unflatten(1, (-1, 3)), modes)
     assert coder.basis is not None
     psi = coder.basis.cpu().numpy()
     basis, dual = (torch.as_tensor(part).to(forces) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
@@ -189,31 +189,31 @@ def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: i
 
 
 def actuation_coder(samples: torch.Tensor) -> Coder:
-    """Each number of (S, A) in units of its root mean square: no actuation stays zero."""
+    """Coder of (S, A) by the root mean square of each column; zero actuation stays zero."""
     size = samples.square().mean(0).sqrt()
     return Coder(torch.zeros_like(size), None, torch.where(size > 0.0, size, torch.ones_like(size)))
 
 
 def nodal_coder(samples: torch.Tensor) -> Coder:
-    """Standardisation of every coordinate of (S, N, 3), as published; constant coordinates stay zero."""
+    """Coder that standardises every coordinate of (S, N, 3), as published; constant coordinates are zero."""
     x = samples.flatten(1)
     deviation = x.std(0)
     return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
 
 
 class StateMap(nn.Module):
-    """Fields predicted from a state, in standardised coordinates: a linear part and a network for what it leaves.
+    """Predicts fields from a state, in standardised coordinates: a linear part plus a network for the remainder.
 
     Attributes:
         fields: names of the predicted fields, in order.
 
     Args:
         rest: (N, 3) rest positions [m].
-        position: coder of positions less the rest shape.
+        position: coder of displacements from rest.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: number and width of the layers, their activation, and the size of a hidden state if any.
-        actuation: coder of what acts on the body, such as weights or pressures; None where nothing does.
+        architecture: number and width of the layers, their activation, and the size of the hidden state if recurrent.
+        actuation: coder of further inputs, such as weights or pressures; None without any.
     """
 
     fields: tuple[str, ...]
@@ -251,12 +251,12 @@ class StateMap(nn.Module):
         return [coder for coder in self.outputs.values() if isinstance(coder, Coder)]
 
     def fit_linear(self, inputs: torch.Tensor, outputs: torch.Tensor, noise: float) -> None:
-        """Sets the linear part by ridge regression: least squares, as if the inputs had noise of that deviation.
+        """Sets the linear part by ridge regression: least squares for inputs with added noise.
 
         Args:
             inputs: (S, n_in) standardised.
             outputs: (S, n_out) standardised.
-            noise: standard deviation.
+            noise: standard deviation of the noise.
         """
         x, y = inputs.double(), outputs.double()
         gram = x.mT @ x + len(x) * noise**2 * torch.eye(x.shape[1], device=x.device, dtype=x.dtype)
@@ -267,18 +267,20 @@ class StateMap(nn.Module):
     def standardised(
         self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """(S, n_out) standardised fields from (S, n_in) standardised inputs: linear part and network.
+        """Maps standardised inputs (S, n_in) to standardised fields (S, n_out), and returns the next hidden state.
 
-        A recurrent network's last hidden state (S, H), None at first, goes in, and the next one comes out.
+        Args:
+            inputs: from `encode`.
+            hidden: (S, H) hidden state of a recurrent network; None at first.
         """
         if isinstance(self.network, RecurrentMLP):
-            found, hidden = self.network(inputs, hidden)
+            outputs, hidden = self.network(inputs, hidden)
         else:
-            found = self.network(inputs)
-        return inputs @ self.linear + self.remainder * found, hidden
+            outputs = self.network(inputs)
+        return inputs @ self.linear + self.remainder * outputs, hidden
 
     def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
-        """(S, n_in) standardised inputs, as precise as the network, of (S, N, 3) [m] and [m/s], and of (S, A) or None.
+        """Standardised inputs (S, n_in), in the network's precision, from q, v (S, N, 3) [m], [m/s] and (S, A) or None.
 
         Raises:
             ValueError: no actuation for a model that was built with one.
@@ -291,24 +293,24 @@ class StateMap(nn.Module):
         return torch.cat(parts, dim=1).to(self.linear.dtype)
 
     def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
-        """(S, n_out) standardised outputs, as precise as the network, from (S, N, 3) fields in the coders' order."""
+        """Standardised outputs (S, n_out), in the network's precision, from fields (S, N, 3) in the coders' order."""
         pairs = zip(self.coders, fields, strict=True)
         return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
     def decode(
         self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
     ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """(S, N, 3) fields in order, and the next hidden state; see `standardised`."""
+        """Predicted fields (S, N, 3) in order, and the next hidden state; see `standardised`."""
         outputs, hidden = self.standardised(inputs, hidden)
         parts = outputs.split(self._sizes, dim=1)
         return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)], hidden
 
     def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
-        """(S, N, 3) fields in order, from a state as `encode` takes it."""
+        """Predicted fields (S, N, 3) in order; for the arguments, see `encode`."""
         return self.decode(self.encode(q, v, actuation))[0]
 
     def description(self) -> dict[str, Any]:
-        """What `restore` needs beside the tensors."""
+        """Metadata for `restore`, beside the tensors."""
         return {
             "architecture": self.architecture,
             "reduced": self.position.basis is not None,
@@ -317,24 +319,24 @@ class StateMap(nn.Module):
 
 
 class ResidualForce(StateMap):
-    """Residual force of a state (the published method's network)."""
+    """Predicts the residual force from the state (the published method's network)."""
 
     fields = ("force",)
 
     def forward(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
-        """(S, N, 3) residual force [N]."""
+        """Residual force (S, N, 3) [N]."""
         return self.predict(q, v, actuation)[0]
 
 
 class NextState(StateMap):
-    """The next state of a state: the purely data-driven baseline (SimFree)."""
+    """Predicts the next state from the state: the purely data-driven baseline (SimFree)."""
 
     fields = ("next_position", "next_velocity")
 
     def forward(
         self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(S, N, 3) positions [m] and velocities [m/s] one time step on."""
+        """Positions [m] and velocities [m/s], (S, N, 3) each, after one time step."""
         position, velocity = self.predict(q, v, actuation)
         return position, velocity
 
@@ -342,7 +344,7 @@ class NextState(StateMap):
     def decode(
         self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
     ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """(S, N, 3) positions [m] and velocities [m/s], and the next hidden state; see `StateMap.standardised`."""
+        """Positions [m] and velocities [m/s], (S, N, 3) each, and the next hidden state; see `StateMap.decode`."""
         (displacement, velocity), hidden = super().decode(inputs, hidden)
         return [self.rest + displacement, velocity], hidden
 
@@ -356,7 +358,7 @@ def build_model(
     actuation: torch.Tensor | None = None,
     stiffness: RestStiffness | None = None,
 ) -> ResidualForce:
-    """A residual force with coders from training samples.
+    """Returns an untrained residual force, with coders from training samples.
 
     Args:
         settings: kind and size of the network.
@@ -364,9 +366,9 @@ def build_model(
         q: (S, N, 3) positions [m].
         v: (S, N, 3) velocities [m/s].
         force: (S, N, 3) residual forces [N].
-        actuation: (S, A) what else acts on the body, or None.
-        stiffness: of the body at rest, for a ``reduced`` network whose modes are those of the displacements that forces
-            would cause; of the forces themselves if None.
+        actuation: (S, A) further inputs of the network, or None.
+        stiffness: of the body at rest, for a ``reduced`` network with modes of the static displacements; with modes of
+            the forces themselves if None.
 
     Raises:
         InputError: sizes that do not fit the samples.
@@ -388,7 +390,7 @@ def build_next_state(
     v: torch.Tensor,
     actuation: torch.Tensor | None = None,
 ) -> NextState:
-    """A data-driven baseline of the same family, whose in- and outputs share their coders; see `build_model`."""
+    """Returns an untrained next-state network with the same coders for inputs and outputs; see `build_model`."""
     position, velocity = _state_coders(settings, q - rest, v)
     outputs = dict(zip(NextState.fields, _state_coders(settings, q - rest, v), strict=True))
     actuated = None if actuation is None else actuation_coder(actuation)
@@ -399,22 +401,22 @@ def _state_coders(settings: NetworkSettings, u: torch.Tensor, v: torch.Tensor) -
     """Coders of displacements and velocities."""
     if settings.kind == "reduced":
         pairs = ((u, settings.position_modes), (v, settings.velocity_modes))
-        found = [pod_coder(field, modes) if modes else _blind_coder(field) for field, modes in pairs]
-        return found[0], found[1]
+        position, velocity = (pod_coder(field, modes) if modes else _empty_coder(field) for field, modes in pairs)
+        return position, velocity
     return nodal_coder(u), nodal_coder(v)
 
 
-def _blind_coder(samples: torch.Tensor) -> Coder:
-    """No coordinates at all: for what a network is not to see."""
-    nothing = samples.new_zeros(samples[0].numel())
-    return Coder(nothing, nothing.new_zeros(len(nothing), 0), nothing.new_zeros(0))
+def _empty_coder(samples: torch.Tensor) -> Coder:
+    """Coder without coordinates, for a field that is not an input of the network."""
+    mean = samples.new_zeros(samples[0].numel())
+    return Coder(mean, mean.new_zeros(len(mean), 0), mean.new_zeros(0))
 
 
 Model = TypeVar("Model", bound=StateMap)
 
 
 def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:
-    """A model from its ``state_dict`` and `StateMap.description`."""
+    """Returns the model of a ``state_dict`` and a `StateMap.description`."""
 
     def coder(name: str) -> Coder:
         basis, dual = (tensors.get(f"{name}.{part}") for part in ("basis", "dual"))

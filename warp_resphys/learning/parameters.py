@@ -1,7 +1,7 @@
-"""The names of what may be identified, and what a configuration expects of it.
+"""Names of the parameters that can be identified, and their effect on a simulator's constants.
 
-A name is that of a simulator's parameter (``youngs_modulus``), the same of one part of an energy that has several
-(``tendon_stiffness_left``), what is unknown of an input's commands (``pressure_delay``), or one of a few others.
+A name is that of a simulator's constant (``youngs_modulus``), of the constant of one part of an energy with several
+parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), or one of `MASS_FACTOR` and `TILTS`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,18 +16,18 @@ from ..io.errors import InputError
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 HUNG: Final = ("attached_mass", PAYLOAD.name)
-_COMMANDS: Final = ("factor", "delay", "rise")  # that may be unknown of an input, in the order in which they act
+_RESPONSES: Final = ("factor", "delay", "rise")  # of an input to its commands, in the order in which they act
 
 
-def known_parameters(simulator: Simulator) -> tuple[str, ...]:
-    """What can be identified of a simulator; see `replay.Replay`."""
+def identifiable_parameters(simulator: Simulator) -> tuple[str, ...]:
+    """Names of the parameters of a simulator that can be identified; see `replay.Replay`."""
     constants = (*(name for name in simulator.parameters if name != "gravity"), *parameters_of_parts(simulator))
-    driven = [f"{name}_{what}" for name in simulator.inputs if name not in HUNG for what in _COMMANDS]
-    return (*constants, MASS_FACTOR, *TILTS, *driven)
+    responses = [f"{name}_{word}" for name in simulator.inputs if name not in HUNG for word in _RESPONSES]
+    return (*constants, MASS_FACTOR, *TILTS, *responses)
 
 
 def parameters_of_parts(simulator: Simulator) -> dict[str, tuple[str, int]]:
-    """The parameter and the number of the part, for every part of energies that have several, by name."""
+    """Name of the constant and index of the part, for every part of energies with several, by parameter name."""
     return {
         f"{name}_{part}": (name, number)
         for name, parts in simulator.parts.items()
@@ -36,11 +36,11 @@ def parameters_of_parts(simulator: Simulator) -> dict[str, tuple[str, int]]:
     }
 
 
-def check_known(names: Iterable[str], known: Sequence[str]) -> None:
-    """Refuses a name that no parameter has.
+def check_names(names: Iterable[str], known: Sequence[str]) -> None:
+    """Checks that all names are names of parameters.
 
     Raises:
-        InputError: it is none of those that are known.
+        InputError: a name is unknown.
     """
     for name in names:
         if name not in known:
@@ -48,47 +48,47 @@ def check_known(names: Iterable[str], known: Sequence[str]) -> None:
 
 
 def constants_of(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """What `Simulator.prepare` takes, of values (E,) of parameters; those of commands and of payloads are left out.
+    """Constants for `Simulator.prepare` from values (E,) of parameters; those of inputs and payloads are ignored.
 
     Args:
-        simulator: gives what no parameter sets.
-        parameters: by a name of `known_parameters`.
+        simulator: gives the constants that are not a parameter.
+        parameters: values by a name of `identifiable_parameters`.
 
     Raises:
         InputError: there is no gravity to tilt.
     """
-    found = {name: value[:, None] for name, value in parameters.items() if name in simulator.parameters}
-    found |= _by_part(simulator, parameters)
+    constants = {name: value[:, None] for name, value in parameters.items() if name in simulator.parameters}
+    constants |= _by_part(simulator, parameters)
     if any(name in parameters for name in TILTS):
-        found["gravity"] = tilted_gravity(simulator, *(parameters.get(name) for name in TILTS))
-    return found
+        constants["gravity"] = tilted_gravity(simulator, *(parameters.get(name) for name in TILTS))
+    return constants
 
 
 def _by_part(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """(E, count) constants of energies of which parts have values (E,) of their own, the others theirs all."""
-    of_parts, found = parameters_of_parts(simulator), dict[str, list[torch.Tensor]]()
+    """(E, count) constants of energies with values (E,) for single parts; the other parts have the common value."""
+    of_parts, by_part = parameters_of_parts(simulator), dict[str, list[torch.Tensor]]()
     for name, value in parameters.items():
         if name not in of_parts:
             continue
         constant, part = of_parts[name]
-        if constant not in found:
+        if constant not in by_part:
             own = parameters[constant] if constant in parameters else simulator.tensor(simulator.constants[constant])
             own = own[:, None] if constant in parameters else simulator.parameters[constant].shaped(own)
-            found[constant] = list(own.expand(len(value), simulator.counts[constant]).unbind(1))
-        found[constant][part] = value
-    return {name: torch.stack(columns, 1) for name, columns in found.items()}
+            by_part[constant] = list(own.expand(len(value), simulator.counts[constant]).unbind(1))
+        by_part[constant][part] = value
+    return {name: torch.stack(columns, 1) for name, columns in by_part.items()}
 
 
 def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:
-    """(1 or B, 3) the simulator's gravity, turned by components along the axes across it [m/s^2].
+    """(1 or B, 3) the simulator's gravity, tilted along the two axes perpendicular to it [m/s^2].
 
     Args:
-        simulator: gives the gravity that is turned, and its strength.
-        first: (B,) component of the direction along the first axis across gravity (the one of lowest number), or None.
-        second: (B,) along the second.
+        simulator: gives the gravity before the tilt.
+        first: (B,) component of the direction along the first axis across gravity (of lowest index); None for zero.
+        second: (B,) component along the second axis; None for zero.
 
     Raises:
-        InputError: there is no gravity to turn.
+        InputError: there is no gravity to tilt.
     """
     gravity = simulator.tensor(simulator.gravity)
     strength = gravity.norm()
@@ -108,13 +108,13 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
 
 
 def command_of(simulator: Simulator, name: str) -> tuple[str, str]:
-    """The input, and which of factor, delay and rise a name is of its commands; both empty for another name."""
-    driven, _, what = name.rpartition("_")
-    return (driven, what) if driven in simulator.inputs and driven not in HUNG and what in _COMMANDS else ("", "")
+    """Input and one of factor, delay and rise in a name such as ``pressure_delay``; else two empty strings."""
+    driven, _, word = name.rpartition("_")
+    return (driven, word) if driven in simulator.inputs and driven not in HUNG and word in _RESPONSES else ("", "")
 
 
 def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[str, float]:
-    """What a simulator has of parameters: its own constants, a part that of all parts; else what changes nothing."""
+    """Configured values of parameters: the simulator's constants, or the value without effect (factor 1, delay 0)."""
     of_parts = parameters_of_parts(simulator)
 
     def find(name: str) -> float:
@@ -122,7 +122,6 @@ def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[st
         if constant in simulator.parameters:
             value = simulator.tensor(simulator.constants[constant]).flatten()
             return float(value[0 if part is None or len(value) == 1 else part])
-        driven, what = command_of(simulator, name)
-        return 1.0 if name == MASS_FACTOR or (driven and what == "factor") else 0.0
+        return 1.0 if name == MASS_FACTOR or command_of(simulator, name)[1] == "factor" else 0.0
 
     return {name: find(name) for name in names}

@@ -1,13 +1,13 @@
-"""Where markers sit and how the recording lies, where that is known to millimetres and degrees alone.
+"""Errors of the marker places on the body and of the recording's frame, estimated beside the physical parameters.
 
-A marker sits b_m beside its nominal place on the body, and the frame of the recordings is shifted by t and turned by w
-about a centre c, so that of what a simulator shows
+Marker m sits at an offset b_m from its nominal place on the body, and the frame of the recordings is shifted by t and
+rotated by w about a centre c, so that a simulated marker y_m is observed at
 
     x = c + R(w) (y_m(q; b_m) - c) + t
 
-is observed. All of these are nuisance: a normal distribution around zero says how large they may be, and for each set
-of physical parameters they are what leaves the least sum of squares, that of the distribution included (variable
-projection, Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413).
+All of these are nuisance parameters with a normal prior around zero. For each set of physical parameters, they take the
+values with the least sum of squares, prior included (variable projection, Golub and Pereyra, SIAM J. Numer. Anal. 10
+(1973) 413).
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,17 @@ from ..data.markers import Markers
 from ..data.observation import Observation
 
 _DIRECTIONS = 3
-_ITERATIONS = 4  # as turns of a few degrees are all but linear
+_ITERATIONS = 4  # enough, as rotations by a few degrees are nearly linear
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Standard deviations of what is known beforehand; None for what is known exactly.
+    """Prior standard deviations; None for what is known exactly.
 
     Attributes:
         markers: of each coordinate of a marker's place on the body [m].
-        shift: of each coordinate of the recordings' origin [m].
-        turn: of each component of the recordings' rotation [rad].
+        shift: of each coordinate of the origin of the recording's frame [m].
+        turn: of each component of its rotation vector [rad].
     """
 
     markers: float | None = None
@@ -41,13 +41,13 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where markers sit, and how the recordings lie.
+    """Marker places on the body, and the frame of the recordings.
 
     Attributes:
         offsets: (M, 3) of the markers from their nominal places, in the frame of the body at rest [m].
-        shift: (3,) of the recordings [m].
-        turn: (3,) their rotation vector [rad].
-        centre: (3,) about which they are turned [m].
+        shift: (3,) of the recording's frame [m].
+        turn: (3,) its rotation vector [rad].
+        centre: (3,) about which it is rotated [m].
     """
 
     offsets: torch.Tensor
@@ -56,7 +56,7 @@ class Placement:
     centre: torch.Tensor
 
     def apply(self, points: torch.Tensor) -> torch.Tensor:
-        """(..., 3) points of the body as the recordings show them [m]."""
+        """Returns points (..., 3) of the body in the frame of the recordings [m]."""
         angle = self.turn.norm()
         axis = self.turn / angle.clamp_min(torch.finfo(angle.dtype).tiny)
         arm = points - self.centre
@@ -65,39 +65,39 @@ class Placement:
         return points + torch.sin(angle) * across + (1.0 - torch.cos(angle)) * twice + self.shift
 
     def to(self, like: torch.Tensor) -> "Placement":
-        """On the device and in the precision of a tensor."""
-        return Placement(*(each.to(like) for each in (self.offsets, self.shift, self.turn, self.centre)))
+        """Returns the placement on the device and in the precision of a tensor."""
+        return Placement(*(t.to(like) for t in (self.offsets, self.shift, self.turn, self.centre)))
 
     def plain(self, labels: Sequence[str]) -> dict[str, Any]:
-        """As JSON."""
+        """Returns the placement as JSON data."""
         rest = {"shift": self.shift.tolist(), "turn": self.turn.tolist(), "centre": self.centre.tolist()}
         return {"offsets": dict(zip(labels, self.offsets.tolist(), strict=True)), **rest}
 
     @classmethod
     def none(cls, count: int, centre: torch.Tensor) -> "Placement":
-        """Where M markers are to be."""
+        """Returns the nominal placement of M markers."""
         zero = torch.zeros_like(centre)
         return cls(centre.new_zeros(count, 3), zero, zero, centre)
 
     @classmethod
-    def from_plain(cls, found: Mapping[str, Any], labels: Sequence[str]) -> "Placement":
-        """Of `plain`."""
-        offsets = torch.tensor([found["offsets"][label] for label in labels], dtype=torch.float64)
-        rest = (torch.tensor(found[key], dtype=torch.float64) for key in ("shift", "turn", "centre"))
+    def from_plain(cls, plain: Mapping[str, Any], labels: Sequence[str]) -> "Placement":
+        """Returns the placement that `plain` wrote."""
+        offsets = torch.tensor([plain["offsets"][label] for label in labels], dtype=torch.float64)
+        rest = (torch.tensor(plain[key], dtype=torch.float64) for key in ("shift", "turn", "centre"))
         return cls(offsets, *rest)
 
 
 @dataclass(frozen=True)
 class PlacedMarkers(Markers):
-    """Markers as recordings show them."""
+    """Markers at their placed offsets, in the frame of the recordings."""
 
     vertices: torch.Tensor
-    markers: Markers  # where they sit
+    markers: Markers  # at their offsets, in the frame of the body
     placement: Placement
 
     @classmethod
     def of(cls, markers: Markers, placement: Placement) -> "PlacedMarkers":
-        """Nominal markers, placed."""
+        """Returns nominal markers with a placement applied."""
         return cls(markers.vertices, markers.moved(placement.offsets), placement)
 
     @override
@@ -105,12 +105,15 @@ class PlacedMarkers(Markers):
         return self.placement.apply(self.markers(positions))
 
 
-class Stems(Observation):
-    """Markers and what moving them by a metre would do, as points of one observation.
+class DisplacedMarkers(Observation):
+    """M markers and three copies of them, displaced by 1 m along each axis of the body at rest.
+
+    Markers are linear in their offsets, so that the copies give the derivative by an offset: the rotation of the body
+    at the marker.
 
     Args:
-        markers: nominal ones.
-        count: M, how many they are.
+        markers: nominal markers.
+        count: M.
     """
 
     copies = 1 + _DIRECTIONS
@@ -130,73 +133,73 @@ class Stems(Observation):
         return self._markers.residual(shown, measured)
 
     @staticmethod
-    def parts(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Markers (..., M, 3) [m] and the rotations of their stems (..., M, 3, 3), of points (..., 4 M, 3)."""
-        at, *moved = points.chunk(1 + _DIRECTIONS, -2)
-        return at, torch.stack([each - at for each in moved], -1)
+    def split(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Markers (..., M, 3) [m] and the rotations of the body there (..., M, 3, 3), from points (..., 4 M, 3)."""
+        markers, *displaced = points.chunk(1 + _DIRECTIONS, -2)
+        return markers, torch.stack([copy - markers for copy in displaced], -1)
 
 
-def estimate(
+def estimate_placement(
     accuracy: Accuracy,
     centre: torch.Tensor,
     errors: Sequence[torch.Tensor],
     seen: Sequence[torch.Tensor],
     points: Sequence[torch.Tensor],
-    turns: Sequence[torch.Tensor],
+    rotations: Sequence[torch.Tensor],
     weights: Sequence[torch.Tensor],
     prior_weight: float,
 ) -> tuple[Placement, torch.Tensor]:
-    """The placement that is the best for one set of physical parameters.
+    """Returns the placement with the least sum of squares for one set of physical parameters (Gauss-Newton).
+
+    Sequences have one tensor for each group of trials.
 
     Args:
-        accuracy: what is known beforehand.
-        centre: (3,) about which recordings are turned [m].
-        errors: of each group of trials, (R, T, M, 3) simulated less observed markers [m], zero where nothing was seen.
-        seen: (R, T, M) where something was.
+        accuracy: prior standard deviations.
+        centre: (3,) about which recordings are rotated [m].
+        errors: (R, T, M, 3) simulated less observed markers [m], zero where a marker was not seen.
+        seen: (R, T, M) bool, whether a marker was seen.
         points: (R, T, M, 3) simulated markers [m].
-        turns: (R, T, M, 3, 3) rotations of their stems.
-        weights: (R,) of the squares of each trial's errors [1/m^2].
-        prior_weight: of the squares of what is estimated over its standard deviations.
+        rotations: (R, T, M, 3, 3) of the body at the markers.
+        weights: (R,) of each trial's squared errors [1/m^2].
+        prior_weight: of the squared placement in standard deviations.
 
     Returns:
-        The placement, and (P,) what it is in standard deviations.
+        The placement, and the same (P,) in standard deviations.
     """
     count, like = errors[0].shape[-2], errors[0]
     deviations = [accuracy.markers or 0.0] * (3 * count) + [accuracy.shift or 0.0] * 3 + [accuracy.turn or 0.0] * 3
     scale = like.new_tensor(deviations)
-    inside, found = torch.zeros_like(scale), Placement.none(count, centre)
+    solution, placement = torch.zeros_like(scale), Placement.none(count, centre)
     for _ in range(_ITERATIONS if accuracy.turn else 1):
         normal, right = torch.diag(torch.full_like(scale, prior_weight)), torch.zeros_like(scale)
-        for error, there, at, turn, weight in zip(errors, seen, points, turns, weights, strict=True):
-            root = weight.sqrt()[:, None, None, None] * there[..., None]  # (R, T, M, 1)
-            moved = at + (turn @ found.offsets[..., None])[..., 0]
-            shown = found.apply(moved)
-            columns = _columns(found, shown, turn) * scale * root[..., None]
-            flat = columns.flatten(0, 3)
-            left = ((error + shown - at) * root).flatten() - flat @ inside
-            normal = normal + flat.T @ flat
-            right = right - flat.T @ left
-        inside = torch.linalg.solve(normal, right)
-        x = scale * inside
-        found = Placement(x[:-6].view(count, 3), x[-6:-3], x[-3:], centre)
-    return found, inside
+        for error, visible, nominal, rotation, weight in zip(errors, seen, points, rotations, weights, strict=True):
+            root = weight.sqrt()[:, None, None, None] * visible[..., None]  # (R, T, M, 1)
+            placed = placement.apply(nominal + (rotation @ placement.offsets[..., None])[..., 0])
+            jacobian = (_jacobian(placement, placed, rotation) * scale * root[..., None]).flatten(0, 3)
+            residual = ((error + placed - nominal) * root).flatten() - jacobian @ solution
+            normal = normal + jacobian.T @ jacobian
+            right = right - jacobian.T @ residual
+        solution = torch.linalg.solve(normal, right)
+        x = scale * solution
+        placement = Placement(x[:-6].view(count, 3), x[-6:-3], x[-3:], centre)
+    return placement, solution
 
 
-def _columns(placement: Placement, shown: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """(R, T, M, 3, P) derivatives of shown markers by the offsets, the shift and the rotation vector.
+def _jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+    """(R, T, M, 3, P) derivatives of placed markers by the offsets, the shift and the rotation vector.
 
-    R(w + dw) = R(J dw) R(w), J the left Jacobian of the rotations.
+    R(w + dw) = R(J dw) R(w), with J the left Jacobian of SO(3).
     """
-    count, eye = shown.shape[-2], torch.eye(3, dtype=shown.dtype, device=shown.device)
+    count, eye = placed.shape[-2], torch.eye(3, dtype=placed.dtype, device=placed.device)
     turn = replace(placement, shift=torch.zeros_like(placement.shift), centre=torch.zeros_like(placement.centre))
     rotation, angle = turn.apply(eye).T, placement.turn.norm()
     cross = torch.linalg.cross(placement.turn.expand(3, 3), eye, dim=-1).T
-    first, second = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0  # of angles far below one
+    first, second = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0  # series for small angles
     jacobian = eye + first * cross + second * cross @ cross
-    columns = shown.new_zeros(*shown.shape, 3 * count + 6)
+    columns = placed.new_zeros(*placed.shape, 3 * count + 6)
     for marker in range(count):
-        columns[..., marker, :, 3 * marker : 3 * marker + 3] = rotation @ turns[..., marker, :, :]
+        columns[..., marker, :, 3 * marker : 3 * marker + 3] = rotation @ rotations[..., marker, :, :]
     columns[..., -6:-3] = eye
-    arm = (shown - placement.shift - placement.centre)[..., None]
+    arm = (placed - placement.shift - placement.centre)[..., None]
     columns[..., -3:] = torch.linalg.cross(jacobian.expand(*arm.shape[:-1], 3), arm.expand(*arm.shape[:-1], 3), dim=-2)
     return columns

@@ -1,13 +1,13 @@
-r"""Residual forces from observed states, or from what sparse markers saw of them.
+r"""Reconstruction of residual forces from observed states or sparse markers.
 
 For each step of an observed trajectory, find the force f that minimises
 
     |C q+(f) - y|^2 + lambda |f|^2
 
-with q+ the simulator's next positions, y what was observed, and C the map from positions to markers, linear or not;
-the identity for full states. The step goes on from the reconstructed state, not from the observed one, so that the
-forces reproduce the trajectory in closed loop. Of sparse markers, most of f is left to the second term: what no marker
-sees stays at zero.
+with q+ the simulator's next positions, y the observation, and C the map from positions to markers, linear or not; the
+identity for full states. The next step starts from the reconstructed state, not from the observed one, so that the
+forces reproduce the trajectory in closed loop. With sparse markers, the second term sets the components of f that the
+markers do not determine to zero.
 """
 
 import copy
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 class Reconstruction:
     """One reconstructed step."""
 
-    state: State  # where the simulator gets with the force
+    state: State  # after the step with the force
     force: torch.Tensor  # (B, N, 3) [N]; zero at fixed vertices
     iterations: int  # of the optimisation
 
@@ -72,8 +72,8 @@ class Reconstructor(ABC):
     def _check_sparse(self, observation: Observation) -> None:
         if not self.regularisation > 0.0:
             raise InputError(
-                f"reconstruction.regularisation is {self.regularisation:g}: it must be positive, as markers leave most "
-                "of the force open."
+                f"reconstruction.regularisation is {self.regularisation:g}: it must be positive, as markers do not "
+                "determine the whole force."
             )
         last = self.simulator.body.n_vertices - 1
         if (
@@ -83,7 +83,7 @@ class Reconstructor(ABC):
             raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
     def with_constants(self, constants: Constants) -> Self:
-        """The same method for other constants than the simulator's."""
+        """Returns the method with constants in place of the simulator's own."""
         other = copy.copy(self)
         other._constants = constants
         return other
@@ -96,27 +96,28 @@ class Reconstructor(ABC):
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
     ) -> Reconstruction:
-        """Reconstructs the step from a state to what was observed.
+        """Reconstructs the force of a step from a state to an observation.
 
         Args:
-            state: where the step starts.
-            observed: (B, M, D) what the observation measured, NaN where a point was not seen [unit].
-            inputs: what acts during the step; an external force adds to the one that is looked for.
-            first_guess: (B, N, 3) force to start from, such as that of the step before [N]; not all methods use it.
+            state: at the start of the step.
+            observed: (B, M, D) measured points, NaN where a point was not seen [unit].
+            inputs: during the step; an external force is added to the reconstructed one.
+            first_guess: (B, N, 3) initial guess of the force, such as that of the last step [N]; not all methods use
+                it.
 
         Raises:
-            ConvergenceError: no minimum was found.
+            ConvergenceError: the method did not converge.
         """
 
 
 class LeastSquares(Reconstructor):
-    """A method of `linalg.least_squares`; its ``tolerance`` is the last change of any position [m].
+    """Gauss-Newton or Levenberg-Marquardt; ``tolerance`` is the last change of any position [m].
 
-    Where one way does not settle, as full steps in a pose far from where it would be without the force, the next does.
+    Where one formulation does not converge, such as full steps far from the state without the force, the next is used.
 
     Args:
-        problems: ways to the same minimum, the quickest first.
-        modes: columns of B; every force on the free vertices where left out.
+        problems: formulations of the same minimum, the fastest first.
+        modes: number of columns of B; any force on the free vertices if None.
         settings: see `Reconstructor`.
     """
 
@@ -139,19 +140,19 @@ class LeastSquares(Reconstructor):
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
                 problem = kind(step)
-                found = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
-                if found.converged or number == len(self._problems):
+                result = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
+                if result.converged or number == len(self._problems):
                     break
-                log.info("full steps moved by %.1e m after %d: damped ones follow", found.last_step, found.iterations)
-            x, force = (each.to(self.simulator.dtype) for each in problem.reached(found.point))
-            if not found.converged:
+                log.info("full steps moved by %.1e m after %d: damped ones follow", result.last_step, result.iterations)
+            x, force = (values.to(self.simulator.dtype) for values in problem.solution(result.point))
+            if not result.converged:
                 raise ConvergenceError(
-                    f"{problem.method} reconstruction moved by {found.last_step:.1e} m in its last iteration, the "
-                    f"{found.iterations}th: raise {problem.remedies}.",
+                    f"{problem.method} reconstruction moved by {result.last_step:.1e} m in its last iteration, the "
+                    f"{result.iterations}th: raise {problem.remedies}.",
                     x,
                     None,
                 )
-            return Reconstruction(step.linearise().finish(x), force, found.iterations)
+            return Reconstruction(step.linearise().finish(x), force, result.iterations)
 
 
 class LBFGSB(Reconstructor):
@@ -181,7 +182,7 @@ class LBFGSB(Reconstructor):
             misfit = (free * residual if whole else residual).square().sum()
             value = misfit + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
-            # In units of lambda both the objective and its change are of the size of f^2.
+            # Divided by lambda, the objective and its change have the magnitude of f^2.
             scale = 1.0 / max(self.regularisation, 1e-12)
             return scale * float(value.detach()), scale * gradient.cpu().double().numpy().ravel()
 
@@ -193,7 +194,7 @@ class LBFGSB(Reconstructor):
             method="L-BFGS-B",
             options={"maxiter": self.max_iterations, "maxcor": 30, "ftol": self.tolerance, "gtol": 0.0},
         )
-        if result.status == 1:  # A line search that ends early is another matter: the objective is down to rounding.
+        if result.status == 1:  # An early end of the line search is no failure: the change is down to rounding.
             raise ConvergenceError(
                 f"L-BFGS-B found no minimum in {result.nit} iterations: raise reconstruction.max_iterations, "
                 "reconstruction.tolerance or reconstruction.regularisation.",
@@ -207,9 +208,9 @@ class LBFGSB(Reconstructor):
 
 
 def without_ringing(simulator: Simulator, observation: Observation) -> Simulator:
-    """Returns the simulator with an integrator whose velocities do not ring where markers are prescribed.
+    """Returns the simulator, with BDF2 in place of the midpoint rule where markers are observed.
 
-    Those of the midpoint rule do: v+ = 2 (q+ - q) / h - v keeps every deviation.
+    Velocities of the midpoint rule ring: v+ = 2 (q+ - q) / h - v keeps every deviation.
     """
     rings = simulator.integrator == "midpoint" and not isinstance(observation, WholeState)
     return replace(simulator, integrator="bdf2") if rings else simulator
@@ -224,15 +225,15 @@ def make_reconstructor(
     modes: int | None = None,
     observation: Observation = WHOLE_STATE,
 ) -> Reconstructor:
-    """The named method.
+    """Returns the reconstruction method of a name.
 
     Args:
-        simulator: the one to correct.
+        simulator: to correct.
         method: ``gauss_newton``, ``lbfgsb``, or for markers ``levenberg_marquardt``.
         regularisation: lambda, positive for markers [m^2/N^2].
         tolerance: see the methods.
-        max_iterations: after which a step has failed.
-        modes: vibration modes that forces are made of; every force on the free vertices where left out.
+        max_iterations: of a step, after which it has failed.
+        modes: number of vibration modes that span the forces; any force on the free vertices if None.
         observation: C, for as many environments as the states have.
 
     Raises:

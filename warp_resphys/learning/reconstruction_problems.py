@@ -1,4 +1,4 @@
-"""A step's residual force as a problem of least squares, for full states and for sparse markers."""
+"""Least-squares problems for the residual force of a step, from full states or sparse markers."""
 
 import math
 from abc import abstractmethod
@@ -20,19 +20,19 @@ from ..stepping.state import State
 
 @dataclass(frozen=True)
 class Step:
-    """A step whose force is looked for."""
+    """A step whose force is unknown."""
 
-    simulator: Simulator  # makes it
+    simulator: Simulator
     constants: Constants  # of the simulator
-    state: State  # where it starts
-    inputs: Inputs  # what acts during it
-    observed: torch.Tensor  # (B, M, D) what the observation measured, NaN where a point was not seen [unit]
+    state: State  # at its start
+    inputs: Inputs  # during the step
+    observed: torch.Tensor  # (B, M, D) measured points at its end, NaN where a point was not seen [unit]
     weight: float  # lambda [m^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
-    basis: torch.Tensor | None = None  # (3 N, modes) of forces; None for every force on the free vertices
+    basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
 
     def linearise(self) -> Linearisation:
-        """Of the step without a force."""
+        """Returns the linearisation of the step without a residual force."""
         return self.simulator.linearise(self.state, self.inputs, self.constants)
 
     def missing(self, end: torch.Tensor) -> torch.Tensor:
@@ -40,12 +40,12 @@ class Step:
         return -self.observation.residual(self.observation(end), self.observed).flatten(1)[..., None]
 
     def transposed_jacobian(self, end: torch.Tensor) -> torch.Tensor:
-        """Returns C'^T, (B, 3 N, M D), of the points that were seen."""
+        """Returns C'^T, (B, 3 N, M D), zero for points that were not seen."""
         return self.observation.transposed_jacobian(end) * torch.isfinite(self.observed).flatten(1)[:, None]
 
 
 class StepProblem(Problem):
-    """The search of a step's force; points are as far apart as the positions of their stages [m]."""
+    """Problem of a step's force; the distance of two iterates is that of their stage positions [m]."""
 
     method: ClassVar[str]
     remedies: ClassVar[str] = "reconstruction.regularisation or reconstruction.max_iterations"
@@ -55,27 +55,27 @@ class StepProblem(Problem):
 
     @abstractmethod
     def start(self, first_guess: torch.Tensor | None) -> Point:
-        """Where to start, perhaps at a force (B, N, 3) [N]."""
+        """Initial iterate, from a first guess of the force (B, N, 3) [N]."""
 
     @abstractmethod
-    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, N, 3) solution x of the stage [m], and the force [N]."""
+    def solution(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions x of the stage (B, N, 3) [m], and the force (B, N, 3) [N]."""
 
     @override
     def distance(self, old: Point, new: Point) -> torch.Tensor:
-        return (self.reached(new)[0] - self.reached(old)[0]).abs().amax((1, 2))
+        return (self.solution(new)[0] - self.solution(old)[0]).abs().amax((1, 2))
 
 
 class FullStateProblem(StepProblem):
-    """|x - x*|^2 + w |g(x)|^2 over positions x, g(x) being the force that the step lacks to end there.
+    """|x - x*|^2 + w |g(x)|^2 over positions x, with g(x) the residual force with which the step ends there.
 
     With H = dg/dx, a step of Gauss-Newton solves
 
         (I + w H^2) dx = -(x - x*) - w H g(x)
 
     by conjugate gradients, preconditioned with (I + sqrt(w) H)^2: for every eigenvalue h of H the quotient
-    (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations do for any w. Damping is in units
-    of the matrix on the left: it shortens the step to dx / (1 + d). The search starts at x*, and needs no force.
+    (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations suffice for any w. Damping d is
+    relative to the matrix on the left: it shortens the step to dx / (1 + d). The search starts at x*.
 
     Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e: w is lambda e^2.
     """
@@ -94,14 +94,14 @@ class FullStateProblem(StepProblem):
         return self.evaluate(self._target)
 
     @override
-    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+    def solution(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
         return point.x, point.kept[0]
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
         force = self._step.residual(x)
-        missed = (x - self._target).square().sum((1, 2))
-        return Point(x, missed + self._weight * force.square().sum((1, 2)), (force,))
+        misfit = (x - self._target).square().sum((1, 2))
+        return Point(x, misfit + self._weight * force.square().sum((1, 2)), (force,))
 
     @override
     def linearise(self, point: Point) -> Move:
@@ -124,7 +124,7 @@ class FullStateProblem(StepProblem):
 
 
 class MarkerPositionProblem(StepProblem):
-    """Positions and forces at once, by full steps: |y - C(q+)|^2 + lambda |f|^2 of sparse markers.
+    """|y - C(q+)|^2 + lambda |f|^2 over positions and forces at once, by full Gauss-Newton steps.
 
     The step with a force f ends where the residual g of the step without it equals f. Linearised at an iterate x, with
     the exact Hessian H = dg/dx, that is
@@ -136,8 +136,8 @@ class MarkerPositionProblem(StepProblem):
     at convergence f = g(x) holds as it does for a step of the simulator. Restricted to forces B a with orthonormal
     columns B (see `vibration_modes`), J is C' H^-1 B, which takes a back-substitution a column where these are fewer.
 
-    Where x stands at a fraction e of the time step, q+ moves 1/e times as far as x, so that e (y - C(q+)) takes the
-    place of y - C(x), and lambda e^2 that of lambda. The objective is zero everywhere: every step is taken.
+    Where x stands at a fraction e of the time step, q+ moves 1/e times as far as x, so that e (y - C(q+)) replaces
+    y - C(x), and lambda e^2 replaces lambda. The objective is set to zero, so that every step is accepted.
     """
 
     method = "sparse Gauss-Newton"
@@ -151,7 +151,7 @@ class MarkerPositionProblem(StepProblem):
         return self.evaluate(torch.stack([self._step.start, torch.zeros_like(self._step.start)], 1))
 
     @override
-    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+    def solution(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
         return point.x[:, 0], point.x[:, 1]
 
     @override
@@ -180,11 +180,11 @@ class MarkerPositionProblem(StepProblem):
 
 
 class MarkerForceProblem(StepProblem):
-    """Forces, for motions that full steps do not follow, such as jerks of real bodies.
+    """|y - C(q+)|^2 + lambda |f|^2 over forces, for motions with which full steps fail, such as jerks of real bodies.
 
-    Each trial force is followed by a whole step of the simulator, with its line search, so that an iterate is always a
-    state that it reaches. With J = C' H^-1 there, the next force minimises
-    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2, over forces B a where there are such columns.
+    Each trial force is applied in a whole step of the simulator, with its line search, so that every iterate is a state
+    of the simulator. With J = C' H^-1 there, the next force minimises
+    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2, over forces B a where a basis B is given.
     """
 
     method = "sparse Levenberg-Marquardt"
@@ -195,16 +195,16 @@ class MarkerForceProblem(StepProblem):
 
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
-        """A first guess that the simulator does not follow is left."""
+        """Starts at zero force where the step fails with the first guess."""
         if first_guess is not None and self._task.basis is not None:
             basis = self._task.basis
             first_guess = (basis @ (basis.mT @ first_guess.flatten(1)[..., None])).view_as(first_guess)
-        if first_guess is not None and bool(torch.isfinite((found := self.evaluate(first_guess)).value).all()):
-            return found
+        if first_guess is not None and bool(torch.isfinite((point := self.evaluate(first_guess)).value).all()):
+            return point
         return self.evaluate(torch.zeros_like(self._task.state.q))
 
     @override
-    def reached(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
+    def solution(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
         return self._task.simulator.method.solution_for(self._task.state, point.kept[0]), point.x
 
     @override
@@ -221,18 +221,17 @@ class MarkerForceProblem(StepProblem):
     def linearise(self, point: Point) -> Move:
         force, (end,), basis = point.x.flatten(1)[..., None], point.kept, self._task.basis
         step = self._task.linearise()
-        step.factorise(self.reached(point)[0])
-        # q+ moves 1 / end times as far as the solution.
+        step.factorise(self.solution(point)[0])
+        # q+ moves 1 / stage.end times as far as x.
         jacobian = step.solve(self._task.transposed_jacobian(end)).mT / step.stage.end
         missing = self._task.missing(end)
         if basis is not None:
             force, jacobian = basis.mT @ force, jacobian @ basis
 
         def damped_step(damping: torch.Tensor) -> torch.Tensor:
-            own = (1.0 + damping)[:, None, None]
-            centre = force - force / own
-            change = ridge(jacobian, missing + jacobian @ (force / own), self._task.weight * own)
-            found = centre + change
-            return (found if basis is None else basis @ found).view_as(point.x)
+            factor = (1.0 + damping)[:, None, None]
+            change = ridge(jacobian, missing + jacobian @ (force / factor), self._task.weight * factor)
+            new = force - force / factor + change
+            return (new if basis is None else basis @ new).view_as(point.x)
 
         return damped_step

@@ -1,8 +1,8 @@
-"""Solver-in-the-loop refinement: a residual force that was trained on single steps, trained on through the simulator.
+"""Solver-in-the-loop refinement: a residual force trained on single steps is trained further through the simulator.
 
-The loss is how far what is observed of the simulator, with the predicted force, is from the target over windows of k
-steps that start on it, or on states that were reconstructed from it (Um et al. 2020, "Solver-in-the-Loop"). Its
-gradient goes back through the implicit adjoint of every step.
+The loss is the distance between simulated and observed points over windows of k steps, which start at observed or
+reconstructed states (Um et al. 2020, "Solver-in-the-Loop"). Its gradient goes back through the implicit adjoint of
+every step.
 """
 
 import math
@@ -24,7 +24,7 @@ from .full_batch import FullBatchTrainer
 from .networks import ResidualForce
 from .predictors import LearnedPredictor, Range
 from .replay import Replay
-from .rollout import FURTHEST, Rollout
+from .rollout import DIVERGENCE_DISTANCE, Rollout
 
 REFINEMENTS = ("none", "solver_in_the_loop")
 _WINDOW = ("motion", "trial", "frame")
@@ -33,33 +33,33 @@ _SMALLEST_UNIT = 1e-20  # mm^2
 
 @dataclass(frozen=True)
 class RefinementBatch:
-    """Trials that begin alike, at a simulator's steps.
+    """Trials that begin alike, at the steps of a simulator.
 
     Attributes:
-        q: (R, K + 1, N, 3) positions that windows start from [m].
-        v: (R, K + 1, N, 3) velocities there [m/s].
-        target: (R, K + 1, M, 3) what should be observed [m], NaN where nothing was seen.
-        trials: what acted on the bodies.
-        told: what the model is told of that, see `LearnedPredictor`; None for nothing.
-        base: in whose frame the model predicts; None where that stands still.
+        q: (R, K + 1, N, 3) initial positions of windows [m].
+        v: (R, K + 1, N, 3) initial velocities [m/s].
+        target: (R, K + 1, M, 3) observed points [m], NaN where a point was not seen.
+        trials: give the inputs.
+        context: see `LearnedPredictor`; None for none.
+        base: moving frame of the base in which the model predicts; None where the base stands still.
     """
 
     q: torch.Tensor
     v: torch.Tensor
     target: torch.Tensor
     trials: Trials
-    told: torch.Tensor | None = None
+    context: torch.Tensor | None = None
     base: BaseFrame | None = None
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of motions.
+    """W windows of trials.
 
     Attributes:
-        motion: (W,) number of the motion.
-        trial: (W,) number of the trial in it.
-        frame: (W,) frame that the window starts from.
+        motion: (W,) index of the `RefinementBatch`.
+        trial: (W,) index of the trial in the batch.
+        frame: (W,) first frame of the window.
     """
 
     motion: torch.Tensor
@@ -67,27 +67,27 @@ class Windows:
     frame: torch.Tensor
 
     def __len__(self) -> int:
-        """W."""
+        """Number of windows, W."""
         return len(self.frame)
 
-    def pick(self, which: torch.Tensor) -> "Windows":
-        """Some of them, by number."""
-        return Windows(self.motion[which], self.trial[which], self.frame[which])
+    def pick(self, index: torch.Tensor) -> "Windows":
+        """Returns the windows of an index."""
+        return Windows(self.motion[index], self.trial[index], self.frame[index])
 
 
 class WindowLoss:
-    """Distances from the target over windows of k steps.
+    """Mean squared distance from the target over windows of k steps.
 
     Args:
         model: residual force, differentiable in the weights of its network.
-        make_simulator: a new simulator whose solver settings count failures. Every loss is computed with one: the
-            factor that a solver keeps would make it depend on what was computed before.
+        make_simulator: returns a new simulator whose solver settings count failures. Every loss is computed with a new
+            one: with the factorisation that a solver keeps, the loss would depend on earlier computations.
         window: k.
-        batch_size: windows that are simulated at once.
-        observe: what sensors show of the body; all vertices if left out.
-        parameters: (1,) physical parameters that were identified.
-        frames: with which forces turn; None if they do not.
-        range_: of the model's inputs, in which they are held; None for no guard.
+        batch_size: number of windows that are simulated at once.
+        observe: observation of the body; all vertices if left out.
+        parameters: (1,) identified physical parameters.
+        frames: vertex frames in which forces are predicted; None for the world's frame.
+        range_: to which the model's inputs are clamped; None for no clamping.
     """
 
     def __init__(
@@ -104,15 +104,17 @@ class WindowLoss:
         self._model, self._make_simulator, self._observe = model, make_simulator, observe
         self._window, self._batch_size = window, batch_size
         self._parameters, self._frames, self._range = parameters or {}, frames, range_
-        self._memories: dict[int, tuple[RefinementBatch, dict[str, torch.Tensor]]] = {}  # by the motion's identity
+        self._memories: dict[int, tuple[RefinementBatch, dict[str, torch.Tensor]]] = {}  # by id() of the batch
         simulator = make_simulator()
-        self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 looks back.
+        self._first_frame = 1 if simulator.integrator == "bdf2" else 0  # BDF2 needs the state before.
         rest = simulator.rest_positions
-        self.failure = (1e3 * FURTHEST * float((rest.amax(0) - rest.amin(0)).max())) ** 2  # of a window [mm^2]
+        self.failure = (
+            1e3 * DIVERGENCE_DISTANCE * float((rest.amax(0) - rest.amin(0)).max())
+        ) ** 2  # of a window [mm^2]
 
-    def side_by_side(self, motions: Sequence[RefinementBatch]) -> Windows:
-        """Windows that cover the trials, but for what is left over at their ends or not seen at all."""
-        found = []
+    def consecutive(self, motions: Sequence[RefinementBatch]) -> Windows:
+        """Consecutive windows over all trials, without incomplete ones and those in which nothing was seen."""
+        windows = []
         for number, motion in enumerate(motions):
             frames = motion.q.shape[1]
             start = torch.arange(self._first_frame, frames - self._window, self._window)
@@ -120,12 +122,12 @@ class WindowLoss:
             span = frame[:, None] + torch.arange(1, self._window + 1)
             seen = torch.isfinite(motion.target.cpu()[trial[:, None], span]).all(-1).flatten(1).any(1)
             known = torch.isfinite(motion.q.cpu()[trial, frame]).flatten(1).all(1)
-            found.append([x[seen & known] for x in (torch.full_like(trial, number), trial, frame)])
-        return Windows(*(torch.cat(each) for each in zip(*found, strict=True)))
+            windows.append([x[seen & known] for x in (torch.full_like(trial, number), trial, frame)])
+        return Windows(*(torch.cat(parts) for parts in zip(*windows, strict=True)))
 
     @torch.no_grad()
     def measure(self, windows: Windows, motions: Sequence[RefinementBatch]) -> tuple[float, torch.Tensor]:
-        """Mean squared distance [mm^2] of the windows that can be simulated, and (W,) bool: which of them cannot."""
+        """Returns the mean squared distance of the windows that do not fail [mm^2], and which fail, (W,) bool."""
         simulator = self._make_simulator()
         lost = torch.zeros(len(windows), dtype=torch.bool)
         squares: list[torch.Tensor] = []
@@ -135,37 +137,37 @@ class WindowLoss:
         return float(torch.cat(squares).mean()), lost
 
     def backward(self, windows: Windows, motions: Sequence[RefinementBatch], unit: float) -> float:
-        """Mean squared distance in a unit [mm^2]; adds its gradient to those of the weights.
+        """Returns the mean squared distance relative to a unit [mm^2]; adds its gradient to those of the weights.
 
-        A window that cannot be simulated counts as `FURTHEST` body lengths, without a gradient.
+        The distance of a failed window is `DIVERGENCE_DISTANCE` body lengths, without a gradient.
         """
         simulator = self._make_simulator()
-        total, each = 0.0, 1.0 / (unit * len(windows))
+        total, weight = 0.0, 1.0 / (unit * len(windows))
         for part in self._parts(windows):
             squares, lost = self._distances(simulator, windows.pick(part), motions)
             failed = int(lost.sum())
             if len(squares):
                 try:
-                    torch.autograd.backward(each * squares.sum())
-                except ConvergenceError:  # A state without a gradient is no place for the optimiser to be.
+                    torch.autograd.backward(weight * squares.sum())
+                except ConvergenceError:  # The adjoint fails: these weights count as failed.
                     squares, failed = squares[:0], len(part)
-            total += each * (float(squares.detach().sum()) + failed * self.failure)
+            total += weight * (float(squares.detach().sum()) + failed * self.failure)
         return total
 
-    def _remembered(self, simulator: Simulator, motion: RefinementBatch) -> dict[str, torch.Tensor]:
-        """Returns the memory of the energies where the windows of a motion start, by name, each (R, W, ...).
+    def _memory(self, simulator: Simulator, motion: RefinementBatch) -> dict[str, torch.Tensor]:
+        """Returns the internal variables of the energies at the start of all windows, by name, (R, W, ...).
 
-        It goes through every state of the motion from the first known one on, in which the body has been at rest for
-        long; while none is known, the body stands still. Empty where nothing is remembered.
+        They are updated through every state of the motion, from rest in the first known state on; an unknown state is
+        taken to equal the one before. Empty for energies without internal variables.
         """
         if id(motion) not in self._memories:
-            constants, *_ = Replay(simulator, self._observe, motion.trials).setting(self._parameters)
+            constants, *_ = Replay(simulator, self._observe, motion.trials).prepare(self._parameters)
             memories, state = list[Mapping[str, torch.Tensor]](), simulator.rest_state(len(motion.q))
             began = torch.zeros(state.batch, dtype=torch.bool, device=state.q.device)
             for frame in range(motion.q.shape[1]):
                 q = motion.q[:, frame]
                 known = torch.isfinite(q).flatten(1).all(1)
-                before = torch.where((known & ~began)[:, None, None], q, state.q)  # at rest where it is first known
+                before = torch.where((known & ~began)[:, None, None], q, state.q)  # at rest in the first known state
                 q, began = torch.where(known[:, None, None], q, before), began | known
                 with torch.no_grad():
                     state = simulator.remember(replace(state, q=before), q, constants)
@@ -178,19 +180,19 @@ class WindowLoss:
         return self._memories[id(motion)][1]
 
     def _parts(self, windows: Windows) -> list[torch.Tensor]:
-        """Numbers of windows that are simulated at once: of one motion each."""
-        found = []
+        """Indices of the windows that are simulated at once, which belong to one motion."""
+        parts = list[torch.Tensor]()
         for motion in windows.motion.unique().tolist():
-            found += (windows.motion == motion).nonzero()[:, 0].split(self._batch_size)
-        return found
+            parts += (windows.motion == motion).nonzero()[:, 0].split(self._batch_size)
+        return parts
 
     def _distances(
         self, simulator: Simulator, windows: Windows, motions: Sequence[RefinementBatch]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(U,) mean squared distances [mm^2] of the windows that can be simulated, and (W,) bool: which cannot.
+        """Returns mean squared distances (U,) of the windows that do not fail [mm^2], and which fail, (W,) bool.
 
-        Where some fail, the others are simulated again beside copies of each other, so that neither their states nor
-        their gradients meet a number that is not finite.
+        After a failure, the other windows are simulated again, with copies of them in place of the failed ones, so that
+        their states and gradients stay finite.
         """
         batch, motion = len(windows), motions[int(windows.motion[0])]
         whole = torch.arange(batch)
@@ -208,22 +210,21 @@ class WindowLoss:
     def _roll_out(
         self, simulator: Simulator, windows: Windows, motion: RefinementBatch
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(W,) mean squared distances [mm^2], and (W,) bool: which windows failed."""
+        """Returns mean squared distances (W,) [mm^2], and which windows failed, (W,) bool."""
         run, frame = windows.trial, windows.frame
         previous = None
         if self._first_frame:
             previous = (motion.q[run, frame - 1], motion.v[run, frame - 1])
         start = (frame - self._first_frame) // self._window
-        memory = {name: values[run, start] for name, values in self._remembered(simulator, motion).items()}
+        memory = {name: values[run, start] for name, values in self._memory(simulator, motion).items()}
         state = State(motion.q[run, frame], motion.v[run, frame], previous, memory)
-        constants, inputs, _ = Replay(simulator, self._observe, motion.trials.select(run.tolist())).setting(
+        constants, inputs, _ = Replay(simulator, self._observe, motion.trials.select(run.tolist())).prepare(
             self._parameters
         )
-        told = None if motion.told is None else _during(motion.told.index_select(-2, run), frame, self._window)
+        context = None if motion.context is None else _during(motion.context.index_select(-2, run), frame, self._window)
         base = None if motion.base is None else motion.base.during(run, frame, self._window)
-        predict = LearnedPredictor(self._model, told, self._range, self._frames, base)
-        acting = inputs.window(frame, self._window)
-        rollout = Rollout(simulator, predict, acting, constants)
+        predict = LearnedPredictor(self._model, context, self._range, self._frames, base)
+        rollout = Rollout(simulator, predict, inputs.window(frame, self._window), constants)
         squares = state.q.new_zeros(len(windows))
         for step in range(1, self._window + 1):
             state = rollout.differentiable_step(state)
@@ -235,7 +236,7 @@ class WindowLoss:
 
 
 def _during(series: torch.Tensor, first: torch.Tensor, steps: int) -> torch.Tensor:
-    """(k, W, A) what (K, W, A) series are during k steps, each from its own first one; (W, A) stays as it is."""
+    """Returns k steps (k, W, A) of series (K, W, A), from a first step for each; a constant (W, A) as it is."""
     if series.ndim == 2:
         return series
     at = (first + torch.arange(steps)[:, None]).clamp_max(len(series) - 1).to(series.device)
@@ -245,12 +246,12 @@ def _during(series: torch.Tensor, first: torch.Tensor, steps: int) -> torch.Tens
 class SolverInTheLoop(FullBatchTrainer):
     """Minimises the squared distance from the target over windows of k steps, by L-BFGS.
 
-    The windows lie side by side over the trajectories: the loss is one smooth function of the weights. Losses are mean
-    squared distances of vertices [mm^2].
+    The windows are consecutive pieces of the trajectories, so that the loss is one smooth function of the weights.
+    Losses are mean squared distances [mm^2].
 
-    The weights that it starts from are the first candidate: what is kept is never worse on the validation split. The
-    history starts with their record, of epoch 0. Windows that fail with them are left out; a step of the optimiser with
-    which another one fails costs so much that the line search goes back.
+    The initial weights are the first candidate, so that the result is never worse on the validation split. The history
+    starts with their record, of epoch 0. Windows that fail with them are left out. If another window fails in a step of
+    the optimiser, its large loss makes the line search step back.
 
     Args:
         model: to refine.
@@ -274,7 +275,7 @@ class SolverInTheLoop(FullBatchTrainer):
     ) -> None:
         super().__init__(model, rollout_error, settings)
         self._loss, self._train, self._validation = loss, train, validation
-        self._windows = loss.side_by_side(train)
+        self._windows = loss.consecutive(train)
 
     @override
     def _run_epoch(self) -> dict[str, float]:
@@ -283,7 +284,7 @@ class SolverInTheLoop(FullBatchTrainer):
         return {"train_loss": self._iterate() * self._unit, **self._validate()}
 
     def _begin(self) -> None:
-        """Leaves out the windows that cannot be simulated, and measures the weights that refinement starts from."""
+        """Leaves out the windows that fail, and records the errors of the initial weights."""
         loss, lost = self._loss.measure(self._windows, self._train)
         if bool(lost.all()):
             raise InputError(
@@ -297,12 +298,12 @@ class SolverInTheLoop(FullBatchTrainer):
 
     def _validate(self) -> dict[str, float]:
         """Loss on the validation split; infinite where the simulator fails in a window."""
-        loss, lost = self._loss.measure(self._loss.side_by_side(self._validation), self._validation)
+        loss, lost = self._loss.measure(self._loss.consecutive(self._validation), self._validation)
         return {"validation_loss": math.inf if bool(lost.any()) else loss}
 
     @property
     def _unit(self) -> float:
-        """The first loss [mm^2], which makes one of what the optimiser sees."""
+        """The first loss [mm^2], by which the optimiser's loss is divided."""
         return max(self.state.history[0]["train_loss"], _SMALLEST_UNIT)
 
     @override

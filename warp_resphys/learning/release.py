@@ -1,9 +1,9 @@
-"""How an observed motion begins: the body that is held, and how it was let go.
+"""Initial conditions of a motion that starts by releasing a held body.
 
-The body is at rest under gravity, its weights and a virtual force that brings its markers to where they were held
-(the published method finds such forces by steps through time; a static equilibrium has none to wait for). The hand lets
-go between two frames, and not without a push, of a body that it may have bent sideways: the delay, a velocity in a few
-slow modes, and a sideways displacement are what best explains the first frames.
+Before the release, the body is at rest under gravity, its weights and a virtual force that brings its markers to their
+held positions (the published method finds such forces by time steps; here it is one static equilibrium). The release
+happens between two frames, may push the body, and the body may have been bent sideways: the delay, a velocity in a few
+slow modes, and a sideways displacement are estimated from the first frames.
 """
 
 import numpy as np
@@ -23,19 +23,19 @@ from .replay import Replay, Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
-_SIDEWAYS_STRAIN = 1e-3  # of the body's extent: how far it is bent to find how it bends
-_DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # that the search begins at, in expected deviations
+_SIDEWAYS_STRAIN = 1e-3  # of the body's extent: size of the displacement from which its bending shapes are computed
+_DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts of the search, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
 def estimate_release(simulator: Simulator, markers: Observation, motions: Trials, settings: ReleaseSettings) -> Start:
-    """The beginning of every motion, as this simulator would have it.
+    """Returns the start of every motion, estimated with a simulator.
 
     Args:
         simulator: of the body.
-        markers: (B, N, 3) positions of the vertices to (B, M, 3) markers [m].
-        motions: what was observed.
+        markers: maps positions of the vertices (B, N, 3) to markers (B, M, 3) [m].
+        motions: observed trials.
         settings: see the class.
 
     Raises:
@@ -47,33 +47,33 @@ def estimate_release(simulator: Simulator, markers: Observation, motions: Trials
 
 
 def hold(replay: Replay, modes: int) -> torch.Tensor:
-    """(R, N, 3) positions at rest under gravity, weights and the virtual force that holds the markers best [m].
+    """Positions (R, N, 3) at rest under gravity, weights and the virtual force that fits the held markers best [m].
 
     Args:
-        replay: of the trials, which tell where the markers were held.
-        modes: columns of B (see `_Held`), the inertial forces of the slowest vibrations.
+        replay: of the trials, with their held markers.
+        modes: number of columns of B (see `_HoldProblem`), the inertial forces of the slowest vibrations.
 
     Raises:
         ConvergenceError: no equilibrium was found.
     """
     if modes == 0:
         with torch.no_grad():
-            constants, _, resting = replay.setting()
+            constants, _, resting = replay.prepare()
             return replay.simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names)).q
-    problem = _Held(replay, modes)
+    problem = _HoldProblem(replay, modes)
     return minimise(problem, problem.straight, _HOLD_TOLERANCE, _HOLD_ITERATIONS).point.kept[0]
 
 
-class _Held(Problem):
-    """|m(q(a)) - y|^2 + w |a|^2 over a (R, modes), q(a) being the equilibrium under the force B a.
+class _HoldProblem(Problem):
+    """|m(q(a)) - y|^2 + w |a|^2 over a (R, modes), with q(a) the equilibrium under the force B a.
 
-    The weight w is so small that it only keeps what no marker sees from moving. A point keeps the positions (R, N, 3),
-    what is missing to where the markers were held (R, 3 M), and its derivative (R, 3 M, modes) [m].
+    The weight w is so small that it only determines what the markers do not. A point keeps the positions (R, N, 3), the
+    residual of the held markers (R, 3 M), and its derivative (R, 3 M, modes) [m].
     """
 
     def __init__(self, replay: Replay, modes: int) -> None:
         with torch.no_grad():
-            self._constants, _, self._resting = replay.setting()
+            self._constants, _, self._resting = replay.prepare()
         self._replay, self._basis = replay, vibration_modes(replay.simulator, modes)
         count = len(replay.trials.names)
         self._near, none = replay.simulator.rest_state(count).q, self._basis.new_zeros(count, modes)
@@ -82,15 +82,15 @@ class _Held(Problem):
         self._weight = _HOLD_WEIGHT * kept[2].square().sum(1).amax(1)[:, None]
 
     def _equilibrium(self, a: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """What a point keeps."""
+        """Returns the values that a point keeps."""
         target = self._replay.trials.held
         with torch.enable_grad():
             a = a.detach().requires_grad_()
             acting = self._resting.plus((a @ self._basis.mT).unflatten(1, (-1, 3)))
             q = self._replay.simulator.static_equilibrium(acting, self._constants, start=self._near).q
-            missing = torch.where(torch.isfinite(target), target - self._replay.observe(q), 0.0).flatten(1)
-            rows = [torch.autograd.grad(each.sum(), a, retain_graph=True)[0] for each in missing.unbind(1)]
-        return q.detach(), missing.detach(), torch.stack(rows, 1)
+            residual = torch.where(torch.isfinite(target), target - self._replay.observe(q), 0.0).flatten(1)
+            rows = [torch.autograd.grad(entry.sum(), a, retain_graph=True)[0] for entry in residual.unbind(1)]
+        return q.detach(), residual.detach(), torch.stack(rows, 1)
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
@@ -102,9 +102,9 @@ class _Held(Problem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        self._near, missing, slope = point.kept
+        self._near, residual, slope = point.kept
         matrix = slope.mT @ slope + torch.diag_embed(self._weight.expand_as(point.x))
-        right = -(slope.mT @ missing[..., None])[..., 0] - self._weight * point.x
+        right = -(slope.mT @ residual[..., None])[..., 0] - self._weight * point.x
         return lambda damping: point.x + torch.linalg.solve(damped(matrix, damping), right)
 
     @override
@@ -115,10 +115,10 @@ class _Held(Problem):
 def _initial_motion(
     simulator: Simulator, markers: Observation, motions: Trials, held: Start, settings: ReleaseSettings
 ) -> Start:
-    """What explains the first frames (`_ReleaseModel`).
+    """Returns the starts with the smallest error in the first frames (`_ReleaseModel`).
 
-    A frame before the release sees the body at rest and one after it does not, so that the objective has a kink at the
-    delay of every frame, and minima between them: several delays are tried, and the best one is kept.
+    The body is at rest in frames before the release and moves in those after it, so that the objective has a kink where
+    the delay equals the time of a frame, and minima in between: the search starts at several delays.
     """
     model = _ReleaseModel(simulator, markers, held, settings)
     count, unknowns = len(motions.names), len(model.deviation)
@@ -128,19 +128,19 @@ def _initial_motion(
     start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
     copies = motions.select(list(range(count)) * len(delays) * (1 + unknowns))
     problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise)
-    found = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, settings.iterations).point
-    chosen = found.value.view(-1, count).argmin(0)
-    return model(found.x.view(-1, count, unknowns)[chosen, torch.arange(count, device=chosen.device)])
+    solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, settings.iterations).point
+    best = solution.value.view(-1, count).argmin(0)
+    return model(solution.x.view(-1, count, unknowns)[best, torch.arange(count, device=best.device)])
 
 
 class _FirstFrames(Problem):
-    """Distances of simulated from observed frames in units of their noise, over releases in their deviations.
+    """Squared error of the first frames over their noise, as a function of releases in expected deviations.
 
-    A point keeps J^T J + 1 and the gradient, J by differences over a batch.
+    A point keeps J^T J + 1 and the gradient, with J from finite differences in one batch.
 
     Args:
-        replay: of 1 + P copies of the trials for the P unknowns.
-        model: of unknowns to releases.
+        replay: of 1 + P copies of the trials, for P unknowns.
+        model: maps unknowns to releases.
         noise: see `ReleaseSettings` [m].
     """
 
@@ -174,13 +174,13 @@ class _FirstFrames(Problem):
 
 
 class _ReleaseModel:
-    """Releases of given delays, velocities and sideways displacements, each in units of its expected deviation.
+    """Maps delays, velocities and sideways displacements, in expected deviations, to releases.
 
     Args:
         simulator: of the body.
-        markers: positions of the vertices to markers.
-        held: the release at the time of the frames, at rest, of a body that is held undeformed.
-        settings: tell what is looked for.
+        markers: maps positions of the vertices to markers.
+        held: release without delay, from rest in the held positions.
+        settings: which unknowns there are, and their expected deviations.
     """
 
     def __init__(self, simulator: Simulator, markers: Observation, held: Start, settings: ReleaseSettings) -> None:
@@ -193,7 +193,7 @@ class _ReleaseModel:
         self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
 
     def __call__(self, values: torch.Tensor) -> Start:
-        """The releases of (k R, unknowns) values, the R motions running fastest."""
+        """Returns the releases for values (k R, unknowns); the R motions run fastest."""
         delay, speeds, bends = (values * self.deviation).split(self._sizes, 1)
         repeats = len(values) // len(self._held.delay)
         held = self._held.state.q.repeat(repeats, 1, 1)
@@ -203,10 +203,10 @@ class _ReleaseModel:
 
 
 def sideways_shapes(simulator: Simulator) -> torch.Tensor:
-    """(1 or 2, N, 3) displacements by accelerations across gravity, about rest, each with its furthest vertex at one.
+    """Displacements (1 or 2, N, 3) from rest by accelerations perpendicular to gravity, scaled to a maximum of one.
 
-    Of the two directions the stiffer one is left out if it bends the body less than half as far: what little it moves
-    may well be along gravity. Weights that hang on the body take no part.
+    The stiffer of the two directions is left out if it bends the body less than half as far, as its displacement may be
+    along gravity. Weights that hang on the body are ignored.
     """
     directions = torch.linalg.svd(simulator.tensor(simulator.gravity)[None])[2][1:]
     extent = float((simulator.rest_positions.amax(0) - simulator.rest_positions.amin(0)).max())
@@ -214,11 +214,11 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
     with torch.no_grad():
         weightless = simulator.prepare({"gravity": torch.zeros_like(directions)})
         mass = weightless.mass - simulator.tensor(simulator.body.attached_mass)
-        for _ in range(3):  # Small enough for a linear answer, and well above rounding, however stiff the body is.
+        for _ in range(3):  # Scale to a displacement in the linear range, far above rounding, for any stiffness.
             load = size * mass[..., None] * directions[:, None]
             bent = simulator.static_equilibrium(Inputs(load), weightless).q - simulator.rest_positions
             size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
-    # From the softest direction to the stiffest; a hundredth of difference is within what the solver leaves.
+    # From the softest direction to the stiffest; a relative difference below 0.01 is within the solver's tolerance.
     _, sizes, rows = np.linalg.svd(bent.flatten(1).double().cpu().numpy(), full_matrices=False)
     columns = with_signs(resolved(sizes, rows.T, simulator.body.mesh.vertices, 0.01 * sizes))
     shapes = simulator.tensor(columns.T).unflatten(1, (-1, 3))
@@ -228,7 +228,7 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
 
 
 def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:
-    """(modes, N, 3) shapes of the slowest vibrations, each with its fastest vertex at one."""
+    """Shapes (modes, N, 3) of the slowest vibrations, scaled to a maximum of one."""
     if modes == 0:
         return simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
     inertial = vibration_modes(simulator, modes).mT.unflatten(1, (-1, 3))

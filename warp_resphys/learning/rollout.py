@@ -1,4 +1,4 @@
-"""Closed loop: a simulator, a model or both, rolled out from their own states."""
+"""Closed-loop roll-outs of a simulator, a model or both."""
 
 from collections.abc import Callable
 
@@ -8,26 +8,26 @@ from ..dynamics.simulator import Constants, Simulator
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 
-FURTHEST = 10.0  # No robot moves ten times its own length from its clamp; a roll-out that does has diverged.
+DIVERGENCE_DISTANCE = 10.0  # body lengths from rest beyond which a roll-out has diverged
 
-# Of a state and the number of the step: a residual force (B, N, 3) [N] to add to the simulator, or the next state.
+# Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state.
 Predictor = Callable[[State, int], torch.Tensor | State]
 
 
 class Rollout:
-    """Steps a batch, and keeps an eye on environments that diverge.
+    """Steps a batch and detects environments that diverge.
 
-    An environment in which a step fails, or a vertex of which is further than `FURTHEST` body lengths from its rest
-    position, has diverged: from then on it stands at rest, and is reported as lost.
+    An environment has diverged when a step fails or a vertex is further than `DIVERGENCE_DISTANCE` body lengths from
+    its rest position: from then on it stands at rest and is reported as lost.
 
     Args:
-        simulator: one whose solver settings count failures rather than raise them.
-        predict: see `Predictor`; None for the simulator as it is. One that gives the next state replaces it.
-        inputs: what acts on the batch, from the first step on.
-        constants: other ones than the simulator's.
+        simulator: its solver settings must count failures rather than raise them.
+        predict: residual force or, in place of the simulator, next state; None for the simulator alone.
+        inputs: of the batch, from the first step on.
+        constants: in place of the simulator's own.
 
     Attributes:
-        done: steps that were made.
+        done: number of steps made.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Rollout:
         self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
 
     def resume(self, lost: torch.Tensor, done: int) -> None:
-        """Goes on after so many steps, in which environments (B,) were lost."""
+        """Continues after a number of steps, in which environments (B,) were lost."""
         self._lost, self.done = lost, done
 
     @torch.no_grad()
@@ -59,19 +59,19 @@ class Rollout:
         new, failed = self._advance(state, lost)
         self.done += 1
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
-        self._lost = lost | failed | ~(distance < FURTHEST * self._length)
+        self._lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
         return self._reset(new, self._lost) if bool(self._lost.any()) else new
 
     def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
-        """The next state, and which environments (B,) failed."""
+        """Returns the next state, and which environments (B,) failed."""
         inputs, force, failed = self._inputs.at(self.done), None, lost
         if self._predict is not None:
-            given = self._predict(state, self.done)
-            if isinstance(given, State):
-                return given, lost
-            failed = lost | ~torch.isfinite(given).flatten(1).all(1)
-            force = torch.where(failed[:, None, None], 0.0, given)
-        if bool(failed.any()):  # An environment that is lost stands at rest: nothing must drive it on.
+            predicted = self._predict(state, self.done)
+            if isinstance(predicted, State):
+                return predicted, lost
+            failed = lost | ~torch.isfinite(predicted).flatten(1).all(1)
+            force = torch.where(failed[:, None, None], 0.0, predicted)
+        if bool(failed.any()):  # Lost environments stand at rest, without inputs.
             rest = self._rest[self.simulator.fixed]
             idle = {name: torch.where(failed[:, None], 0.0, value) for name, value in inputs.actuation.items()}
             if inputs.fixed_positions is not None:
@@ -81,26 +81,26 @@ class Rollout:
         return new, failed | ~report.converged
 
     def _reset(self, state: State, lost: torch.Tensor) -> State:
-        """The state with its lost environments at rest."""
+        """Returns the state with its lost environments at rest."""
         rest = dict.fromkeys(("q", "previous_q"), self._rest)
 
-        def put(name: str, value: torch.Tensor) -> torch.Tensor:
+        def masked(name: str, value: torch.Tensor) -> torch.Tensor:
             where = lost.view(-1, *[1] * (value.ndim - 1))
             return torch.where(where, rest.get(name, value.new_zeros(())), value)
 
-        return State.from_tensors({name: put(name, value) for name, value in state.tensors().items()})
+        return State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
 
     def lost(self, state: State) -> torch.Tensor:
-        """(B,) bool, environments that have diverged."""
+        """Which environments have diverged, (B,) bool."""
         return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if self._lost is None else self._lost
 
     def positions(self, state: State) -> torch.Tensor:
-        """(B, N, 3) positions of the last state, NaN where lost [m]."""
+        """Positions (B, N, 3) of a state, NaN in lost environments [m]."""
         return state.q if self._lost is None else torch.where(self._lost[:, None, None], torch.nan, state.q)
 
 
 def closed_loop(rollout: Rollout, start: State, steps: int) -> torch.Tensor:
-    """(B, T + 1, N, 3) positions of a roll-out [m]; NaN from where an environment diverged."""
+    """Returns positions (B, T + 1, N, 3) of a roll-out [m]; NaN from the step where an environment diverged."""
     positions, state = [start.q], start
     for _ in range(steps):
         state = rollout.step(state)

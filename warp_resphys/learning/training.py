@@ -1,4 +1,4 @@
-"""Supervised training of a model, chosen by its roll-outs or, as published, by its validation loss."""
+"""Supervised training of a model, with weights selected by roll-out error or, as published, by validation loss."""
 
 import copy
 import math
@@ -20,27 +20,27 @@ SELECTIONS = ("rollout", "validation_loss")
 
 @dataclass(frozen=True)
 class Samples:
-    """States and the fields that belong to them."""
+    """States and the fields to predict from them."""
 
     q: torch.Tensor  # (S, N, 3) positions [m]
     v: torch.Tensor  # (S, N, 3) velocities [m/s]
-    outputs: tuple[torch.Tensor, ...]  # the fields, each (S, N, 3)
-    actuation: torch.Tensor | None = None  # (S, A) what else acts on the body; None if nothing does
-    lengths: tuple[int, ...] = ()  # of the series that the samples are, one after the other, if they are
+    outputs: tuple[torch.Tensor, ...]  # fields to predict, (S, N, 3) each
+    actuation: torch.Tensor | None = None  # (S, A) further inputs of the network; None without any
+    lengths: tuple[int, ...] = ()  # of the time series that the samples consist of, one after the other
 
 
 @dataclass
 class TrainingState:
-    """All that training goes on from."""
+    """Progress of a training."""
 
     epoch: int = 0  # epochs done
-    # one record an epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and
-    # ``rollout_error_mm`` where it was measured; infinite where a roll-out diverged
+    # one record for each epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and where measured
+    # ``rollout_error_mm``, infinite where a roll-out diverged
     history: list[dict[str, float]] = field(default_factory=list)
-    # smallest so far of what weights are selected by, a roll-out error [mm] or a validation loss
+    # smallest value so far of the selection criterion, a roll-out error [mm] or a validation loss
     best_score: float = math.inf
-    best_epoch: int = 0  # after which it was reached
-    best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights that had it
+    best_epoch: int = 0  # epoch of the best score
+    best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights of the best score
 
 
 class EpochTrainer(ABC, Generic[Model]):
@@ -48,7 +48,7 @@ class EpochTrainer(ABC, Generic[Model]):
 
     Args:
         model: to train.
-        optimiser: of its network's weights.
+        optimiser: of the network's weights.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
         settings: number of epochs, and how often the roll-out error is measured.
     """
@@ -67,7 +67,7 @@ class EpochTrainer(ABC, Generic[Model]):
 
     @abstractmethod
     def _run_epoch(self) -> dict[str, float]:
-        """Trains for one epoch; returns what its record says of the losses."""
+        """Trains for one epoch; returns the losses for its record."""
 
     @property
     def finished(self) -> bool:
@@ -75,7 +75,7 @@ class EpochTrainer(ABC, Generic[Model]):
         return self.state.epoch >= self.settings.epochs
 
     def run_epoch(self) -> dict[str, float]:
-        """One epoch; returns its record."""
+        """Trains for one epoch and returns its record."""
         losses = self._run_epoch()
         self.state.epoch += 1
         record = {"epoch": float(self.state.epoch), **losses}
@@ -85,7 +85,7 @@ class EpochTrainer(ABC, Generic[Model]):
         return record
 
     def _keep(self, record: dict[str, float]) -> None:
-        """Adds to the history; keeps the weights if they are the best so far, or the first that could be compared."""
+        """Adds a record to the history, and keeps the weights if their score is the first or the best so far."""
         self.state.history.append(record)
         score = record.get("rollout_error_mm" if self.selection == "rollout" else self.selection)
         if score is not None and (score < self.state.best_score or not self.state.best):
@@ -93,16 +93,16 @@ class EpochTrainer(ABC, Generic[Model]):
             self.state.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
 
     def _kept_record(self) -> dict[str, float]:
-        """The record of the epoch whose weights are kept."""
+        """Record of the epoch whose weights are kept."""
         return next(record for record in self.state.history if record["epoch"] == self.state.best_epoch)
 
     @property
     def best_error(self) -> float:
-        """Roll-out error of the kept weights [mm]; infinite where one diverged, NaN where none was measured yet."""
+        """Roll-out error of the kept weights [mm]; infinite if one diverged, NaN before the first measurement."""
         return self._kept_record().get("rollout_error_mm", math.nan) if self.state.best else math.nan
 
     def use_best(self) -> Model:
-        """The model with the weights that are kept; completes the history by their roll-out error."""
+        """Returns the model with the kept weights; adds their roll-out error to the history if missing."""
         self.model.network.load_state_dict(self.state.best)
         self.model.eval()
         record = self._kept_record()
@@ -111,7 +111,7 @@ class EpochTrainer(ABC, Generic[Model]):
         return self.model
 
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Tensors and metadata from which `resume` goes on exactly."""
+        """Returns tensors and metadata for `resume`."""
         tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
         tensors |= {f"best.{k}": t for k, t in self.state.best.items()}
         numbers: dict[str, Any] = {}
@@ -122,7 +122,7 @@ class EpochTrainer(ABC, Generic[Model]):
                     tensors[f"optimiser.{name}"] = value
                 elif not isinstance(value, list):
                     numbers[name] = value
-                elif key != "al":  # Scratch of L-BFGS.
+                elif key != "al":  # Scratch memory of L-BFGS.
                     numbers[name] = []
                     tensors |= {f"optimiser.{name}.{k:04d}": t for k, t in enumerate(value)}
         return tensors, {
@@ -134,26 +134,26 @@ class EpochTrainer(ABC, Generic[Model]):
         }
 
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
-        """Goes on from a `snapshot`."""
-        self.model.load_state_dict(part_of(tensors, "model."))
+        """Continues exactly from a `snapshot`."""
+        self.model.load_state_dict(with_prefix(tensors, "model."))
         done = {key: metadata[key] for key in ("epoch", "history", "best_score", "best_epoch")}
-        self.state = TrainingState(**copy.deepcopy(done), best=part_of(tensors, "best."))
+        self.state = TrainingState(**copy.deepcopy(done), best=with_prefix(tensors, "best."))
         slots: dict[int, dict[str, Any]] = {}
         for name, value in metadata["optimiser"].items():
             index, key = name.split(".")
             slots.setdefault(int(index), {})[key] = list(value) if isinstance(value, list) else value
-        for name, tensor in sorted(part_of(tensors, "optimiser.").items()):
-            index, key, *place = name.split(".")
+        for name, tensor in sorted(with_prefix(tensors, "optimiser.").items()):
+            index, key, *position = name.split(".")
             slot = slots.setdefault(int(index), {})
-            slot[key] = [*slot[key], tensor] if place else tensor
+            slot[key] = [*slot[key], tensor] if position else tensor
         self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
 
 class Trainer(EpochTrainer[Model]):
     """Minimises the mean squared error of the standardised outputs by Adam.
 
-    The weights that are kept have the smallest roll-out error on the validation split, measured every so many epochs,
-    or the smallest validation loss of all epochs. In either case `use_best` leaves their roll-out error in the history.
+    The kept weights have the smallest roll-out error on the validation split, measured every few epochs, or the
+    smallest validation loss. In both cases `use_best` records their roll-out error in the history.
 
     Args:
         model: to train; on the device of the samples.
@@ -197,7 +197,7 @@ class Trainer(EpochTrainer[Model]):
             self._weights = scale_weights(model, settings.scale_weight)
 
     def learning_rate(self, epoch: int) -> float:
-        """Cosine from the first to the final rate, or a factor gamma every so many epochs."""
+        """Learning rate of an epoch: cosine schedule, or steps by a factor gamma."""
         first, last = self.settings.learning_rate, self.settings.final_learning_rate
         if self.settings.schedule == "step":
             return float(first * self.settings.gamma ** (epoch // self.settings.step_epochs))
@@ -224,15 +224,15 @@ class Trainer(EpochTrainer[Model]):
         return {"train_loss": float(total) / count * unit, "validation_loss": validation, "learning_rate": rate}
 
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
-        """Yields the mean loss of each batch of one pass over the samples, and the number of samples in it."""
+        """Yields the mean loss and the number of samples of every batch in one epoch."""
         inputs, outputs = self._train
         order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
         for batch in order.split(self.settings.batch_size):
-            found, _ = self.model.standardised(self._noisy(inputs[batch]))
-            yield self._squares(found, outputs[batch]).mean(), len(batch)
+            predicted, _ = self.model.standardised(self._noisy(inputs[batch]))
+            yield self._squares(predicted, outputs[batch]).mean(), len(batch)
 
     def _validate(self) -> torch.Tensor:
-        """The mean validation loss."""
+        """Mean validation loss."""
         inputs, outputs = self._validation
         return self._squares(self.model.standardised(inputs)[0], outputs).mean()
 
@@ -241,9 +241,9 @@ class Trainer(EpochTrainer[Model]):
             return inputs
         return inputs + self.settings.noise * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
 
-    def _squares(self, found: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Weighted squared errors of the standardised outputs, in units of what the linear part leaves."""
-        return (self._weights * (found - outputs) / self.model.remainder).square()
+    def _squares(self, predicted: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
+        """Weighted squared errors of the standardised outputs, relative to the remainder of the linear part."""
+        return (self._weights * (predicted - outputs) / self.model.remainder).square()
 
     @override
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -257,16 +257,16 @@ class Trainer(EpochTrainer[Model]):
 
 
 class SequenceTrainer(Trainer[Model]):
-    """The same for a recurrent model, whose hidden state goes through the training trials.
+    """Trainer of a recurrent model, by truncated backpropagation through time.
 
-    All trials, series of samples, are run through side by side, in spans of ``sequence`` steps. A gradient reaches back
-    to the beginning of its span, the hidden state comes from before (truncated backpropagation through time).
+    All trials are a batch of series, in spans of ``sequence`` steps. The hidden state is passed from one span to the
+    next, without its gradient.
     """
 
     def __init__(self, model: Model, train: Samples, validation: Samples, *settings: Any) -> None:
         super().__init__(model, train, validation, *settings)
-        self._train_series = _side_by_side(*self._train, train.lengths)
-        self._validation_series = _side_by_side(*self._validation, validation.lengths)
+        self._train_series = _padded(*self._train, train.lengths)
+        self._validation_series = _padded(*self._validation, validation.lengths)
 
     @override
     def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
@@ -275,11 +275,11 @@ class SequenceTrainer(Trainer[Model]):
         assert self.settings.sequence is not None
         for span in torch.arange(len(inputs)).split(self.settings.sequence):
             count = float(inside[span].sum())
-            loss, hidden = self._through(self._noisy(inputs[span]), outputs[span], inside[span], hidden, count)
+            loss, hidden = self._series_loss(self._noisy(inputs[span]), outputs[span], inside[span], hidden, count)
             yield loss, count
             hidden = hidden.detach()
 
-    def _through(
+    def _series_loss(
         self,
         inputs: torch.Tensor,
         outputs: torch.Tensor,
@@ -287,33 +287,33 @@ class SequenceTrainer(Trainer[Model]):
         hidden: torch.Tensor | None,
         count: float,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Loss of (L, R, .) steps that are inside (L, R) of their trial, over a count; the hidden state at last."""
+        """Summed loss of (L, R, .) steps inside (L, R) of their trial over a count, and the last hidden state."""
         total = inputs.new_zeros(())
-        for x, y, known in zip(inputs, outputs, inside, strict=True):
-            found, hidden = self.model.standardised(x, hidden)
-            total = total + torch.where(known, self._squares(found, y).mean(1), 0.0).sum()
+        for x, y, valid in zip(inputs, outputs, inside, strict=True):
+            predicted, hidden = self.model.standardised(x, hidden)
+            total = total + torch.where(valid, self._squares(predicted, y).mean(1), 0.0).sum()
         assert hidden is not None
         return total / max(count, 1.0), hidden
 
     @override
     def _validate(self) -> torch.Tensor:
-        return self._through(*self._validation_series, None, float(self._validation_series[2].sum()))[0]
+        return self._series_loss(*self._validation_series, None, float(self._validation_series[2].sum()))[0]
 
 
-def _side_by_side(
+def _padded(
     inputs: torch.Tensor, outputs: torch.Tensor, lengths: Sequence[int]
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(K, R, .) inputs and outputs of R series, and (K, R) whether a step is one of its series."""
+    """Inputs and outputs (K, R, .) of R series, padded to one length, and whether a step is valid (K, R)."""
     parts = [torch.nn.utils.rnn.pad_sequence(list(x.split(list(lengths)))) for x in (inputs, outputs)]
     ends = torch.tensor(lengths, device=inputs.device)
     return parts[0], parts[1], torch.arange(len(parts[0]), device=inputs.device)[:, None] < ends
 
 
 def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
-    """(n_out,) weights of the standardised outputs in the loss: their deviations to a power, mean square one a field.
+    """Weights (n_out,) of the standardised outputs in the loss: powers of their deviations, mean square one in a field.
 
-    Standardised outputs are all alike to a loss. With the power one it is the squared error of the fields themselves,
-    where a few modes hold nearly everything; a half lets the small ones be learned too.
+    With exponent zero, all modes have equal weight. With exponent one, the loss is the squared error of the fields
+    themselves, which a few modes dominate; with a half, small modes are learned too.
     """
     weights = []
     for coder in model.coders:
@@ -322,6 +322,6 @@ def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
     return torch.cat(weights).to(model.linear.dtype)
 
 
-def part_of(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    """Those whose names start so, without that start."""
+def with_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    """Returns the tensors whose names start with a prefix, without the prefix."""
     return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}

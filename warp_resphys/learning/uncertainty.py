@@ -1,8 +1,8 @@
 """Uncertainty of identified parameters, from the residuals and their derivatives at the minimum (Gauss-Newton).
 
-The covariance is (J^T J)^-1 (sum_r S_r) (J^T J)^-1. S_r is that of the gradient J_r^T e of a trial whose errors e are
-as large as its residuals, and as correlated in time, up to the first zero of their autocorrelation (Newey and West
-1987, with the same correlation for all coordinates). The priors count as one more trial, with independent errors.
+The covariance is (J^T J)^-1 (sum_r S_r) (J^T J)^-1, with S_r the covariance of a trial's gradient J_r^T e. Its errors e
+are as large as its residuals and as correlated in time, up to the first zero of their autocorrelation (Newey and West
+1987, with one autocorrelation for all coordinates). The priors count as one more trial, with independent errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,11 +22,11 @@ Linearised = tuple[FloatArray, FloatArray, int]
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the data say about the parameters near the minimum (Gauss-Newton approximation)."""
+    """Uncertainty of the parameters near the minimum (Gauss-Newton approximation)."""
 
     deviation: dict[str, float]  # standard deviation of each parameter, in its unit
     correlation: list[list[float]]  # (P, P) of the parameters, in their order
-    # the direction that the data tell least about: weights of the parameters, in fractions of their ranges
+    # the least certain direction: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
     poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
 
@@ -38,14 +38,14 @@ def uncertainty_of(
     bounds: Mapping[str, Bounds],
     unit: FloatArray,
 ) -> Uncertainty:
-    """The uncertainty of parameters at fractions (P,) of their ranges.
+    """Returns the uncertainty of P parameters at the minimum.
 
     Args:
-        trials: linearised there.
-        prior: (K, P) derivatives of the residuals of the priors.
-        prior_weight: their mean square.
-        bounds: the ranges, by parameter.
-        unit: the fractions.
+        trials: linearised at the minimum.
+        prior: (K, P) derivatives of the prior residuals.
+        prior_weight: mean square of the prior residuals.
+        bounds: range of each parameter.
+        unit: (P,) the minimum, in fractions of the ranges.
     """
     free = 1.0 - min(len(unit) / sum(seen for _, _, seen in trials), 0.5)
     scatter = [np.square(rows).sum() / (seen * free) * _scatter(rows, jacobian) for rows, jacobian, seen in trials]
@@ -55,7 +55,7 @@ def uncertainty_of(
     inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
     covariance = inverse @ np.sum(scatter, axis=0) @ inverse
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    slopes = [each.slope(u) for each, u in zip(bounds.values(), unit, strict=True)]
+    slopes = [range_.slope(u) for range_, u in zip(bounds.values(), unit, strict=True)]
     poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
     return Uncertainty(
         deviation=dict(zip(bounds, (deviation * slopes).tolist(), strict=True)),
@@ -66,7 +66,7 @@ def uncertainty_of(
 
 
 def _autocorrelation(series: FloatArray) -> list[float]:
-    """That of (T, C) values at the lags of 1, 2, ... frames, up to its first zero."""
+    """Autocorrelation of (T, C) values at lags of 1, 2, ... frames, up to its first zero."""
     products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
     if not products or products[0] <= 0.0:
         return []
@@ -74,21 +74,21 @@ def _autocorrelation(series: FloatArray) -> list[float]:
 
 
 def redundancy(series: FloatArray) -> float:
-    """Number of frames of a series (T, C) that weigh as much as one independent frame."""
+    """Number of correlated frames of a series (T, C) with as much information as one independent frame."""
     return 1.0 + 2.0 * sum(_autocorrelation(series))
 
 
 def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """(P, P) the covariance of J^T e for errors e of unit size that are as correlated in time as the residuals.
+    """(P, P) covariance of J^T e, for errors e of unit variance that are as correlated in time as the residuals.
 
     Args:
         rows: (T, C) the residuals.
         jacobian: (T C, P) J.
     """
     slopes = jacobian.reshape(*rows.shape, -1)
-    found = np.einsum("tcp,tcq->pq", slopes, slopes)
-    for lag, share in enumerate(_autocorrelation(rows), 1):
-        across = share * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
-        found += across + across.T
-    values, vectors = np.linalg.eigh(found)  # Cut off at a zero, a correlation may leave something negative.
+    covariance = np.einsum("tcp,tcq->pq", slopes, slopes)
+    for lag, correlation in enumerate(_autocorrelation(rows), 1):
+        lagged = correlation * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
+        covariance += lagged + lagged.T
+    values, vectors = np.linalg.eigh(covariance)  # A truncated autocorrelation may leave negative eigenvalues.
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -109,7 +109,7 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
     with torch.no_grad():
         replay = experiment.replay(simulator, [name], model)
         start = experiment.start(replay, model)
-        constants, _, resting = replay.setting(experiment.parameters(model))
+        constants, _, resting = replay.prepare(experiment.parameters(model))
         inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
         load = float(experiment.dataset.payload[experiment.dataset.rows([name])[0]])
         if load:
@@ -119,7 +119,10 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:
-            begun, steps = robot.state(replay.begin(start, constants, resting).q, start.state.v[0]), replay.steps(start)
+            begun, steps = (
+                robot.state(replay.initial_state(start, constants, resting).q, start.state.v[0]),
+                replay.steps(start),
+            )
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]

@@ -38,7 +38,7 @@ class _Program(nn.Module):
         """Returns force, or next state, and next hidden state, with the arguments of `export_network`'s program."""
         inputs = self.network.encode(q, v, conditions)
         if self._range is not None:
-            inputs = self._range.hold(inputs)
+            inputs = self._range.clamp(inputs)
         fields, later = self.network.decode(inputs, hidden)
         outputs = [field.to(q.dtype) for field in fields]
         if self._frames is not None:

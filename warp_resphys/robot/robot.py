@@ -11,18 +11,18 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
-from ..data.input_response import InputResponse, response_of, told_of
+from ..data.input_response import InputResponse, response_of, with_means
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
 from ..energies.strings import PAYLOAD, Strings
 from ..experiment.experiment import COROTATED
 from ..experiment.files import payload_inputs
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError
+from ..learning.feedback_equilibrium import equilibrium_under_feedback
 from ..learning.networks import NextState
-from ..learning.parameters import MASS_FACTOR, check_known, constants_of, known_parameters
+from ..learning.parameters import MASS_FACTOR, check_names, constants_of, identifiable_parameters
 from ..learning.predictors import LearnedPredictor
-from ..learning.replay import settled
-from ..learning.rollout import FURTHEST, Rollout
+from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .description import Description
@@ -79,7 +79,7 @@ class Robot:
         self._set_parameters(parameters or {})
 
     def _set_parameters(self, parameters: Mapping[str, torch.Tensor | float]) -> None:
-        check_known(parameters, known_parameters(self.simulator))
+        check_names(parameters, identifiable_parameters(self.simulator))
         given = {**self.description.parameters, **parameters}
         values = {name: self.simulator.tensor(value).reshape(-1) for name, value in given.items()}
         count = max((len(value) for value in values.values()), default=1)
@@ -218,7 +218,7 @@ class Robot:
             assert isinstance(predicted, torch.Tensor)
             return predicted
 
-        body = settled(self.simulator, acting, self.constants, start.body, force)
+        body = equilibrium_under_feedback(self.simulator, acting, self.constants, start.body, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return replace(start, body=body, memory={**start.memory, **memory}, left=left)
 
@@ -264,8 +264,8 @@ class Robot:
         now = rollout.lost(body)
         if self.simulator.settings.on_failure == "raise" and bool((now & ~state.lost).any()):
             raise ConvergenceError(
-                f"the robot has diverged: a vertex moved further than {FURTHEST:g} body lengths; use shorter steps, "
-                "lower inputs, or a force that was trained longer.",
+                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths; "
+                "use shorter steps, lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )
@@ -384,7 +384,7 @@ class Robot:
             remembered = {key.removeprefix(own): x for key, x in state.memory.items() if key.startswith(own)}
             acting, means, later = response(remembered, (zeros if value is None else value)[None])
             fields[name] = acting[0]
-            conditions += [told_of(acting[0], means[:, 0])] if name in self.description.seen else []
+            conditions += [with_means(acting[0], means[:, 0])] if name in self.description.seen else []
             memory |= {f"{own}{key}": values for key, values in later.items()}
         if payload is not None:
             fields |= self._hung(payload)

@@ -54,7 +54,7 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
     commands = np.random.default_rng(1).random((20, 3, 2))
     response = InputResponse(STEP, 0.8, delay, rise, [0.1, 0.5])
     acting, means = response.from_rest(commands)
-    memory = response.still(np.zeros((3, 2)))
+    memory = response.steady(np.zeros((3, 2)))
     for number, now in enumerate(commands):
         one, mean, memory = response(memory, now[None])
         np.testing.assert_allclose(one[0], acting[number], atol=1e-12)
@@ -69,5 +69,5 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
 def test_constant_commands_are_remembered_as_if_they_had_always_been_given():
     commands = np.array([[1.0, 2.0]])
     response = InputResponse(STEP, 0.8, 0.013, 0.02, [0.3])
-    acting, means, _ = response(response.still(commands), commands[None])
+    acting, means, _ = response(response.steady(commands), commands[None])
     np.testing.assert_allclose(with_means(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))

@@ -168,7 +168,7 @@ class ReducedModel:
         z = self._equilibrium(Monomials(u))[0]
         z, u = np.repeat(z, count, axis=0), np.repeat(u, count, axis=0)
         still = np.stack([z, np.zeros_like(z)])
-        return ReducedState(still[0], still[1], u, self.response.still(u), still, np.zeros(count, dtype=np.bool_))
+        return ReducedState(still[0], still[1], u, self.response.steady(u), still, np.zeros(count, dtype=np.bool_))
 
     def _equilibrium(self, u: Monomials) -> tuple[FloatArray, ForceAlong | None]:
         """Solves A (z - z_0) = learned force by Newton's method with step halving; returns z (1, r) and the force."""

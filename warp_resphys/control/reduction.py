@@ -225,7 +225,7 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
     z, rates, y, acting, commands = (
         series[:, first:] for series in (z, rates, motions.y, motions.acting, motions.commands)
     )
-    memories = [model.response.still(np.zeros(commands.shape[1:]))]
+    memories = [model.response.steady(np.zeros(commands.shape[1:]))]
     for now in commands:
         memories.append(model.response(memories[-1], now[None])[2])
     off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)

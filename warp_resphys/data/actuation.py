@@ -13,32 +13,31 @@ from ..stepping.quantity import Quantity
 FloatArray = NDArray[np.float64]
 
 _JITTER = 1e-9  # of the variance, on the diagonal of a smooth covariance
-NO_INPUT = 0.01  # of the limit: less is what a gauge shows of none
-_SLACK = 1.005  # by which a gauge may exceed the limit
+NO_INPUT = 0.01  # of the limit: zero error of a gauge, below which an input counts as none
+_SLACK = 1.005  # factor by which a measured input may exceed the limit
 
 
 @dataclass(frozen=True)
 class InputSequences:
-    """A distribution of inputs over time, such as pressures: a Gaussian process, clipped to what the body takes.
+    """A distribution of inputs over time, such as pressures: a Gaussian process, clipped to the range of the body.
 
-    Each part's input is a normal variable at each time, correlated with those at other times by
-    ``exp(-(t - t')^2 / (2 correlation_time^2))`` and with the other parts by `correlation`. It is conditioned on
-    being zero, with zero slope, at the start and the end, where the body rests (Rasmussen and Williams 2006, section
-    2.2); then what is below zero or above the limit is cut off.
+    The input of a part is normally distributed, correlated in time by ``exp(-(t - t')^2 / (2 correlation_time^2))`` and
+    with the other parts by `correlation`. It is conditioned on zero value and slope at the start and the end, where the
+    body rests (Rasmussen and Williams 2006, section 2.2); then it is clipped to the range from zero to the limit.
     """
 
     mean: float = 8e3  # [Pa], or the unit of the input
-    deviation: float = 9e3  # in the same
+    deviation: float = 9e3  # in the unit of the input
     correlation_time: float = 0.4  # [s]; the longer, the smoother
-    correlation: float | Sequence[Sequence[float]] = 0.0  # between each two parts, less than 1; or a (C, C) matrix
-    limit: float = 20e3  # in the same
+    correlation: float | Sequence[Sequence[float]] = 0.0  # between every two parts, less than 1; or a (C, C) matrix
+    limit: float = 20e3  # in the unit of the input
     rest: float = 0.1  # without input before the start and after the end [s]
 
     def draw(self, steps: int, time_step: float, parts: int, random: np.random.Generator) -> FloatArray:
-        """(K + 1, C) a sequence at the times 0, h, ..., K h of K steps h [s].
+        """Draws a sequence (K + 1, C) for C parts at the times 0, h, ..., K h [s].
 
         Raises:
-            InputError: there is no time between the rests, or the parts' correlations are those of no distribution.
+            InputError: there is no time between the rests, or the correlations are not those of a distribution.
         """
         times = time_step * np.arange(steps + 1)
         inside = (times >= self.rest - 1e-9) & (times <= times[-1] - self.rest + 1e-9)
@@ -50,7 +49,7 @@ class InputSequences:
         normal = root @ random.standard_normal((inside.sum(), parts))
         drawn = np.zeros((steps + 1, parts))
         drawn[inside] = self.mean * bridge[:, None] + self.deviation * normal @ self._between(parts).T
-        drawn[np.flatnonzero(inside)[[0, -1]]] = 0.0  # as it is but for rounding
+        drawn[np.flatnonzero(inside)[[0, -1]]] = 0.0  # exact, without rounding
         return np.clip(drawn, 0.0, self.limit)
 
     def _covariance(self, first: FloatArray, second: FloatArray) -> FloatArray:
@@ -58,7 +57,7 @@ class InputSequences:
         return np.asarray(np.exp(-0.5 * scaled**2))
 
     def _conditioned(self, count: int, step: float) -> tuple[FloatArray, FloatArray]:
-        """(count,) what remains of a mean of one, and (count, count) the factor L of the covariance L L^T over time."""
+        """Conditional mean (count,) of a mean of one, and factor L (count, count) of the covariance L L^T over time."""
         times = step * np.arange(count, dtype=np.float64)
         close = 0.05 * self.correlation_time  # zero at two times close to each end leaves no slope
         ends = np.array([times[0] - close, times[0], times[-1], times[-1] + close])
@@ -69,11 +68,10 @@ class InputSequences:
         return bridge, vectors * np.sqrt(np.maximum(values, 0.0))
 
     def _between(self, parts: int) -> FloatArray:
-        """(C, C) factor of the parts' correlations."""
+        """Cholesky factor (C, C) of the correlations between parts."""
         matrix: FloatArray = np.asarray(self.correlation, dtype=np.float64)
         if matrix.ndim == 0:
-            same = np.eye(parts)
-            matrix = same + (1.0 - same) * matrix
+            matrix = np.eye(parts) + (1.0 - np.eye(parts)) * matrix
         if matrix.shape != (parts, parts):
             raise InputError(
                 f"correlation is {np.asarray(self.correlation).tolist()}: give one number, or a matrix of "
@@ -89,13 +87,12 @@ class InputSequences:
 
 
 def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: float, source: str | Path) -> FloatArray:
-    """(T, C) recorded inputs, if a body with so many parts can take them.
+    """Checks recorded inputs (T, C) against a body with this number of parts, and returns them.
 
-    What is out of the quantity's range by no more than a gauge's error is brought into it.
+    Values below the quantity's range by no more than the error of a gauge are clipped to it.
 
     Raises:
-        DataFileError: another number of parts, or a value beyond the limit, in the unit of the quantity, or below what
-            it can be.
+        DataFileError: a different number of parts, or a value above the limit or below the quantity's range.
     """
     words, per = quantity.words, quantity.per
     if values.shape[1] != parts:

@@ -1,8 +1,8 @@
-"""Which of the markers of a recording is which, where nobody named them.
+"""Assignment of names to the unlabelled markers of a recording.
 
-The markers that were seen are matched with the places where markers should be, by the rigid motion and the pairs that
-leave the least sum of squares. For a motion, the best pairs are those of the Hungarian method (Kuhn, Naval Research
-Logistics Quarterly 2 (1955) 83); motions are tried that carry a few markers, the anchors, onto their places.
+Measured markers are matched with their nominal places by the rigid motion and the pairs with the least sum of squares.
+The best pairs for a motion are those of the Hungarian method (Kuhn, Naval Research Logistics Quarterly 2 (1955) 83);
+the candidate motions carry a few markers, the anchors, onto their nominal places.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,19 +20,19 @@ from .rigid import FloatArray, RigidTransform, fit, root_mean_square
 IntArray = NDArray[np.int64]
 
 _REFINEMENTS = 3
-_CLEAR = 1.3  # by which the next best pairs must fit worse
-_LEAST = 1e-4  # m: pairs that fit better than that fit alike
+_CLEAR = 1.3  # least ratio of the residual of the next best pairs and that of the best
+_LEAST = 1e-4  # m: smaller residuals count as this one
 _MILLI = 1e3
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """Markers by name."""
+    """Named markers."""
 
-    columns: IntArray  # (M,) of each name, the number of the marker that was seen
+    columns: IntArray  # (M,) index of the measured marker of every name
     transform: RigidTransform  # from the frame of the recording to that of the body
     rms: float  # root mean square distance of the pairs [m]
-    next_rms: float  # the same of the next best pairs, with which these must not be mistaken [m]
+    next_rms: float  # root mean square distance of the next best pairs [m]
 
 
 def assign(
@@ -44,22 +44,22 @@ def assign(
     anchors: Sequence[int] | None = None,
     rotation: FloatArray | None = None,
 ) -> Assignment:
-    """Names the markers that were seen.
+    """Assigns names to measured markers.
 
     Args:
-        seen: (S, 3) markers in the frame of the recording [m], NaN for one that was not seen; more than there are names
-            are left over.
-        expected: (M, 3) where the named ones should be, in the frame of the body [m].
+        seen: (S, 3) measured markers in the frame of the recording [m], NaN for one that was not seen; markers in
+            excess of the names stay without a name.
+        expected: (M, 3) nominal places of the named markers, in the frame of the body [m].
         names: M names.
         source: of the recording, for messages.
-        anchors: the names, by number, that stand where they should, from which the motion is found: those on the clamp,
-            for a body that is bent; all if None.
-        rotation: (3, 3) from the frame of the recording to that of the body, where it is known. One anchor is enough
-            then, otherwise it takes three that are not on a line.
+        anchors: indices of the names at their nominal places, which determine the motion: those on the clamp, for a
+            bent body; all if None.
+        rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one anchor is enough;
+            otherwise it takes three that are not on a line.
 
     Raises:
-        InputError: arrays that do not fit, or too few anchors.
-        DataFileError: fewer markers than names, or other pairs that fit about as well.
+        InputError: arrays of wrong shapes, or too few anchors.
+        DataFileError: fewer markers than names, or other pairs with a similar residual.
     """
     points, places = np.asarray(seen, dtype=np.float64), np.asarray(expected, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or places.shape != (len(names), 3) or not np.isfinite(places).all():
@@ -67,14 +67,14 @@ def assign(
             f"{len(names)} markers are named, with places {places.shape} and {points.shape} seen: both must be "
             "(markers, 3), and the places finite."
         )
-    there = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(there) < len(names):
+    visible = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(visible) < len(names):
         raise DataFileError(
-            f"{source} shows {len(there)} markers, and {len(names)} are configured ({listed(names)}): leave out of the "
-            "configuration those that it does not have."
+            f"{source} shows {len(visible)} markers, and {len(names)} are configured ({listed(names)}): leave out "
+            "of the configuration those that it does not have."
         )
-    points, fixed = points[there], np.arange(len(names)) if anchors is None else np.asarray(anchors, dtype=np.int64)
-    found: dict[tuple[int, ...], tuple[float, RigidTransform]] = {}
+    points, fixed = points[visible], np.arange(len(names)) if anchors is None else np.asarray(anchors, dtype=np.int64)
+    fits: dict[tuple[int, ...], tuple[float, RigidTransform]] = {}
     for motion in _motions(points, places, fixed, rotation):
         pairs = _pairs(motion.apply(points), places)
         for _ in range(_REFINEMENTS):
@@ -82,13 +82,13 @@ def assign(
             before, pairs = pairs, _pairs(motion.apply(points), places)
             if (pairs == before).all():
                 break
-        for some in _and_next_best(motion.apply(points), places, pairs):
-            off = root_mean_square(motion.apply(points[some]) - places)
-            if tuple(some) not in found or off < found[tuple(some)][0]:
-                found[tuple(some)] = off, motion
-    if not found:
+        for candidate in _best_and_next(motion.apply(points), places, pairs):
+            residual = root_mean_square(motion.apply(points[candidate]) - places)
+            if tuple(candidate) not in fits or residual < fits[tuple(candidate)][0]:
+                fits[tuple(candidate)] = residual, motion
+    if not fits:
         raise DataFileError(f"{source}: no three of its markers stand as those of the configuration do: check these.")
-    (best, (rms, motion)), *others = sorted(found.items(), key=lambda each: each[1][0])
+    (best, (rms, motion)), *others = sorted(fits.items(), key=lambda fit: fit[1][0])
     next_rms = others[0][1][0] if others else np.inf
     if next_rms < _CLEAR * max(rms, _LEAST):
         moved = [name for name, a, b in zip(names, best, others[0][0], strict=True) if a != b]
@@ -97,13 +97,13 @@ def assign(
             f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; name them (labels), or correct "
             "their places in the configuration."
         )
-    return Assignment(there[list(best)], motion, rms, next_rms)
+    return Assignment(visible[list(best)], motion, rms, next_rms)
 
 
 def _motions(
     points: FloatArray, places: FloatArray, anchors: IntArray, rotation: FloatArray | None
 ) -> Iterator[RigidTransform]:
-    """Motions that carry some of the markers onto anchors: one if the rotation is known, otherwise three."""
+    """Motions that carry one marker, if the rotation is known, or three markers onto anchors."""
     if not len(anchors):
         raise InputError("markers are named by those that stand still: configure one at least (markers.reference).")
     if rotation is not None:
@@ -135,17 +135,17 @@ def _fitted(points: FloatArray, places: FloatArray, rotation: FloatArray | None)
 
 
 def _squares(points: FloatArray, places: FloatArray) -> FloatArray:
-    """(M, S) squared distances."""
+    """Squared distances (M, S) between places and points."""
     return np.asarray(np.square(places[:, None] - points[None]).sum(axis=2))
 
 
 def _pairs(points: FloatArray, places: FloatArray) -> IntArray:
-    """(M,) the point of each place."""
+    """Index (M,) of the point that is assigned to a place."""
     return np.asarray(linear_sum_assignment(_squares(points, places))[1])
 
 
-def _and_next_best(points: FloatArray, places: FloatArray, pairs: IntArray) -> Iterator[IntArray]:
-    """The best pairs, and the best without each of them."""
+def _best_and_next(points: FloatArray, places: FloatArray, pairs: IntArray) -> Iterator[IntArray]:
+    """Yields the best pairs, then the best pairs without one of them, for every pair."""
     yield pairs
     squares = _squares(points, places)
     for place, point in enumerate(pairs):

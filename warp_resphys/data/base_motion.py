@@ -1,7 +1,6 @@
-"""Rigid motion of what a body is fixed to: as a function of time, from a file, recorded, or followed by markers on it.
+"""Rigid motion of the base of a body: a function of time, a table, or estimated from markers on the base.
 
-A pose is a translation t [m] and a rotation vector [rad] of R, side by side: what was at x before time zero is at
-R x + t.
+A pose (6,) is a translation t [m] and the rotation vector of R [rad]: a point at x before time zero is at R x + t.
 """
 
 from pathlib import Path
@@ -21,56 +20,56 @@ _MILLI = 1e3
 
 
 def poses_of(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """(T, 6) poses of (T, 3, 3) rotations and (T, 3) translations [m], their rotation vectors without jumps."""
+    """Poses (T, 6) of rotations (T, 3, 3) and translations (T, 3) [m], with continuous rotation vectors."""
     return np.concatenate([translation, _unwrapped(Rotation.from_matrix(rotation).as_rotvec())], axis=1)
 
 
 def rigid(poses: FloatArray) -> RigidTransform:
-    """The motions that (T, 6) poses stand for."""
+    """Rigid motions of poses (T, 6)."""
     return RigidTransform(Rotation.from_rotvec(poses[:, 3:]).as_matrix(), poses[:, :3])
 
 
 def prescribed(motion: MotionSettings, times: ArrayLike, folder: str | Path = ".", scale: float = 1.0) -> FloatArray:
-    """(T, 6) poses at (T,) times [s] of a motion that is known beforehand.
+    """Poses (T, 6) at times (T,) [s] of a configured motion.
 
     Args:
-        motion: a table of poses, see `_table`, or sinusoids, see `_swinging`; ``about`` is the point of the base, in
-            the frame of the mesh, whose translation is given, and which rotations leave where it is [m].
+        motion: a table of poses, see `_table`, or sinusoids, see `_sinusoids`; ``about`` is the point of the base, in
+            the frame of the mesh, that the translation refers to and rotations leave in place [m].
         times: (T,) [s].
-        folder: that a path in ``file`` begins in.
+        folder: of a relative path in ``file``.
         scale: of the whole motion.
 
     Raises:
         DataFileError: the file cannot be read.
     """
     at = np.asarray(times, dtype=np.float64)
-    moved = _swinging(motion, at) if motion.file is None else _table(Path(folder).expanduser() / motion.file, at)
+    moved = _sinusoids(motion, at) if motion.file is None else _table(Path(folder).expanduser() / motion.file, at)
     poses, about = scale * moved, np.asarray(motion.about, dtype=np.float64)
     poses[:, :3] += about - Rotation.from_rotvec(poses[:, 3:]).apply(about)
     return np.asarray(poses)
 
 
-def _swinging(motion: MotionSettings, times: FloatArray) -> FloatArray:
-    """(T, 6) a sum of sinusoids, which begins where the body was.
+def _sinusoids(motion: MotionSettings, times: FloatArray) -> FloatArray:
+    """Poses (T, 6) of a sum of sinusoids, zero at the start.
 
-    ``swings``, by any names, have each a ``frequency`` [Hz], amplitudes ``translation`` [m] and ``rotation`` [rad]
-    along and about x, y and z, and a ``phase`` [rad]; before ``start`` nothing moves, and during ``ramp`` after it the
-    amplitudes grow from nothing [s].
+    Every one of ``swings`` has a ``frequency`` [Hz], amplitudes ``translation`` [m] and ``rotation`` [rad] along and
+    about x, y and z, and a ``phase`` [rad]. Nothing moves before ``start``, and the amplitudes grow from zero during
+    ``ramp`` after it [s].
     """
     since = np.maximum(times - motion.start, 0.0)
     share = np.clip(since / motion.ramp, 0.0, 1.0) if motion.ramp else np.ones_like(since)
-    grown = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    growth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     poses = np.zeros((len(since), 6))
     for swing in (motion.swings or {}).values():
-        wave = grown * (np.sin(2.0 * np.pi * swing.frequency * since + swing.phase) - np.sin(swing.phase))
+        wave = growth * (np.sin(2.0 * np.pi * swing.frequency * since + swing.phase) - np.sin(swing.phase))
         poses += wave[:, None] * np.concatenate([swing.translation, swing.rotation])
     return poses
 
 
 def _table(path: Path, times: FloatArray) -> FloatArray:
-    """(T, 6) the motion since the first line of a table: t [s], x, y, z [m] and a quaternion w, x, y, z in each line.
+    """Poses (T, 6) relative to the first line of a table with lines of t [s], x, y, z [m], quaternion w, x, y, z.
 
-    Lines that begin with # are not read; before and after the table, its first and last pose.
+    Lines that begin with # are comments. Before and after the table, the first and the last pose stay.
     """
     try:
         table = np.loadtxt(path, delimiter=",", ndmin=2)
@@ -85,7 +84,7 @@ def _table(path: Path, times: FloatArray) -> FloatArray:
 
 
 def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -> FloatArray:
-    """(T, 6) motion since the first frame of places (T, 3) [m] of a point, and quaternions (T, 4), w first.
+    """Poses (T, 6) relative to the first frame, from positions (T, 3) of a point [m] and quaternions (T, 4), w first.
 
     Raises:
         DataFileError: a value that is not finite, or a quaternion of no length.
@@ -101,13 +100,13 @@ def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -
 
 
 def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> FloatArray:
-    """(T, 6) motion of markers (T, M, 3) [m] on the base since they stood still at (M, 3) [m]; NaN where not seen.
+    """Poses (T, 6) of the base, from its markers (T, M, 3), NaN where not seen, and their rest positions (M, 3) [m].
 
-    Frames in which fewer than three of them are seen are interpolated, and a spline smooths the motion as much as its
-    noise asks for (generalised cross-validation): a body feels the acceleration of its base.
+    Frames with fewer than three seen markers are interpolated. A spline smooths the motion (generalised
+    cross-validation), as a body feels the acceleration of its base.
 
     Raises:
-        DataFileError: three or more are seen in less than half of the frames.
+        DataFileError: three or more markers are seen in less than half of the frames.
     """
     seen = np.asarray(np.isfinite(markers).all(-1) & np.isfinite(still).all(-1))
     enough = seen.sum(1) >= 3
@@ -118,8 +117,8 @@ def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> Floa
         )
     rotation, translation = np.zeros((len(markers), 3, 3)), np.zeros((len(markers), 3))
     for frame in np.flatnonzero(enough).tolist():
-        found = kabsch(still[seen[frame]], markers[frame, seen[frame]])
-        rotation[frame], translation[frame] = found.rotation, found.translation
+        motion = kabsch(still[seen[frame]], markers[frame, seen[frame]])
+        rotation[frame], translation[frame] = motion.rotation, motion.translation
     frames, known = np.arange(len(markers)), np.flatnonzero(enough)
     inside = np.clip(frames, known[0], known[-1])
     turned = Slerp(known, Rotation.from_matrix(rotation[known]))(inside) if len(known) > 1 else None
@@ -129,7 +128,7 @@ def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> Floa
 
 
 def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
-    """(T, 6) the same motions D as another frame has them, to which G leads from theirs: G D G^-1."""
+    """Poses (T, 6) of the motions D in another frame: G D G^-1, with G from their frame to the other one."""
     motion = rigid(poses)
     turned = frame.rotation @ motion.rotation @ frame.rotation.T
     origin = -frame.rotation.T @ frame.translation
@@ -137,7 +136,7 @@ def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
 
 
 def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> FloatArray:
-    """(T', 6) poses between frames, by cubic splines; before and after them, the first and the last."""
+    """Poses (T', 6) at new times, by cubic splines; before and after the frames, the first and the last pose."""
     if len(poses) < 2:
         return np.repeat(poses, len(new), axis=0)
     kept = np.clip(new, times[0], times[-1])
@@ -145,7 +144,7 @@ def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> Float
 
 
 def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> None:
-    """Refuses (K + 1, 6) poses at the steps of a simulation that no body of points (N, 3) [m] follows.
+    """Checks that poses (K + 1, 6) at the steps of a simulation do not jump, for a body of points (N, 3) [m].
 
     Raises:
         DataFileError: a corner of the body moves by a fifth of its size in a single step.
@@ -169,12 +168,12 @@ def _smoothed(poses: FloatArray) -> FloatArray:
 
 
 def _unwrapped(vectors: FloatArray) -> FloatArray:
-    """(T, 3) rotation vectors, each the nearest to the one before of those of its rotation."""
-    found = vectors.copy()
-    for row in range(1, len(found)):
-        angle = np.linalg.norm(found[row])
+    """Rotation vectors (T, 3) of the same rotations, each the nearest one to its predecessor."""
+    unwrapped = vectors.copy()
+    for row in range(1, len(unwrapped)):
+        angle = np.linalg.norm(unwrapped[row])
         if angle > 0.0:
-            axis = found[row] / angle
-            turns = np.round((found[row - 1] @ axis - angle) / (2.0 * np.pi))
-            found[row] = (angle + 2.0 * np.pi * turns) * axis
-    return found
+            axis = unwrapped[row] / angle
+            turns = np.round((unwrapped[row - 1] @ axis - angle) / (2.0 * np.pi))
+            unwrapped[row] = (angle + 2.0 * np.pi * turns) * axis
+    return unwrapped

@@ -1,9 +1,9 @@
-"""Pixels of markers in the picture of a calibrated camera, as an observation.
+"""Pixels of markers in the image of a calibrated camera, as an observation.
 
 A point x of the body's frame is seen at (u, v), where (u w, v w, w) = P (x, 1) and P = K [R | t] is the camera's matrix
 (Hartley and Zisserman, Multiple View Geometry, 2nd edition, eq. 6.8). w is the depth in front of the camera. Lens
 distortion is removed from the pixels beforehand, for example by OpenCV's `undistortPoints`. Depth along the line of
-sight is not measured: with one camera, motion towards it shows as a change of size alone.
+sight is not measured: with one camera, motion towards it appears only as a change of size.
 
 `tests/data/test_camera.py` compares it with a camera of closed form and identifies Young's modulus from its pixels.
 """
@@ -21,7 +21,7 @@ from .observation import Observation
 
 @dataclass(frozen=True)
 class CameraMarkers(Observation):
-    """Markers as a pinhole camera sees them, (B, M, 2) [px].
+    """Projections of markers in a pinhole camera, (B, M, 2) [px].
 
     Raises:
         InputError: a matrix of another shape.

@@ -1,7 +1,7 @@
-"""The input that acts on a body, from what was commanded: a factor, a delay, a first-order lag, and exponential means.
+"""Response of an input to its commands: a factor, a delay, a first-order lag, and exponential means.
 
-Each call continues from a memory, so that a series at once and step by step give the same. NumPy arrays and torch
-tensors are taken alike; tensors are differentiable.
+Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
+and torch tensors are accepted; tensors are differentiable.
 """
 
 import math
@@ -15,21 +15,21 @@ Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
 Number = torch.Tensor | float | None
 
-_FASTEST = 1e-2  # of a step: shorter time constants are taken as this one
+_FASTEST = 1e-2  # of a step: shortest time constant; shorter ones count as this one
 
 
 class InputResponse:
-    """How an input follows its commands, exact where these are constant during steps.
+    """Response of an input to its commands, exact for commands that are constant during steps.
 
-    A step in which a delayed command gives way to the next has the mean of both over its time. The means are the
-    internal variables of Maxwell elements that the input drives: how far a viscoelastic body creeps depends on how long
-    an input has lasted, which its state shows badly.
+    In a step in which the delayed command changes, the input is its mean over the step. The exponential means are the
+    internal variables of Maxwell elements driven by the input: the creep of a viscoelastic body depends on the duration
+    of an input, which the state does not contain.
 
     Args:
         time_step: h [s].
-        factor: on the commands; a number, or (1 or B,) for commands (T, B, C). None leaves out the effect; likewise:
-        delay: zero or more [s]; differentiable but at whole numbers of steps.
-        rise: time constant of the lag [s].
+        factor: on the commands; a number, or (1 or B,) for commands (T, B, C); None for no factor.
+        delay: zero or more [s], not differentiable at whole numbers of steps; None for no delay.
+        rise: time constant of the lag [s]; None for no lag.
         filters: F time constants of the exponential means [s].
     """
 
@@ -45,25 +45,25 @@ class InputResponse:
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         self._kept_lag = None if rise is None else _share_kept(rise, time_step)
-        self._kept_means = [_share_kept(each, time_step) for each in self.filters]
+        self._kept_means = [_share_kept(time, time_step) for time in self.filters]
 
-    def still(self, commands: Array) -> dict[str, Array]:
-        """The memory after commands (..., C) that have lasted for long; its entries are (..., C) or (L, ..., C)."""
-        given, like = self.scaled(commands), _library(commands)
-        memory = {} if self._late is None else {"queue": like.broadcast_to(given, (self._length, *given.shape))}
-        memory |= {} if self._kept_lag is None else {"behind": given}
-        means = {"means": like.broadcast_to(given, (len(self.filters), *given.shape))} if self.filters else {}
+    def steady(self, commands: Array) -> dict[str, Array]:
+        """Returns the memory under constant commands (..., C); its entries are (..., C) or (L, ..., C)."""
+        scaled, like = self.scaled(commands), _library(commands)
+        memory = {} if self._late is None else {"queue": like.broadcast_to(scaled, (self._length, *scaled.shape))}
+        memory |= {} if self._kept_lag is None else {"behind": scaled}
+        means = {"means": like.broadcast_to(scaled, (len(self.filters), *scaled.shape))} if self.filters else {}
         return memory | means
 
     def __call__(self, memory: Memory, commands: Array) -> tuple[Array, Array, dict[str, Array]]:
-        """The input during T steps.
+        """Returns the input during T steps.
 
         Args:
-            memory: before them, from `still` or an earlier call.
+            memory: before the steps, from `steady` or an earlier call.
             commands: (T, ..., C) during the steps.
 
         Returns:
-            (T, ..., C) the input, (F, T, ..., C) its means at the ends of the steps, and the memory after them.
+            The input (T, ..., C), its means at the ends of the steps (F, T, ..., C), and the memory after the steps.
         """
         acting, later, like = self.scaled(commands), dict[str, Array](), _library(commands)
         if self._late is not None:
@@ -78,15 +78,15 @@ class InputResponse:
         return acting, means, later | {"means": means[:, -1]}
 
     def from_rest(self, commands: Array) -> tuple[Array, Array]:
-        """(T, ..., C) the input and (F, T, ..., C) its means under commands (T, ..., C), with none before these."""
-        return self(self.still(0.0 * commands[0]), commands)[:2]
+        """Returns the input (T, ..., C) and its means (F, T, ..., C) under commands (T, ..., C), from zero input."""
+        return self(self.steady(0.0 * commands[0]), commands)[:2]
 
     def scaled(self, commands: Array) -> Array:
-        """(..., C) commands times the factor: the input where they have always been given."""
+        """Returns commands (..., C) times the factor: the input under constant commands."""
         return commands if self._factor is None else commands * _column(self._factor)
 
     def _delayed(self, queue: Array, count: int) -> Array:
-        """(T, ..., C) delayed commands, of (L + T, ..., C)."""
+        """Delayed commands (T, ..., C), from a queue (L + T, ..., C)."""
         late, first = self._late, self._length
         if not isinstance(late, torch.Tensor):
             assert late is not None
@@ -99,27 +99,27 @@ class InputResponse:
 
 
 def response_of(name: str, parameters: Mapping[str, torch.Tensor]) -> tuple[Number, Number, Number]:
-    """Factor, delay and rise of an input, as they are named among identified parameters; None where one is not."""
+    """Returns the identified factor, delay and rise of an input; None for those that were not identified."""
     factor, delay, rise = (parameters.get(f"{name}_{word}") for word in ("factor", "delay", "rise"))
     return factor, delay, rise
 
 
 def with_means(acting: Array, means: Array) -> Array:
-    """(..., C (1 + F)) inputs (..., C), then their means (F, ..., C), as networks take them."""
+    """Concatenates inputs (..., C) and their means (F, ..., C) to (..., C (1 + F)), as the context of a network."""
     return _library(acting).concatenate([acting, *means], -1)
 
 
 def _lagged(behind: Array, series: Array, kept: Array) -> Array:
-    """(T, ..., C) a series that follows another one (T, ..., C) from (..., C) on, keeping a share of its distance."""
-    found = []
+    """First-order lag (T, ..., C) of a series (T, ..., C), from (..., C) on; `kept` is the decay in a step."""
+    lagged = []
     for now in series:
         behind = now + kept * (behind - now)
-        found.append(behind)
-    return _library(series).stack(found)
+        lagged.append(behind)
+    return _library(series).stack(lagged)
 
 
 def _share_kept(time: torch.Tensor | float, step: float) -> Array:
-    """Share of the distance from its goal that a lag of a time constant [s] keeps in a step; (B, 1) of (B,)."""
+    """Decay exp(-step / time) of a lag in a step; (B, 1) for time constants (B,) [s]."""
     if isinstance(time, torch.Tensor):
         return _column(torch.exp(-step / time.clamp_min(_FASTEST * step)))
     return math.exp(-step / max(time, _FASTEST * step))
@@ -130,7 +130,7 @@ def _column(values: torch.Tensor | float) -> Array:
 
 
 def _whole(steps: torch.Tensor | float) -> Array:
-    """The whole numbers of steps."""
+    """Rounds down to whole numbers of steps."""
     return steps.detach().floor().clamp_min(0.0).long() if isinstance(steps, torch.Tensor) else np.array(int(steps))
 
 

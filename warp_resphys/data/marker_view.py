@@ -1,9 +1,9 @@
-r"""What recordings tell of where markers are, where that is less than their places in the frame of the body.
+r"""Recordings that contain less than the marker positions in the frame of the body: a plane, or the shape alone.
 
-A single camera sees a plane. And a body that nothing holds, as one that swims, is anywhere: its markers tell its shape
-alone. Then both recorded and simulated markers are moved rigidly, frame by frame, to where they are closest to their
-nominal places (Kabsch 1976), and differ by what is left. Moved so, markers x become R^T (x - mean x) + mean o, with the
-nominal places o and the rotation R that maximises sum (x_i - mean x) . R (o_i - mean o); in a plane that has the angle
+A single camera sees a plane. The markers of a free body, such as a swimming one, have no fixed frame and give its shape
+alone. Then both recorded and simulated markers are moved rigidly, frame by frame, to the best fit with their nominal
+places (Kabsch 1976), and compared there. Markers x become R^T (x - mean x) + mean o, with the nominal places o and the
+rotation R that maximises sum (x_i - mean x) . R (o_i - mean o); in a plane it has the angle
 atan2(sum (o_i - mean o) x (x_i - mean x), sum (o_i - mean o) . (x_i - mean x)).
 """
 
@@ -21,22 +21,22 @@ from .markers import Markers, closest_rotation
 
 FRAMES = ("body", "own")
 _AXES = "xyz"
-_LINE = 1e-3  # m: markers that are closer to a line do not tell how a body is turned about it
+_LINE = 1e-3  # m: markers closer to a line do not determine the rotation about it
 
 
 @dataclass(frozen=True)
 class MarkerView:
-    """How much of the places of m markers recordings tell.
+    """Which coordinates of m markers the recordings contain.
 
     Attributes:
-        nominal: (m, 3) where they are on the undeformed body [m].
-        plane: the two axes of the body that span what is seen, such as ("x", "z"); None where all is.
-        own: whether markers are seen in a frame of their own, rather than in that of the body.
-        sets: the numbers of those that are seen together, and have one frame; all are, if left out. Those in none are
-            nowhere seen.
+        nominal: (m, 3) places on the undeformed body [m].
+        plane: the two axes of the body that span the recorded plane, such as ("x", "z"); None for all coordinates.
+        own: whether markers are recorded in their own frame (shape alone) rather than in that of the body.
+        sets: indices of markers that are seen together and share an own frame; all if left out. Markers in no set are
+            never seen.
 
     Raises:
-        InputError: axes that are not two of x, y and z, or markers that tell no frame or are in two sets.
+        InputError: axes that are not two of x, y and z, or markers that determine no frame or are in two sets.
     """
 
     nominal: torch.Tensor
@@ -52,7 +52,7 @@ class MarkerView:
         frame: str = "body",
         sets: tuple[tuple[int, ...], ...] = (),
     ) -> "MarkerView":
-        """From the values of a configuration.
+        """Returns the view of a configuration.
 
         Raises:
             InputError: see the class; or a ``frame`` that is none of `FRAMES`.
@@ -69,7 +69,7 @@ class MarkerView:
         if not self.own:
             return
         if self.sets:
-            if len({each for some in self.sets for each in some}) < sum(map(len, self.sets)):
+            if len({marker for members in self.sets for marker in members}) < sum(map(len, self.sets)):
                 raise InputError(
                     "markers.frame is own, but two trials have some markers in common, and not all: they must have the "
                     "same ones, or none in common."
@@ -84,61 +84,61 @@ class MarkerView:
 
     @property
     def is_whole(self) -> bool:
-        """Whether recordings tell where markers are."""
+        """Whether recordings contain all coordinates in the frame of the body."""
         return self.plane is None and not self.own
 
     @cached_property
     def _parts(self) -> "list[tuple[torch.Tensor, MarkerView]]":
-        """The numbers of each set, and the view of its markers."""
+        """Indices of every set, and the view of its markers."""
         device = self.nominal.device
-        return [(torch.tensor(some, device=device), self.select(some)) for some in self.sets]
+        return [(torch.tensor(members, device=device), self.select(members)) for members in self.sets]
 
     def select(self, chosen: Sequence[int]) -> "MarkerView":
-        """Of some of the markers, which are seen together."""
+        """Returns the view of some markers, which are seen together."""
         return replace(self, nominal=self.nominal[list(chosen)], sets=())
 
     @property
     def unseen(self) -> int | None:
-        """The number of the axis that is not seen."""
+        """Index of the axis that is not recorded; None without one."""
         return None if self.plane is None else next(i for i, axis in enumerate(_AXES) if axis not in self.plane)
 
     def to(self, like: torch.Tensor) -> "MarkerView":
-        """The same on the device and in the precision of a tensor."""
+        """Returns the view on the device and in the precision of a tensor."""
         return replace(self, nominal=self.nominal.to(like))
 
     def __call__(self, points: torch.Tensor) -> torch.Tensor:
-        """(..., m, 3) places in the frame of the body to what is told of them [m]; what is not seen is nominal."""
+        """Maps positions (..., m, 3) in the frame of the body to recorded ones [m]; unseen coordinates are nominal."""
         if self.unseen is not None:
             hidden = torch.arange(3, device=points.device) == self.unseen
             points = torch.where(hidden, self.nominal, points)
         if not self.own or not self.sets:
             return self._in_own_frame(points, points) if self.own else points
-        found = points
-        for at, part in self._parts:
-            found = found.index_copy(-2, at, part(points.index_select(-2, at)))
-        return found
+        viewed = points
+        for members, part in self._parts:
+            viewed = viewed.index_copy(-2, members, part(points.index_select(-2, members)))
+        return viewed
 
     def of_arrays(self, points: ArrayLike) -> NDArray[np.float64]:
-        """The same of an array (..., m, 3), NaN where a marker is not seen.
+        """Applies the view to an array (..., m, 3), NaN where a marker is not seen.
 
-        In a frame of their own, one marker that is not seen hides all, and so do markers that tell no frame.
+        In an own frame, all markers become NaN where one is not seen or the markers determine no frame.
         """
         if self.is_whole:
             return np.asarray(points, dtype=np.float64)
         assert not self.sets, "A trial has the markers of one set."
-        given = torch.as_tensor(np.asarray(points, dtype=np.float64))
-        lost = ~given.isfinite().all(-1, keepdim=True)
+        positions = torch.as_tensor(np.asarray(points, dtype=np.float64))
+        lost = ~positions.isfinite().all(-1, keepdim=True)
         if self.own:
             lost = lost.any(-2, keepdim=True)
-            lost = lost | self._is_degenerate(torch.where(lost, self.nominal, given))[..., None, None]
-        return torch.where(lost, torch.nan, self(torch.where(lost, self.nominal, given))).numpy()
+            lost = lost | self._is_degenerate(torch.where(lost, self.nominal, positions))[..., None, None]
+        return torch.where(lost, torch.nan, self(torch.where(lost, self.nominal, positions))).numpy()
 
     def carried(self, others: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """(..., N, 3) places of a body, moved as what is told of its markers (..., m, 3) is [m]."""
+        """Moves points (..., N, 3) of a body into the own frame of its markers (..., m, 3), if they have one [m]."""
         return self._in_own_frame(replace(self, own=False)(points), others) if self.own else others
 
     def _in_own_frame(self, markers: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """(..., N, 3) points by the rigid motion that brings markers (..., m, 3) closest to their nominal places."""
+        """Moves points (..., N, 3) by the best rigid fit of markers (..., m, 3) to their nominal places."""
         middle, here = self.nominal.mean(-2), markers.mean(-2, keepdim=True)
         nominal, now, moved = self.nominal - middle, markers - here, points - here
         if self.plane is None:
@@ -155,11 +155,11 @@ class MarkerView:
         return torch.stack(turned, -1) + middle
 
     def _is_degenerate(self, points: torch.Tensor) -> torch.Tensor:
-        """(...,) whether places (..., m, 3) do not tell how they are turned."""
+        """Whether points (..., m, 3) do not determine a rotation, (...,) bool."""
         if self.unseen is not None:
             points = points * (torch.arange(3, device=points.device) != self.unseen)
         spread = torch.linalg.svdvals(points - points.mean(-2, keepdim=True))
-        needed = 1 if self.plane is None else 0  # they span a plane in space, a line in a plane
+        needed = 1 if self.plane is None else 0  # index of the singular value that must not vanish
         if spread.shape[-1] <= needed:
             return torch.ones(spread.shape[:-1], dtype=torch.bool)
         return spread[..., needed] <= _LINE
@@ -167,15 +167,15 @@ class MarkerView:
 
 @dataclass(frozen=True)
 class ViewedMarkers(Markers):
-    """Markers as far as recordings tell where they are."""
+    """Markers in the view of the recordings."""
 
     vertices: torch.Tensor
-    markers: Markers  # where they are
+    markers: Markers  # in the frame of the body
     view: MarkerView
 
     @classmethod
     def of(cls, markers: Markers, view: MarkerView) -> Markers:
-        """Markers seen so; themselves where all is told."""
+        """Returns markers in a view; the markers themselves if the view is whole."""
         return markers if view.is_whole else cls(markers.vertices, markers, view)
 
     @override

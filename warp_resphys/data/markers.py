@@ -1,14 +1,14 @@
-r"""Markers on a deforming body: from the positions of its vertices to those of its markers, differentiably.
+r"""Markers on a deforming body: differentiable maps from the positions of its vertices to those of its markers.
 
-A marker stands on a stem. What a body does to the stem is decided by what it is bound to:
+A marker stands on a stem. The motion of the stem depends on the kind of binding:
 
 - ``normal``: x = sum b_i q_i + d n. The stem is along the normal n of the deformed surface triangle, of constant
   length d; the b_i sum to one and say where in the triangle's plane it stands.
-- ``frame``: x = sum b_i q_i + R o. It stands on the closest point of the surface and turns with the triangle: R is
+- ``frame``: x = sum b_i q_i + R o. It stands on the closest point of the surface and rotates with the triangle: R is
   the rotation of its tangent plane that is closest to the deformation (the polar factor).
 - ``rigid``: x = c + R o. It follows the rigid motion that is closest to that of a set of vertices, such as those of a
   face that it is glued to; c is their centre.
-- ``patch``: the same with the vertices around its foot, as of a marker on a clip around a rod.
+- ``patch``: like ``rigid``, with the vertices around its foot, such as for a marker on a clip around a rod.
 
 All reproduce the markers at rest, and carry them rigidly where the body moves rigidly.
 """
@@ -26,39 +26,39 @@ from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
 from .observation import Observation
 
-_LEAST_PATCH = 4  # vertices that tell how a patch turns
+_LEAST_PATCH = 4  # number of vertices that determine the rotation of a patch
 KINDS = ("normal", "frame", "rigid", "patch")
 
 
 class Markers(Observation):
     """A map from the vertices of a body to M markers."""
 
-    vertices: torch.Tensor  # all that the markers depend on, in any shape
+    vertices: torch.Tensor  # indices of the vertices that the markers depend on, in any shape
 
     def moved(self, by: torch.Tensor) -> "Markers":
-        """The same markers elsewhere on the body.
+        """Returns the markers with an offset on the body.
 
         Args:
-            by: (m, 3) how far they sit from here, in the frame of the body at rest [m].
+            by: (m, 3) offset in the frame of the body at rest [m].
 
         Raises:
-            InputError: of vertices themselves.
+            InputError: the observed points are vertices.
         """
         raise InputError("observed vertices are where they are: only markers on stems can be placed elsewhere.")
 
 
 @dataclass(frozen=True)
 class MarkerMap(Markers):
-    """Markers as weighted sums of vertices, other ones in every environment."""
+    """Markers as weighted sums of vertices, different in every environment."""
 
     vertices: torch.Tensor  # (B, m, k) the vertices of each marker
-    weights: torch.Tensor  # (B, m, k) their weights; a marker whose weights are all zero is none
+    weights: torch.Tensor  # (B, m, k) weights; all zero for a missing marker
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.
 
         Raises:
-            InputError: they do not, or there is no marker.
+            InputError: they do not agree, or there is no marker.
         """
         if self.vertices.ndim != 3 or self.vertices.shape != self.weights.shape or not self.vertices.numel():
             raise InputError(
@@ -68,12 +68,12 @@ class MarkerMap(Markers):
 
     @classmethod
     def at_vertices(cls, vertices: torch.Tensor, dtype: torch.dtype = torch.float64) -> "MarkerMap":
-        """One marker on each of (B, m) vertices."""
+        """Returns one marker on every one of vertices (B, m)."""
         return cls(vertices[..., None], torch.ones_like(vertices[..., None], dtype=dtype))
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """C: (B, N, ...) values at the vertices to (B, m, ...) values at the markers."""
+        """Applies C: maps values at the vertices (B, N, ...) to values at the markers (B, m, ...)."""
         batch = torch.arange(len(self.vertices), device=positions.device)[:, None, None]
         weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
         return (positions[batch, self.vertices] * weights).sum(2)
@@ -90,12 +90,12 @@ class MarkerMap(Markers):
 class SurfaceMarkers(Markers):
     """Markers that stand on triangles of the surface; kinds ``normal`` and ``frame`` (see the module)."""
 
-    vertices: torch.Tensor  # (m, 3) of a triangle each, counter-clockwise seen from outside
+    vertices: torch.Tensor  # (m, 3) corners of the triangles, counter-clockwise seen from outside
     weights: torch.Tensor  # (m, 3) barycentric coordinates of the feet, the sum of each row one
     # (m, 2, 2) from the triangle's edges to its tangents at rest: the inverse of their coordinates [1/m]
     unstretch: torch.Tensor
     offsets: torch.Tensor  # (m, 3) stems [m] along the first and second tangent and the normal
-    axes: torch.Tensor  # (m, 3, 3) these at rest, as columns
+    axes: torch.Tensor  # (m, 3, 3) tangents and normal at rest, as columns
 
     @override
     def moved(self, by: torch.Tensor) -> "SurfaceMarkers":
@@ -113,8 +113,8 @@ class RigidMarkers(Markers):
     """Markers that follow the rigid motion of a set of vertices; kind ``rigid`` (see the module)."""
 
     vertices: torch.Tensor  # (S,) three or more, not on one line
-    rest: torch.Tensor  # (S, 3) [m] where these are at rest, from their centre
-    offsets: torch.Tensor  # (m, 3) [m] the markers at rest, from the centre of the vertices
+    rest: torch.Tensor  # (S, 3) [m] vertices at rest, relative to their centre
+    offsets: torch.Tensor  # (m, 3) [m] markers at rest, relative to the centre of the vertices
 
     @override
     def moved(self, by: torch.Tensor) -> "RigidMarkers":
@@ -132,9 +132,9 @@ class RigidMarkers(Markers):
 class JoinedMarkers(Markers):
     """Markers of several kinds."""
 
-    vertices: torch.Tensor  # (K,) those of all parts
+    vertices: torch.Tensor  # (K,) of all parts
     parts: tuple[SurfaceMarkers | RigidMarkers, ...]  # the markers of each kind
-    order: torch.Tensor  # (m,) place of each marker in the parts laid end to end
+    order: torch.Tensor  # (m,) index of the markers in the concatenated parts
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -144,12 +144,12 @@ class JoinedMarkers(Markers):
     def moved(self, by: torch.Tensor) -> "JoinedMarkers":
         counts = [len(part.offsets) for part in self.parts]
         in_parts = by[torch.argsort(self.order).to(by.device)].split(counts)
-        parts = tuple(part.moved(some) for part, some in zip(self.parts, in_parts, strict=True))
+        parts = tuple(part.moved(offsets) for part, offsets in zip(self.parts, in_parts, strict=True))
         return replace(self, parts=parts)
 
 
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
-    """(B, m, 3, 3) rotated tangents and normals of deformed triangles, as columns.
+    """Rotated tangents and normals (B, m, 3, 3) of deformed triangles, as columns.
 
     With f1, f2 the images of the orthonormal tangents and n the unit normal, f1 + f2 x n points along the first column
     of the rotation closest to the deformation of the plane: the polar factor of [[a, b], [c, d]] is the matrix
@@ -163,16 +163,16 @@ def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tens
 
 
 def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
-    r"""(B, 3, 3) rotations R that maximise tr(R^T A), differentiable once; the identity's for an A that is not finite.
+    r"""Rotations R (B, 3, 3) that maximise tr(R^T A), differentiable once; identity where A is not finite.
 
     Where R is optimal, S = R^T A is symmetric. When A changes by dA, R becomes R (1 + [w]) with
 
         (tr(S) 1 - S) w = axial(R^T dA - dA^T R),
 
     as [w] S + S [w] = [(tr(S) 1 - S) w]. The matrix on the left has the eigenvalues s2 + s3, s1 + s3 and s1 + s2,
-    s3 with the sign of det A: it is regular for every set of points that is not on a line, also for a plane and
-    symmetric one, where the singular vectors themselves have no derivative. A step of Newton's method from the
-    optimum moves nothing and has that derivative; so this is one, with all else constant.
+    s3 with the sign of det A: it is regular for all points that are not on a line, also for plane and symmetric
+    ones, where the singular vectors have no derivative. A step of Newton's method from the optimum is zero and has
+    that derivative; so one step is made, with all other values constant.
     """
     identity = torch.eye(3, device=matrix.device, dtype=matrix.dtype)
     with torch.no_grad():
@@ -203,48 +203,49 @@ def bind_markers(
     """Binds markers to a body at rest.
 
     A marker is bound to a triangle of `surface.closest_points`. Beside an edge, a ``normal`` one stands on the plane of
-    that adjacent triangle which it lies most squarely above, outside of the triangle where need be, and a ``frame`` one
-    on the edge.
+    that adjacent triangle which it lies most squarely above, possibly outside of the triangle, and a ``frame`` one on
+    the edge.
 
     Args:
         mesh: The body.
-        positions: (m, 3) [m] where the markers are at rest, in its frame.
+        positions: (m, 3) [m] markers at rest, in the frame of the body.
         names: m names.
-        kind: One of `KINDS` for all markers, or one for each.
+        kind: One of `KINDS` for all markers, or one for every marker.
         vertices: (S,) the vertices that ``rigid`` markers follow.
-        patch: how far from its foot, the closest point of the surface, are those that a ``patch`` marker follows [m].
-        largest_distance: How far from the surface a marker may be [m].
+        patch: Radius around the foot of a ``patch`` marker, the closest point of the surface, of the vertices that it
+            follows [m].
+        largest_distance: Largest distance of a marker from the surface [m].
 
     Returns:
         Markers in float64 on the CPU.
 
     Raises:
         InputError: A marker is too far from the surface or not finite, a kind is unknown, or the vertices of ``rigid``
-            markers are missing, too few, on one line or not there.
+            markers are missing, too few, on one line or not in the mesh.
     """
     points = np.asarray(positions, dtype=np.float64)
     kinds = [kind] * len(names) if isinstance(kind, str) else list(kind)
     _check_markers(points, names, kinds)
-    found = closest_points(mesh, points)
-    worst = int(np.argmax(np.abs(found.distances)))
-    if abs(found.distances[worst]) > largest_distance:
+    feet = closest_points(mesh, points)
+    worst = int(np.argmax(np.abs(feet.distances)))
+    if abs(feet.distances[worst]) > largest_distance:
         raise InputError(
-            f"Marker '{names[worst]}' is {1e3 * abs(found.distances[worst]):.1f} mm from the surface of the body, more "
+            f"Marker '{names[worst]}' is {1e3 * abs(feet.distances[worst]):.1f} mm from the surface of the body, more "
             f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
         )
-    on_surface = np.array([each in ("normal", "frame") for each in kinds])
-    flat = np.array([each == "normal" for each in kinds])
+    flat = np.array(kinds) == "normal"
+    on_surface = flat | (np.array(kinds) == "frame")
     parts: list[SurfaceMarkers | RigidMarkers] = []
     places: list[int] = []
     if on_surface.any():
-        bound = (found.triangles, points, found.points, flat)
-        parts.append(_on_triangles(mesh, *(each[on_surface] for each in bound)))
+        arrays = (feet.triangles, points, feet.points, flat)
+        parts.append(_on_triangles(mesh, *(array[on_surface] for array in arrays)))
         places += np.flatnonzero(on_surface).tolist()
-    if rigid := [number for number, each in enumerate(kinds) if each == "rigid"]:
+    if rigid := [number for number, name in enumerate(kinds) if name == "rigid"]:
         parts.append(_on_vertices(mesh, vertices, points[rigid]))
         places += rigid
-    for number in [number for number, each in enumerate(kinds) if each == "patch"]:
-        near = np.flatnonzero(np.linalg.norm(mesh.vertices - found.points[number], axis=1) <= patch)
+    for number in [number for number, name in enumerate(kinds) if name == "patch"]:
+        near = np.flatnonzero(np.linalg.norm(mesh.vertices - feet.points[number], axis=1) <= patch)
         if len(near) < _LEAST_PATCH:
             raise InputError(
                 f"Marker '{names[number]}' follows {len(near)} vertices within {1e3 * patch:.3g} mm of its foot: "
@@ -274,7 +275,7 @@ def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str
 def _on_triangles(
     mesh: Mesh, triangles: np.ndarray, points: np.ndarray, closest: np.ndarray, flat: np.ndarray
 ) -> SurfaceMarkers:
-    """Markers with feet at the closest points; `flat` ones right below them, in the triangle's plane."""
+    """Markers with feet at the closest points; those of `flat` markers at their projections on the triangle's plane."""
     corners = mesh.vertices[triangles]  # (m, 3, 3)
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # (m, 3, 2), as columns
     normal = np.cross(edges[:, :, 0], edges[:, :, 1])

@@ -1,7 +1,8 @@
-"""What sensors show of a body: a differentiable map from its vertices to M measured points of D numbers each.
+"""Observations: differentiable maps from the vertices of a body to M measured points with D coordinates.
 
-An observation gives what a sensor would show of positions, and how far that is from what it did show. The simulator is
-compared with recordings by these two alone, in `learning.replay`, so that an observation of another kind is one class.
+An observation predicts the measurement of a sensor from positions, and gives the residual of a measurement. The
+simulator is compared with recordings by these two alone, in `learning.replay`, so that a new kind of sensor is one
+class.
 """
 
 from abc import ABC, abstractmethod
@@ -13,11 +14,11 @@ from typing_extensions import override
 
 
 class Observation(ABC):
-    """What a sensor shows of a body; subclasses are frozen dataclasses.
+    """Map from positions to the measurement of a sensor; subclasses are frozen dataclasses.
 
     Attributes:
-        unit: of what is measured.
-        dimension: D, numbers of a measured point.
+        unit: of the measured coordinates.
+        dimension: D, number of coordinates of a measured point.
     """
 
     unit: ClassVar[str] = "m"
@@ -25,20 +26,20 @@ class Observation(ABC):
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns what the sensor shows, (B, M, D) [unit], of positions (B, N, 3) [m] of the vertices."""
+        """Returns the predicted measurement (B, M, D) [unit] at positions (B, N, 3) of the vertices [m]."""
 
-    def residual(self, shown: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
-        """Returns shown less measured points, (..., M, D) [unit], zero where a point was not measured (NaN)."""
+    def residual(self, predicted: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+        """Returns predicted less measured points, (..., M, D) [unit], zero where a point was not measured (NaN)."""
         seen = torch.isfinite(measured).all(-1, keepdim=True)
-        return torch.where(seen, shown - measured, 0.0)
+        return torch.where(seen, predicted - measured, 0.0)
 
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns (B, 3 N, D M), the transposed derivative of what is shown by positions (B, N, 3)."""
+        """Returns the transposed derivative (B, 3 N, D M) of the predicted measurement by positions (B, N, 3)."""
         with torch.enable_grad():
             q = positions.detach().requires_grad_(True)
-            shown = self(q)
-            seeds = torch.eye(shown[0].numel(), device=q.device, dtype=q.dtype).view(-1, 1, *shown.shape[1:])
-            (rows,) = torch.autograd.grad(shown, q, seeds.expand(-1, *shown.shape), is_grads_batched=True)
+            points = self(q)
+            seeds = torch.eye(points[0].numel(), device=q.device, dtype=q.dtype).view(-1, 1, *points.shape[1:])
+            (rows,) = torch.autograd.grad(points, q, seeds.expand(-1, *points.shape), is_grads_batched=True)
         return rows.flatten(2).permute(1, 2, 0).contiguous()
 
     def to(self, like: torch.Tensor) -> Self:

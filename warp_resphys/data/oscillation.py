@@ -1,4 +1,4 @@
-"""Sag, period and decay of a displacement that swings and comes to rest.
+"""Sag, period and decay of a decaying oscillation.
 
 One estimator serves measured and simulated signals: a damped cosine fitted by least squares from the first
 turning point on. It averages over every sample of several periods, so neither the frame rate nor the noise
@@ -20,14 +20,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Oscillation:
-    """What describes a decaying oscillation x(t) = c + b t + exp(-d t) (p cos w t + r sin w t)."""
+    """Parameters of a decaying oscillation x(t) = c + b t + exp(-d t) (p cos w t + r sin w t)."""
 
     sag: float  # Mean of the settled end of the signal [m], signed as the signal is
     tail_spread: float  # Standard deviation of that end [m]: small where the signal has settled
     period: float  # 2 pi / w [s]
     decay_rate: float  # d, of the envelope exp(-d t) [1/s]
     damping_ratio: float  # d / sqrt(d^2 + w^2)
-    fit_residual: float  # Root mean square of what the fit leaves [m]
+    fit_residual: float  # Root mean square residual of the fit [m]
 
 
 def measure_oscillation(
@@ -35,8 +35,8 @@ def measure_oscillation(
 ) -> Oscillation:
     """Measures sag, period and decay.
 
-    The fit spans `window` from the first turning point, so that how the body was let go stays out of it. Its
-    linear term takes up the creep of a viscoelastic body. For a given decay and frequency the other four
+    The fit spans `window` from the first turning point, so that the release itself has no influence. Its
+    linear term models the creep of a viscoelastic body. For a given decay and frequency the other four
     coefficients are linear (variable projection), which leaves a fit of two unknowns.
 
     Args:
@@ -77,7 +77,7 @@ def measure_oscillation(
 
 
 def turning_points(signal: FloatArray, threshold: float = 0.05) -> NDArray[np.int64]:
-    """Indices of the extremes of (T,) that stand out by more than a part of its range, as noise does not; in order."""
+    """Sorted indices of the extremes of (T,) with a prominence above a share of its range, unlike noise."""
     prominence = threshold * np.ptp(signal)
     if prominence == 0.0:
         return np.empty(0, dtype=np.int64)
@@ -102,8 +102,8 @@ def _fit_damped_cosine(
         columns = [np.ones_like(time), time, envelope * np.cos(phase), envelope * np.sin(phase)]
         basis = np.stack(columns, axis=1)
         coefficients = np.linalg.lstsq(basis, values, rcond=None)[0]
-        left: FloatArray = (basis @ coefficients - values) / np.ptp(values)
-        return left
+        remaining: FloatArray = (basis @ coefficients - values) / np.ptp(values)
+        return remaining
 
     fit = least_squares(residual, start, x_scale=np.array([0.1 * start[1], start[1]]), xtol=1e-12, ftol=1e-12)
     scale = float(np.ptp(values))

@@ -1,6 +1,6 @@
-"""Rigid registration: which motion carries measured markers to where they should be on a body, and how well it fits.
+"""Rigid registration: the motion from measured markers to their nominal places on a body, and its residual.
 
-Points are (M, 3) in metres. Nothing here knows about time.
+Points are (M, 3) [m].
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from ..io.errors import DataFileError, InputError, listed
 from .rigid import BoolArray, FloatArray, RigidTransform, fit, root_mean_square
 
 _MILLI = 1e3
-_MOST_FITS = 20_000  # Sets of markers that are tried when outliers are sought.
+_MOST_FITS = 20_000  # Sets of markers that are tried in the search for outliers.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Registration:
 
     names: tuple[str, ...]
     transform: RigidTransform  # From the frame of the recording to that of the body
-    positions: FloatArray  # (M, 3) [m] where the markers are in the frame of the body; NaN for one that was not seen
-    residual: FloatArray  # (M,) [m] how far each is from where it should be; NaN for one that was not seen
-    inliers: BoolArray  # (M,) whether it took part in the fit
-    outliers: tuple[str, ...]  # Names of markers that should have taken part, and were too far off
+    positions: FloatArray  # (M, 3) [m] markers in the frame of the body; NaN for one that was not seen
+    residual: FloatArray  # (M,) [m] distances from the nominal positions; NaN for a marker that was not seen
+    inliers: BoolArray  # (M,) whether a marker took part in the fit
+    outliers: tuple[str, ...]  # Names of markers that were left out of the fit because of their distance
     rms: float  # Root mean square [m] of the residuals of the inliers
 
 
@@ -44,28 +44,28 @@ def register_markers(
     rotation: ArrayLike | None = None,
     vertical: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Registration:
-    """Registers markers at rest to their nominal positions, without those that are not where they should be.
+    """Registers markers at rest to their nominal positions, and detects outliers.
 
-    The fit is the least-squares one (Kabsch) to the largest set of markers of which none is left with more than
-    `largest_residual`; among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000
-    of them, so that no unlucky start can miss the best. The set is more than half of the markers and at least four:
-    two of six markers or seven of fifteen may be anywhere, and three markers that do not fit are an error. Markers
-    that are NaN are left out and do not count. Where the rotation is known, one marker is enough. Where the vertical
-    is, two are, or several on a line, if they do not lie above one another: what is open is the angle about it.
+    The least-squares fit (Kabsch) is made to the largest set of markers with no residual above `largest_residual`;
+    among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000, so that the best is
+    not missed. The set has more than half of the markers and at least four: two of six markers or seven of fifteen may
+    be anywhere, and three markers that do not fit are an error. Markers that are NaN are ignored. Where the rotation is
+    known, one marker is enough. Where the vertical is known, two are enough, or several on a line, if they do not lie
+    above one another: only the angle about the vertical is unknown.
 
     Args:
-        measured: (M, 3) [m] the markers while the body was at rest, in the frame of the recording.
-        nominal: (M, 3) [m] where they should be, in the frame of the body.
+        measured: (M, 3) [m] markers of the body at rest, in the frame of the recording.
+        nominal: (M, 3) [m] nominal positions, in the frame of the body.
         names: M names.
-        source: The file that they come from, for messages.
-        largest_residual: How well the nominal positions are known [m].
-        use: The markers to fit, such as those on the clamp; all if None.
-        rotation: (3, 3) from the frame of the recording to that of the body, where it is known.
-        vertical: (3,) upwards in the frame of the recording and in that of the body, where these are known.
+        source: File of the recording, for messages.
+        largest_residual: Accuracy of the nominal positions [m].
+        use: Names of the markers to fit, such as those on the clamp; all if None.
+        rotation: (3, 3) from the frame of the recording to that of the body, if known.
+        vertical: (3,) upward directions in the frame of the recording and in that of the body, if known.
 
     Raises:
-        InputError: Arrays that do not fit, a name in `use` that there is not, or nominal positions on one line (with a
-            known vertical: above one another).
+        InputError: Arrays of wrong shapes, an unknown name in `use`, or nominal positions on one line (with a known
+            vertical: above one another).
         DataFileError: Fewer than three of the markers are seen (two with a known vertical, one with a known rotation),
             or too many of them are too far off.
     """
@@ -125,15 +125,15 @@ def _registration(
 def _shifted(
     a: FloatArray, b: FloatArray, used: BoolArray, rotation: FloatArray, largest_residual: float
 ) -> tuple[BoolArray, RigidTransform]:
-    """(M,) the largest set of used markers that one shift fits after the rotation, and the motion.
+    """Largest set (M,) of used markers that one translation fits after the rotation, and the motion.
 
-    A set is that of the markers close to what one of them asks for; of two as large, that which fits better.
+    A set has the markers close to the translation of one marker; of two sets of one size, the better fit is taken.
     """
     shifts = b - a @ rotation.T
     sets = [
         used & (np.linalg.norm(shifts - shifts[one], axis=1) <= 2.0 * largest_residual) for one in np.flatnonzero(used)
     ]
-    misfits = [float(np.square(shifts[each] - shifts[each].mean(axis=0)).sum(axis=1).mean()) for each in sets]
+    misfits = [float(np.square(shifts[near] - shifts[near].mean(axis=0)).sum(axis=1).mean()) for near in sets]
     best = max(range(len(sets)), key=lambda row: (np.count_nonzero(sets[row]), -misfits[row]))
     shift = shifts[sets[best]].mean(axis=0)
     near = used & (np.linalg.norm(shifts - shift, axis=1) <= largest_residual)
@@ -143,26 +143,27 @@ def _shifted(
 def _upright(
     a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike], least: float, names: str
 ) -> RigidTransform:
-    """The motion of points a onto points b (M, 3) of those that carry one vertical onto the other."""
-    below, up = (np.asarray(each, dtype=np.float64) / np.linalg.norm(each) for each in vertical)
-    tilt, _ = Rotation.align_vectors(up[None], below[None])
-    now, meant = tilt.apply(a - a.mean(axis=0)), b - b.mean(axis=0)
-    level = meant - np.outer(meant @ up, up)
+    """Least-squares motion from points a to points b (M, 3) that maps one vertical to the other."""
+    up_measured, up = (np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis) for axis in vertical)
+    tilt, _ = Rotation.align_vectors(up[None], up_measured[None])
+    tilted, nominal = tilt.apply(a - a.mean(axis=0)), b - b.mean(axis=0)
+    level = nominal - np.outer(nominal @ up, up)
     if np.linalg.norm(level, axis=1).max() <= least:
         raise InputError(
             f"{names} lie above one another to within {_MILLI * least:.1f} mm, so that the vertical does not tell how "
             "the body is turned: register with another marker."
         )
-    angle = np.arctan2(np.sum(np.cross(now, level) @ up), np.sum(now * level))
+    angle = np.arctan2(np.sum(np.cross(tilted, level) @ up), np.sum(tilted * level))
     rotation = (Rotation.from_rotvec(angle * up) * tilt).as_matrix()
     return RigidTransform(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
 
 
 def axes_rotation(axes: Sequence[str]) -> FloatArray:
-    """(3, 3) rotation to the frame of the body, of the recording's axes along which its x, y and z are.
+    """Rotation (3, 3) from the frame of the recording to that of the body.
 
     Args:
-        axes: of `x`, `-x` and so on, as (x, z, -y) where the body's y is the recording's z, and its z points against y.
+        axes: the recording's axes along the body's x, y and z: (x, z, -y) where the body's y is the recording's z, and
+            its z the recording's -y.
 
     Raises:
         InputError: an axis twice, or axes of a mirror image.
@@ -181,7 +182,7 @@ def axes_rotation(axes: Sequence[str]) -> FloatArray:
 def _used(
     measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path, least: int
 ) -> BoolArray:
-    """(M,) which markers can be fitted: those in `use` that are seen, as many as it takes."""
+    """Which markers are fitted, (M,): those in `use` that were seen; at least `least`."""
     unknown = [name for name in use or () if name not in names]
     if unknown:
         raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
@@ -197,13 +198,13 @@ def _used(
 
 
 def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: float) -> BoolArray | None:
-    """(M,) the largest set of used markers that fit one motion, or None."""
+    """Largest set (M,) of used markers that fit one motion, or None."""
     members = np.flatnonzero(used)
     count = len(members)
-    fits = 0
+    tried = 0
     for left_out in range(max(0, count - max(4, count // 2 + 1)) + 1):
-        fits += comb(count, left_out)
-        if fits > _MOST_FITS:
+        tried += comb(count, left_out)
+        if tried > _MOST_FITS:
             return None
         kept = np.ones((comb(count, left_out), count), dtype=bool)
         for row, without in enumerate(combinations(range(count), left_out)):
@@ -220,18 +221,18 @@ def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: 
 
 
 def _distance_from_line(points: FloatArray) -> float:
-    """Root mean square distance [m] of points (N, 3) from the line that is closest to them."""
+    """Root mean square distance [m] of points (N, 3) from their best-fitting line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.sqrt(np.sum(spread[1:] ** 2) / len(points)))
 
 
 def _worst(a: FloatArray, b: FloatArray, used: BoolArray, names: Sequence[str]) -> str:
-    """The marker without which the others fit best, and how far it is off, for a sentence."""
+    """Describes the marker without which the others fit best, and its residual."""
     members = np.flatnonzero(used).tolist()
     three = len(members) == 3
     fits: list[tuple[float, float, str]] = []
     for marker in members:
-        others = [each for each in members if three or each != marker]
+        others = [member for member in members if three or member != marker]
         motion, _ = fit(a[others], b[others], np.ones(len(others)))
         off = np.linalg.norm(motion.apply(a) - b, axis=1)
         fits.append((float(np.sqrt(np.mean(off[others] ** 2))), -float(off[marker]), names[marker]))

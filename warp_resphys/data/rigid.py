@@ -1,4 +1,4 @@
-"""Rigid motions of points, and which of them carries points onto others best."""
+"""Rigid motions of points, and their least-squares fit."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class RigidTransform:
 
 
 def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:
-    """The rigid motion that carries source points onto target points with the least sum of squares.
+    """Returns the rigid motion from source points to target points with the least sum of squares.
 
     Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. A32 (1976) 922. Both are
     (..., N, 3) [m]; leading axes of either are a batch.
@@ -45,10 +45,10 @@ def kabsch(source: ArrayLike, target: ArrayLike) -> RigidTransform:
 
 
 def fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransform, BoolArray]:
-    """The rigid motion that carries points a onto points b (..., N, 3) with the least weighted sum of squares.
+    """Fits the rigid motion from points a to points b (..., N, 3) with the least weighted sum of squares.
 
     Returns:
-        The motion, and whether the points lie on a line, where it is not determined.
+        The motion, and whether the points lie on a line, so that it is not unique.
     """
     share = (weights / weights.sum(axis=-1, keepdims=True))[..., None]
     centre_a, centre_b = (share * a).sum(axis=-2, keepdims=True), (share * b).sum(axis=-2, keepdims=True)

@@ -129,8 +129,8 @@ class DisplacedMarkers(Observation):
         return torch.cat([markers(positions) for markers in self._all], 1)
 
     @override
-    def residual(self, shown: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
-        return self._markers.residual(shown, measured)
+    def residual(self, predicted: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+        return self._markers.residual(predicted, measured)
 
     @staticmethod
     def split(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

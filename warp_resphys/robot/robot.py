@@ -356,7 +356,7 @@ class Robot:
         for name, response in self._responses.items():
             value = (given or {}).get(name)
             zeros = body.q.new_zeros(body.batch, len(self.inputs[name].parts))
-            still = response.still(zeros if value is None else value)
+            still = response.steady(zeros if value is None else value)
             memory |= {f"{name}.{key}": values for key, values in still.items()}
         base = (given or {}).get(BASE)
         moved = self.description.told_of_base is not None or base is not None

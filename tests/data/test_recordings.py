@@ -106,7 +106,7 @@ class TestALogThatBeganBeforeItsWinch:
             self.read(self.write(path, positions, np.where(numbers >= 30, np.inf, whole), whole))
         with pytest.raises(DataFileError, match="line 2: an actuation is missing"):
             self.read(self.write(path, positions, np.full(40, np.nan), whole))
-        with pytest.raises(DataFileError, match="tells what drove the body in 1 frames: a recording needs two"):
+        with pytest.raises(DataFileError, match="has an actuation in 1 frames: a recording needs two"):
             self.read(self.write(path, positions, np.where(numbers > 0, np.nan, whole), whole))
 
     def test_a_line_that_holds_more_than_its_columns_is_named(self, tmp_path, positions):

@@ -1,1 +1,1 @@
-"""Measured markers: reading files of several programs, occlusions, jumps, the release, and how good a recording is."""
+"""Measured markers: file readers, occlusions, jumps, detection of the release, and quality of a recording."""

@@ -30,20 +30,20 @@ _NAMES = (
 
 
 def read_raw_npz(path: Path) -> RawRecording:
-    """Reads a NumPy archive without running anything that is in it.
+    """Reads a NumPy archive without unpickling.
 
     Raises:
         DataFileError: The file is missing, no archive or damaged, holds Python objects, or an array is missing or
             wrong.
     """
-    found = read_arrays(path, _NAMES)
-    if "" in found:
+    arrays = read_arrays(path, _NAMES)
+    if "" in arrays:
         raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
-    return _assemble(found, path)
+    return _assemble(arrays, path)
 
 
 def read_raw_hdf5(path: Path) -> RawRecording:
-    """Reads an HDF5 file of any origin: each name of the layout may be a dataset or an attribute of the root.
+    """Reads an HDF5 file of any origin: every name of the layout may be a dataset or an attribute of the root.
 
     Raises:
         DataFileError: The file is missing, no HDF5 file or damaged, refers to other files, was written for something
@@ -52,20 +52,20 @@ def read_raw_hdf5(path: Path) -> RawRecording:
     try:
         if not is_as_written(path, USER_BLOCK):
             raise DecodingError("it does not match its checksum")
-        found = decode("h5py", path, "format", "kind", *_NAMES)
+        arrays = decode("h5py", path, "format", "kind", *_NAMES)
     except (OSError, DecodingError) as error:
         raise hdf5_error(path, error) from error
-    kind = _word(found.get("kind"))
-    if _word(found.get("format")) == FORMAT and kind != KIND:
+    kind = _word(arrays.get("kind"))
+    if _word(arrays.get("format")) == FORMAT and kind != KIND:
         raise DataFileError(f"{path} holds '{kind}' where '{KIND}' is needed: check the path.")
     for name, unit in (("positions", "units"), ("actuation", "actuation_units")):
-        if f"{name}.units" in found:
-            found[unit] = found[f"{name}.units"]
-    return _assemble(found, path)
+        if f"{name}.units" in arrays:
+            arrays[unit] = arrays[f"{name}.units"]
+    return _assemble(arrays, path)
 
 
 def decoded(library: str, path: Path) -> Arrays:
-    """What `io.decoding.decode` gives; raises DataFileError where that cannot read the file."""
+    """Returns the result of `io.decoding.decode`; raises DataFileError where it cannot read the file."""
     try:
         return decode(library, path)
     except OSError as error:
@@ -75,9 +75,9 @@ def decoded(library: str, path: Path) -> Arrays:
 
 
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
-    """Writes the HDF5 layout, in metres, so that `read_recording` gives the same recording back.
+    """Writes the HDF5 layout, in metres; `read_recording` returns the same recording.
 
-    Attributes tell what else is known of the trial, such as a load. Missing folders are made.
+    Attributes are further properties of the trial, such as a load. Missing folders are created.
 
     Raises:
         DataFileError: The file cannot be written.
@@ -94,45 +94,45 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
 
 
-def numbers(found: Arrays, name: str, path: Path) -> FloatArray:
-    """One of the arrays of a file, if it is there and holds numbers; raises DataFileError otherwise."""
-    if name not in found:
+def numbers(arrays: Arrays, name: str, path: Path) -> FloatArray:
+    """Returns an array of a file; raises DataFileError if it is missing or does not hold numbers."""
+    if name not in arrays:
         raise DataFileError(
-            f"{path} has no array '{name}'; it has {', '.join(found) or 'none'}: check the path, or see "
+            f"{path} has no array '{name}'; it has {', '.join(arrays) or 'none'}: check the path, or see "
             "docs/recordings.md."
         )
-    if found[name].dtype.kind not in "fiu":
-        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {found[name].dtype}); save numbers there.")
-    return np.asarray(found[name], dtype=np.float64)
+    if arrays[name].dtype.kind not in "fiu":
+        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}); save numbers there.")
+    return np.asarray(arrays[name], dtype=np.float64)
 
 
-def _assemble(found: Arrays, path: Path) -> RawRecording:
-    """A recording from arrays of the layout, by name."""
-    actuation = numbers(found, "actuation", path) if "actuation" in found else None
+def _assemble(arrays: Arrays, path: Path) -> RawRecording:
+    """Returns the recording of arrays of the layout, by name."""
+    actuation = numbers(arrays, "actuation", path) if "actuation" in arrays else None
     if actuation is not None:
-        unit = _word(found.get("actuation_units")) or "1"
+        unit = _word(arrays.get("actuation_units")) or "1"
         if unit not in SI_PER_ACTUATION_UNIT:
             raise DataFileError(
                 f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
             )
         with np.errstate(over="ignore"):
             actuation = actuation * SI_PER_ACTUATION_UNIT[unit]
-    labels = found.get("labels")
+    labels = arrays.get("labels")
     return RawRecording(
-        positions=numbers(found, "positions", path),
+        positions=numbers(arrays, "positions", path),
         labels=None if labels is None else [_text(label) for label in np.ravel(labels)],
-        unit=_word(found.get("units")) or "m",
-        rate=_number(found, "rate_hz", path),
+        unit=_word(arrays.get("units")) or "m",
+        rate=_number(arrays, "rate_hz", path),
         actuation=actuation,
-        rest=numbers(found, "rest", path) if "rest" in found else None,
-        base=numbers(found, "base", path) if "base" in found else None,
-        start=_number(found, "start", path) or 0.0,
-        turns=numbers(found, "quaternions", path) if "quaternions" in found else None,
+        rest=numbers(arrays, "rest", path) if "rest" in arrays else None,
+        base=numbers(arrays, "base", path) if "base" in arrays else None,
+        start=_number(arrays, "start", path) or 0.0,
+        turns=numbers(arrays, "quaternions", path) if "quaternions" in arrays else None,
     )
 
 
-def _number(found: Arrays, name: str, path: Path) -> float | None:
-    array = numbers(found, name, path) if name in found else None
+def _number(arrays: Arrays, name: str, path: Path) -> float | None:
+    array = numbers(arrays, name, path) if name in arrays else None
     if array is not None and array.size != 1:
         raise DataFileError(f"{path}: '{name}' has the shape {array.shape}; it must be one number.")
     return None if array is None else array.item()

@@ -12,14 +12,14 @@ _BIG_ENDIAN_PROCESSOR = 86
 
 
 def read_raw_c3d(path: Path) -> RawRecording:
-    """What a C3D file holds, in its own unit.
+    """Reads the markers of a C3D file, in its own unit.
 
     Raises:
         DataFileError: The file is missing, not C3D, damaged, truncated, or holds no marker trajectories.
     """
     declared_frames = _declared_frames(path)
-    found = decoded("ezc3d", path)
-    points = found["points"]
+    arrays = decoded("ezc3d", path)
+    points = arrays["points"]
     if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
         raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
     if points.shape[2] < declared_frames:
@@ -29,9 +29,9 @@ def read_raw_c3d(path: Path) -> RawRecording:
         )
     return RawRecording(
         positions=points[:3].transpose(2, 1, 0),
-        labels=found["labels"][: points.shape[1]].tolist(),
-        unit=str(found["units"][0]).strip() if found["units"].size else None,
-        rate=float(found["rate"][0]) if found["rate"].size else None,
+        labels=arrays["labels"][: points.shape[1]].tolist(),
+        unit=str(arrays["units"][0]).strip() if arrays["units"].size else None,
+        rate=float(arrays["rate"][0]) if arrays["rate"].size else None,
     )
 
 

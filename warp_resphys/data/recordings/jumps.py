@@ -1,4 +1,4 @@
-"""Samples gone astray: markers that jump, and markers that took over each other's names."""
+"""Faulty samples: markers that jump, and markers with exchanged labels."""
 
 import dataclasses
 
@@ -8,50 +8,50 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from .recording import FloatArray, Recording, bridged, runs
 
 LEAST_JUMP = 2e-4  # [m]
-_TIMES_USUAL = 8.0  # A jump is so many times the median of the steps around it.
+_TIMES_USUAL = 8.0  # Least ratio of a jump and the median of the steps around it.
 _USUAL_FRAMES = 21
-_SHARE_OF_LARGEST = 0.75  # A step of 1 leaves 4/6 beside it, which is no jump of its own.
-_TAKEN_OVER = 0.25  # of the way that the marker went
+_SHARE_OF_LARGEST = 0.75  # Excludes the residual of 4/6 that a jump of 1 leaves in the steps beside it.
+_TAKEN_OVER = 0.25  # of the marker's displacement: largest distance from the other marker's place
 _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Jump:
-    """A step that a marker made alone."""
+    """A step of a single marker."""
 
     label: str
     frame: int  # The first frame after the jump
-    size: float  # [m] how far it went beyond what its neighbours in time, and the other markers, explain
+    size: float  # [m] part of the step that neither its neighbours in time nor the other markers explain
 
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """A marker that appears where another one was."""
+    """A marker that appears at the last place of another one."""
 
     label: str
-    other: str  # The marker in whose place it appears
-    frame: int  # The first frame of that
+    other: str  # The other marker
+    frame: int  # The first frame at that place
 
 
 def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> list[Jump]:
     """Finds steps between two frames that neither the marker's own motion nor that of another marker explains.
 
-    A step is predicted from the two steps on either side of it by a cubic: exact for a motion that is smooth over six
-    frames. What is left is compared with what is left of every other marker, since a body that is let go, or hits
-    something, jerks as a whole; the smallest difference counts. It is a jump if it is larger than `least` and than
-    eight times its median over 21 frames. Gaps are bridged by a spline for this.
+    A step is predicted from the two steps on either side by a cubic, which is exact for a motion that is smooth over
+    six frames. Its residual is compared with the residuals of all other markers, since a body that is released or hits
+    something jerks as a whole; the smallest difference counts. It is a jump if it is larger than `least` and larger
+    than eight times its median over 21 frames. Gaps are interpolated by a spline.
     """
     size = _unexplained(recording)
     if not len(size):
         return []
     usual = median_filter(size, size=(_USUAL_FRAMES, 1), mode="nearest")
     largest = maximum_filter1d(size, 5, axis=0, mode="nearest")
-    found = (size > least) & (size > _TIMES_USUAL * usual) & (size >= _SHARE_OF_LARGEST * largest)
-    return [Jump(recording.labels[column], int(at) + 1, float(size[at, column])) for at, column in np.argwhere(found)]
+    is_jump = (size > least) & (size > _TIMES_USUAL * usual) & (size >= _SHARE_OF_LARGEST * largest)
+    return [Jump(recording.labels[column], int(at) + 1, float(size[at, column])) for at, column in np.argwhere(is_jump)]
 
 
 def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
-    """Finds markers that, after a jump or an occlusion, stand where another marker was before."""
+    """Finds markers that appear at the last place of another marker after a jump or an occlusion."""
     seen = recording.seen
     last_seen = np.maximum.accumulate(np.where(seen, np.arange(len(seen))[:, None], -1), axis=0)  # (T, M)
     swaps: list[Swap] = []
@@ -62,18 +62,18 @@ def find_swaps(recording: Recording, jumps: list[Jump]) -> list[Swap]:
             before = last_seen[frame - 1]  # (M,)
             if not seen[frame, column] or before[column] < 0:
                 continue
-            gone = np.linalg.norm(recording.positions[frame, column] - recording.positions[before[column], column])
+            moved = np.linalg.norm(recording.positions[frame, column] - recording.positions[before[column], column])
             places = recording.positions[before, np.arange(len(before))]  # (M, 3)
             distance = np.linalg.norm(recording.positions[frame, column] - places, axis=1)
             distance[(before < 0) | (np.arange(len(before)) == column)] = np.inf
             nearest = int(np.argmin(distance))
-            if distance[nearest] < _TAKEN_OVER * gone and gone > 5.0 * LEAST_JUMP:
+            if distance[nearest] < _TAKEN_OVER * moved and moved > 5.0 * LEAST_JUMP:
                 swaps.append(Swap(label, recording.labels[nearest], frame))
     return swaps
 
 
 def _unexplained(recording: Recording) -> FloatArray:
-    """(T-1, M) [m] how much of each step is not smooth, and not shared by any other marker."""
+    """Part of the steps (T-1, M) [m] that is neither smooth nor shared by another marker."""
     frames = len(recording.positions)
     if frames < 6:
         return np.zeros((0, len(recording.labels)))
@@ -84,20 +84,20 @@ def _unexplained(recording: Recording) -> FloatArray:
     steps = np.diff(positions, axis=0)
     padded = np.pad(steps, ((2, 2), (0, 0), (0, 0)), mode="reflect")
     beside = (padded[:-4], padded[1:-3], padded[3:-1], padded[4:])
-    left = steps - sum(weight * each for weight, each in zip(_NEIGHBOURS, beside, strict=True))
-    size = np.linalg.norm(left, axis=2)
+    residual = steps - sum(weight * step for weight, step in zip(_NEIGHBOURS, beside, strict=True))
+    size = np.linalg.norm(residual, axis=2)
     for column in range(len(recording.labels)):
-        others = np.linalg.norm(np.delete(left, column, axis=1) - left[:, column, None], axis=2)
+        others = np.linalg.norm(np.delete(residual, column, axis=1) - residual[:, column, None], axis=2)
         if others.shape[1]:
             size[:, column] = np.minimum(size[:, column], others.min(axis=1))
     return size
 
 
 def mask_repeats(recording: Recording) -> Recording:
-    """Makes NaN the frames in which every marker that is seen stands exactly where it stood in the frame before.
+    """Masks frames (NaN) in which all seen markers have exactly their positions in the frame before.
 
-    Measured positions always differ by their noise. Equal ones are a stream that was read faster than it was updated:
-    the frame says nothing new, and less than that of a body that moves.
+    Measured positions always differ by their noise. Equal ones come from a stream that was read faster than it was
+    updated.
     """
     positions = recording.positions
     equal = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))

@@ -1,7 +1,7 @@
-"""From a recording as it was measured to one that a simulation can be compared with.
+"""Processing of measured recordings for the comparison with simulations.
 
-What is known stays; what is short and lies between known frames is interpolated; the rest is masked: its positions
-stay NaN, and `Recording.seen` is False there.
+Short gaps between measured frames are interpolated; longer gaps are masked: positions stay NaN, and `Recording.seen` is
+False there.
 """
 
 import dataclasses
@@ -15,21 +15,21 @@ from ..base_motion import at_times
 from .recording import Recording, bridged, runs
 from .release import Release, find_release
 
-_FIRST_SECONDS = 0.2  # A stretch may begin so much later than the first one.
-_WHOLE = 1e-6  # Relative; how near a ratio of rates must be to a whole number.
+_FIRST_SECONDS = 0.2  # [s] latest start of a stretch after that of the first one
+_WHOLE = 1e-6  # Relative tolerance for a whole ratio of rates
 
 
 def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False) -> Recording:
     """Interpolates short occlusions by a cubic spline through the frames in which the marker was seen.
 
     Args:
-        recording: What to fill.
+        recording: The recording.
         longest: The longest gap that is filled, in frames.
-        mask_long: Leave longer gaps, and gaps at either end, as NaN. Otherwise a longer gap is refused, and a short
-            one at either end is filled with the nearest sample, as nothing lies beyond it.
+        mask_long: Keep longer gaps, and gaps at either end, as NaN. Otherwise a longer gap is an error, and a short one
+            at either end is filled with the nearest sample.
 
     Raises:
-        DataFileError: A marker is seen in fewer than two frames or, unless that is masked, occluded for longer.
+        DataFileError: A marker is seen in fewer than two frames or, unless masked, occluded for longer.
     """
     positions = recording.positions.copy()
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
@@ -53,12 +53,12 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
 
 
 def resample(recording: Recording, rate: float) -> Recording:
-    """Brings a recording to the simulator's rate 1/h [Hz].
+    """Resamples a recording at the simulator's rate 1/h [Hz].
 
-    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise a cubic
-    spline goes through the frames in which a marker was seen; a new frame is seen if the frames on both sides of it
-    were. Actuation is interpolated linearly. What is interpolated should move slowly beside the frame rate: a spline
-    follows a swing with n frames a period to about (2 pi / n)^4 / 384 of its amplitude.
+    Where the recording's rate is a whole multiple, every n-th frame is kept, exactly as measured. Otherwise positions
+    are interpolated by a cubic spline through the frames in which a marker was seen; a new frame is seen if the frames
+    on both sides of it were. Actuation is interpolated linearly. The relative error of the spline is about
+    (2 pi / n)^4 / 384 for an oscillation with n frames a period.
     """
     ratio = recording.rate / rate
     every = round(ratio)
@@ -81,12 +81,12 @@ def resample(recording: Recording, rate: float) -> Recording:
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:
-    """Takes out what is faster than a body moves: a Butterworth filter forwards and backwards, which delays nothing.
+    """Low-pass filters positions by a zero-phase Butterworth filter, forwards and backwards.
 
     Its gain is one half at the cut-off, and falls by 48 dB an octave above it. Forces follow from accelerations, in
-    which noise grows with the square of its frequency: without this, a force that explains every frame is mostly noise.
+    which noise grows with the square of its frequency: without a filter, reconstructed forces are mostly noise.
 
-    Gaps stay gaps; they are crossed by straight lines.
+    Gaps stay NaN; the filter input is linear there.
 
     Raises:
         InputError: the cut-off [Hz] is not below half of the frame rate.
@@ -104,41 +104,41 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
     frames = np.arange(len(positions))
     for column, seen in enumerate(recording.seen.T):
         if seen.any():
-            found = [np.interp(frames, frames[seen], x[seen]) for x in recording.positions[:, column].T]
-            positions[:, column] = sosfiltfilt(sections, np.stack(found, axis=1), axis=0, padlen=pad)
+            filled = [np.interp(frames, frames[seen], x[seen]) for x in recording.positions[:, column].T]
+            positions[:, column] = sosfiltfilt(sections, np.stack(filled, axis=1), axis=0, padlen=pad)
             positions[~seen, column] = np.nan
     return dataclasses.replace(recording, positions=positions)
 
 
 def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5) -> Release:
-    """Finds when the body was let go, from the mean of those moving markers that are seen longest at first.
+    """Finds the release of the body from the mean of the moving markers with the longest first stretch without gaps.
 
-    Occlusions of up to `longest_gap` frames are interpolated for this.
+    Occlusions of up to `longest_gap` frames are interpolated.
 
     Raises:
-        DataFileError: A marker is missing, or nothing is let go before all of them are hidden.
+        DataFileError: A marker is missing, or there is no release before all markers are hidden.
     """
     moving = fill_gaps(recording.select(labels), longest_gap, mask_long=True)
     stretches = [stretch for seen in moving.seen.T for stretch in runs(seen)]
     earliest = min(start for start, _ in stretches) + _FIRST_SECONDS * moving.rate
-    start, stop = max((stretch for stretch in stretches if stretch[0] <= earliest), key=lambda each: each[1] - each[0])
+    start, stop = max((stretch for stretch in stretches if stretch[0] <= earliest), key=lambda ends: ends[1] - ends[0])
     use = moving.seen[start:stop].all(axis=0)
     part = (
         "" if stop - start == len(moving.positions) else f", frames {start} to {stop - 1}, the first without a long gap"
     )
     path = moving.positions[start:stop, use].mean(axis=1)
-    found = find_release(path, recording.rate, source=f"{recording.source}{part}")
-    return Release(start + found.frame, (start + found.rest[0], start + found.rest[1]))
+    release = find_release(path, recording.rate, source=f"{recording.source}{part}")
+    return Release(start + release.frame, (start + release.rest[0], start + release.rest[1]))
 
 
 def trim_to_release(recording: Recording, release: Release, seconds: float | None = None) -> Recording:
-    """The frames from the release on, and where the markers were while the body was held.
+    """Returns the frames from the release on, with the held markers as `rest`.
 
-    The release falls between two frames: `start` of the result is the time from it to the first frame that is kept.
-    What is later than `seconds` after it is left out.
+    The release is between two frames: `start` of the result is the time from the release to the first frame. Frames
+    later than `seconds` after the release are left out.
 
     Raises:
-        DataFileError: A marker is not seen at all while the body is held, or too few frames are left.
+        DataFileError: A marker is never seen while the body is held, or too few frames are left.
     """
     held = recording.positions[slice(*release.rest)]
     visible = recording.seen[slice(*release.rest)]

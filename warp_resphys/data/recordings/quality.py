@@ -1,4 +1,4 @@
-"""How good a recording is: occlusions, jumps, noise, and whether what should stand still does."""
+"""Quality of a recording: occlusions, jumps, noise, and drift of markers that should stand still."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ _LEAST_NOISE_FRAMES = 10
 _QUIET_QUARTILE = 25.0
 _DRIFT_PART = 0.1  # of the frames, at either end
 _MUCH_DRIFT = 2e-4  # [m]
-_RELEASE_FRAMES = 1.5  # around the release, in which a marker that is alone on its body jerks without a fault
+_RELEASE_FRAMES = 1.5  # around the release, in which a jerk of a marker is no jump
 
 
 @dataclasses.dataclass(frozen=True)
 class MarkerQuality:
-    """One marker of a recording."""
+    """Quality of one marker."""
 
     label: str
     still: bool  # Whether it should not move
@@ -36,51 +36,51 @@ class MarkerQuality:
     masked: int  # Frames in gaps that are too long to be filled, or at either end
     jumps: tuple[Jump, ...]  # Its jumps, in the order of time
     noise: float  # [m] standard deviation of one coordinate, from third differences in the quietest parts
-    drift: float | None  # [m] from its place in the first tenth of the frames to that in the last; None if it may move
+    drift: float | None  # [m] between the median places in the first and last tenth of the frames; None if it may move
     reach: float  # [m] largest distance from its median position
 
     @property
     def largest_jump(self) -> Jump | None:
-        """The jump that went farthest, if there is one."""
+        """The largest jump, if there is one."""
         return max(self.jumps, key=lambda jump: jump.size, default=None)
 
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """What `quality` found out about a recording."""
+    """Quality of a recording."""
 
     source: Path
     rate: float  # Frames a second [Hz]
     frames: int
-    release: Release | None  # When the body was let go, if that was looked for and found
-    markers: tuple[MarkerQuality, ...]  # One entry a marker
-    swaps: tuple[Swap, ...]  # Markers that took over each other's place
+    release: Release | None  # Release of the body, if known
+    markers: tuple[MarkerQuality, ...]  # One entry for every marker
+    swaps: tuple[Swap, ...]  # Markers at the place of another one
     longest_gap: int  # The longest occlusion that counts as short, in frames
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should look at, a sentence each."""
-        found = [
+        """Warnings for the user, one sentence each."""
+        warnings = [
             f"From frame {swap.frame} on, {swap.label} stands where {swap.other} was: check the labels."
             for swap in self.swaps
         ]
         for marker in self.markers:
             if marker.masked:
-                found.append(
+                warnings.append(
                     f"{marker.label} is hidden for up to {marker.longest_gap} frames; {marker.masked} frames are "
                     "masked."
                 )
             if largest := marker.largest_jump:
                 often = "once," if len(marker.jumps) == 1 else f"{len(marker.jumps)} times, farthest"
-                found.append(
+                warnings.append(
                     f"{marker.label} jumps {often} by {_MILLI * largest.size:.2f} mm, in frame {largest.frame}."
                 )
             if marker.drift is not None and marker.drift > max(_MUCH_DRIFT, 5.0 * marker.noise):
-                found.append(f"{marker.label} should not move and drifts by {_MILLI * marker.drift:.2f} mm.")
-        return found
+                warnings.append(f"{marker.label} should not move and drifts by {_MILLI * marker.drift:.2f} mm.")
+        return warnings
 
     def to_plain(self) -> dict[str, Any]:
-        """For quality.json: lengths in millimetres, as in the table."""
+        """Returns the content of quality.json, with lengths in millimetres."""
         markers = [
             {
                 "label": marker.label,
@@ -117,14 +117,14 @@ def quality(
     longest_gap: int = 5,
     least_jump: float = LEAST_JUMP,
 ) -> Quality:
-    """Examines a recording as it was measured, before gaps are filled.
+    """Examines a measured recording before gaps are filled.
 
     Args:
         recording: The recording.
         still: Markers that should not move, such as those on the clamp.
-        release: When the body was let go, if known: the jerk of that is no jump.
+        release: Release of the body, if known; its jerk is not counted as a jump.
         longest_gap: The longest occlusion that will be filled, in frames.
-        least_jump: The smallest jump that counts [m].
+        least_jump: Smallest size of a jump [m].
 
     Raises:
         DataFileError: A marker that should not move is not in the recording.
@@ -164,25 +164,25 @@ def quality(
 
 
 def noise_level(recording: Recording) -> FloatArray:
-    """Standard deviation [m] of one coordinate of each marker, (M,); NaN where too little was seen.
+    """Standard deviation of the noise in a coordinate of every marker, (M,) [m]; NaN where too few frames were seen.
 
-    Third differences of a smooth motion are small, those of white noise of variance s^2 have the variance 20 s^2
-    (1 + 9 + 9 + 1). They are averaged over stretches of 25 frames, and the lower quartile of these is taken, so that a
-    swing or a jump in some of them does not count as noise.
+    Third differences of a smooth motion are small, those of white noise with variance s^2 have the variance 20 s^2
+    (1 + 9 + 9 + 1). They are averaged over stretches of 25 frames, and the lower quartile of the stretches is taken, so
+    that oscillations or jumps in some of them do not count as noise.
     """
     third = np.diff(recording.positions, n=3, axis=0)  # (T-3, M, 3), NaN beside gaps
     stretches = [third[start : start + _NOISE_FRAMES] for start in range(0, len(third), _NOISE_FRAMES)]
     noise = np.full(len(recording.labels), np.nan)
     for column in range(len(recording.labels)):
         values = [stretch[:, column][np.isfinite(stretch[:, column]).all(axis=1)] for stretch in stretches]
-        variances = [np.mean(np.square(each)) / 20.0 for each in values if len(each) >= _LEAST_NOISE_FRAMES]
+        variances = [np.mean(np.square(part)) / 20.0 for part in values if len(part) >= _LEAST_NOISE_FRAMES]
         if variances:
             noise[column] = np.sqrt(np.percentile(variances, _QUIET_QUARTILE))
     return noise
 
 
 def quality_table(result: Quality) -> list[list[str]]:
-    """The table as rows of text, the first one the header; lengths in millimetres."""
+    """Returns rows of text with a header; lengths in millimetres."""
     header = ["marker", "seen", "gaps", "longest", "masked", "jumps", "largest [mm]", "noise [mm]", "drift [mm]"]
     rows = [header]
     for marker in result.markers:
@@ -196,28 +196,28 @@ def quality_table(result: Quality) -> list[list[str]]:
 
 @dataclasses.dataclass(frozen=True)
 class BaseMotion:
-    """How the base markers of a recording differ from those of the first one."""
+    """Displacement of the base markers of a recording relative to the first recording."""
 
     source: Path
-    shift: FloatArray  # (M,) [m] how far each marker stands from its place in the first recording
-    changes: FloatArray  # (M, M) [m] how much the distance between each two of them differs: of the shape they make
+    shift: FloatArray  # (M,) [m] distances of the markers from their places in the first recording
+    changes: FloatArray  # (M, M) [m] changes of the distances between every two markers
 
     @property
     def distortion(self) -> FloatArray:
-        """(M,) [m] median change of each marker's distance to the other ones."""
+        """Median change of a marker's distances to the other ones, (M,) [m]."""
         count = len(self.changes)
         others = self.changes[~np.eye(count, dtype=np.bool_)].reshape(count, count - 1)
         return np.asarray(np.median(others, axis=1))
 
 
 def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
-    """Compares where two or more markers on something rigid stand, by their median positions in several recordings.
+    """Compares the median positions of two or more markers on a rigid base in several recordings.
 
     Returns:
-        An entry for each recording after the first.
+        One entry for every recording after the first.
 
     Raises:
-        DataFileError: A marker is missing, or never seen, in one of them.
+        DataFileError: A marker is missing or never seen in a recording.
     """
     places = []
     for recording in recordings:
@@ -242,10 +242,10 @@ def check_base(
     largest_distortion: float = 1e-3,
     largest_shift: float | None = None,
 ) -> None:
-    """Refuses trials on one set-up between which a marker on its base was moved.
+    """Checks that no marker on the base of a set-up was moved between trials.
 
-    The distance between two markers may change by `largest_distortion` [m]. A marker may stand `largest_shift` [m] from
-    its place in the first recording; anywhere if None, which is right where each recording is registered by itself.
+    The distance between two markers may change by `largest_distortion` [m]. A marker may be `largest_shift` [m] from
+    its place in the first recording; anywhere if None, for recordings that are registered separately.
 
     Raises:
         DataFileError: A marker moved, is missing or is never seen.
@@ -272,12 +272,12 @@ def check_base(
 
 
 def check_motion(recording: Recording, labels: Sequence[str]) -> None:
-    """Refuses a recording in which none of these markers moves, as of a stream that froze, or of the wrong ones.
+    """Checks that one of the markers moves; none does in a frozen stream or with the wrong markers.
 
-    One of them must move by half a millimetre from its first position, in the median of three frames.
+    A marker moves if the median of three frames is half a millimetre from its first position.
 
     Raises:
-        DataFileError: A marker is not in the recording, or none of them moves so far.
+        DataFileError: A marker is not in the recording, or none of them moves.
     """
     chosen, farthest = recording.select(labels), 0.0
     for path, seen in zip(chosen.positions.swapaxes(0, 1), chosen.seen.T, strict=True):
@@ -293,7 +293,7 @@ def check_motion(recording: Recording, labels: Sequence[str]) -> None:
 
 
 def check_passive(recording: Recording) -> None:
-    """Refuses a recording with pressures or forces that nothing would use; raises DataFileError."""
+    """Checks that a recording has no actuation, which would be ignored; raises DataFileError."""
     if recording.actuation is not None:
         raise DataFileError(
             f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here "

@@ -1,4 +1,4 @@
-"""One function for every kind of recording."""
+"""Reader of recordings in all supported formats."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,18 +28,18 @@ def read_recording(
     labels: Sequence[str] | None = None,
     table: Table | None = None,
 ) -> Recording:
-    """Reads a recording; the end of its name tells the format. docs/recordings.md describes the layouts.
+    """Reads a recording in the format of its file name extension. docs/recordings.md describes the layouts.
 
     Args:
         path: A C3D, CSV, TSV, npz or HDF5 file.
-        units: m, cm or mm, where the file does not say it, or says it wrongly.
-        rate: Frames a second [Hz], where the file does not say it, or says it wrongly.
-        labels: A name for each marker in the file's order, in place of those in the file.
-        table: What the columns of a CSV, TSV or text file are, where it has no header, or another.
+        units: m, cm or mm, where missing or wrong in the file.
+        rate: Frames a second [Hz], where missing or wrong in the file.
+        labels: A name for every marker in the file's order, in place of those in the file.
+        table: Columns of a CSV, TSV or text file without a header or with an unknown one.
 
     Raises:
-        DataFileError: The file is missing, of another format, damaged, or lacks something that was not given.
-        InputError: What was given cannot be used.
+        DataFileError: The file is missing, damaged, of an unknown format, or incomplete.
+        InputError: An argument is invalid.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())

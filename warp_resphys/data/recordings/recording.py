@@ -1,4 +1,4 @@
-"""What every reader returns: labelled markers over time, in metres and seconds, with occlusions as NaN."""
+"""Recordings: labelled markers over time, in metres and seconds, with occlusions as NaN."""
 
 import dataclasses
 from collections import Counter
@@ -17,43 +17,43 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-# What an actuation is divided into; one without a unit is kept as it is.
+# Factors to SI units; 1 for an actuation without a unit.
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]
-_QUATERNION_ERROR = 0.01  # of the length of a quaternion, which is one
-ARM = 0.05  # [m] from a rigid body to the points that tell how it is turned
+_QUATERNION_ERROR = 0.01  # largest deviation of the length of a quaternion from one
+ARM = 0.05  # [m] distance from a rigid body to the points that represent its rotation
 RATES = (1e-3, 1e6)  # [Hz]
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Markers followed over time."""
+    """Positions of markers over time."""
 
     labels: tuple[str, ...]  # Names of the M markers
     positions: FloatArray  # (T, M, 3) [m], NaN where a marker is occluded
     rate: float  # Frames a second [Hz]
-    source: Path  # The file it came from
-    # (T, C) [Pa, N or without a unit] what drove the body in each frame, if that was recorded
+    source: Path  # The file
+    # (T, C) [Pa, N or 1] actuation of the body in every frame, if recorded
     actuation: FloatArray | None = None
-    # (M, 3) [m] the markers on the body at rest, if known; it tells where they sit on it
+    # (M, 3) [m] markers on the body at rest, if known
     rest: FloatArray | None = None
-    # (T, 6) the motion since the first frame of what the body is fixed to, if that was recorded; see `data.base_motion`
+    # (T, 6) motion of the base since the first frame, if recorded; see `data.base_motion`
     base: FloatArray | None = None
     start: float = 0.0  # Time of the first frame [s]; after `trim_to_release`, since the release
 
     @property
     def seen(self) -> BoolArray:
-        """(T, M) whether a marker has a position; what a loss or an error may use."""
+        """Whether a marker has a position, (T, M)."""
         return np.asarray(np.isfinite(self.positions).all(axis=2))
 
     @property
     def time(self) -> FloatArray:
-        """(T,) [s] of the frames."""
+        """Times of the frames, (T,) [s]."""
         return self.start + np.arange(len(self.positions)) / self.rate
 
     def select(self, labels: Sequence[str]) -> "Recording":
-        """The same recording with these markers only, in this order.
+        """Returns the recording with these markers only, in this order.
 
         Raises:
             DataFileError: A marker is not in the recording.
@@ -70,14 +70,14 @@ class Recording:
         return dataclasses.replace(self, labels=tuple(labels), positions=self.positions[:, columns], rest=rest)
 
     def frames(self, chosen: slice) -> "Recording":
-        """Some of the frames; rate and start stay as they are."""
-        actuation, base = (None if each is None else each[chosen] for each in (self.actuation, self.base))
+        """Returns some of the frames, with rate and start unchanged."""
+        actuation, base = (None if series is None else series[chosen] for series in (self.actuation, self.base))
         return dataclasses.replace(self, positions=self.positions[chosen], actuation=actuation, base=base)
 
 
 @dataclasses.dataclass(frozen=True)
 class RawRecording:
-    """What a file holds, in its own units; None for what it does not say."""
+    """Content of a file, in its own units; None for missing values."""
 
     positions: FloatArray  # (T, M, 3) [unit]
     labels: Sequence[str] | None  # M names
@@ -85,7 +85,7 @@ class RawRecording:
     rate: float | None  # [Hz]
     actuation: FloatArray | None = None  # (T, C) [Pa, N or 1]
     rest: FloatArray | None = None  # (M, 3) [unit]
-    # (T, 7) a point of what the body is fixed to [m], and a quaternion of its rotation, w first
+    # (T, 7) position of a point of the base [m], and quaternion of its rotation, w first
     base: FloatArray | None = None
     start: float = 0.0  # Time of the first frame [s]
     # (T, M, 4) quaternions, w first, of those markers that are rigid bodies; NaN for others
@@ -99,16 +99,16 @@ def to_recording(
     rate: float | None = None,
     labels: Sequence[str] | None = None,
 ) -> Recording:
-    """Brings what was read of a file to metres and seconds, and checks it.
+    """Converts the content of a file to metres and seconds, and checks it.
 
-    What is given, as `reading.read_recording` describes it, goes before what the file says. A marker without a name
-    becomes `marker 3`, those that share one `name #1`, `name #2` and so on. A rigid body becomes four markers: its
-    place, and the points `name +x`, `name +y` and `name +z` at 50 mm along its axes.
+    Arguments, described in `reading.read_recording`, take precedence over the file. A marker without a name becomes
+    `marker 3`, markers with one name become `name #1`, `name #2` and so on. A rigid body becomes four markers: its
+    position, and the points `name +x`, `name +y` and `name +z` at 50 mm along its axes.
 
     Raises:
-        DataFileError: The unit or the rate is missing or not known, an array has the wrong shape, or the positions are
-            too large or too small to be in this unit.
-        InputError: A given unit, rate or list of names cannot be used.
+        DataFileError: The unit or the rate is missing or unknown, an array has the wrong shape, or the positions are
+            too large or too small for the unit.
+        InputError: The unit, rate or list of names in the arguments is invalid.
     """
     if units is not None and units not in METRES_PER_UNIT:
         raise InputError(f"units is {units!r}: set it to m, cm or mm, the unit of {path}.")
@@ -159,7 +159,7 @@ def to_recording(
 def _with_arms(
     names: tuple[str, ...], positions: FloatArray, rest: FloatArray | None, turns: FloatArray, path: Path
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
-    """The same with the points on the axes of rigid bodies; where these are at rest is not known."""
+    """Adds the points on the axes of rigid bodies, with unknown rest positions."""
     if turns.shape != (*positions.shape[:2], 4):
         raise DataFileError(
             f"{path}: its quaternions have the shape {turns.shape}; each marker in each frame needs (w, x, y, z), NaN "
@@ -189,7 +189,7 @@ def _with_arms(
 
 
 def _check_span(positions: FloatArray, path: Path) -> None:
-    """Refuses positions [m] that no marker system records of a body of a laboratory, as those in a wrong unit."""
+    """Checks that positions [m] have the size of a laboratory; they do not in a wrong unit."""
     seen = positions[np.isfinite(positions).all(axis=2)]
     if not len(seen):
         raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
@@ -204,7 +204,7 @@ def _check_span(positions: FloatArray, path: Path) -> None:
 
 
 def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[str, ...]:
-    """M different names."""
+    """Returns M distinct names."""
     markers = raw.positions.shape[1]
     if given is not None and len(given) != markers:
         raise InputError(f"labels has {len(given)} names; {path} has {markers} markers: name each of them.")
@@ -220,9 +220,9 @@ def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[
 
 
 def bridged(recording: Recording, column: int, frames: ArrayLike) -> FloatArray:
-    """(T', 3) [m] a marker at frames, by a cubic spline through those in which it was seen, two or more.
+    """Positions (T', 3) [m] of a marker at frames, by a cubic spline through the frames in which it was seen.
 
-    Before the first and after the last of them, it stays where it was seen there.
+    Positions before the first and after the last of these are constant.
     """
     known = np.flatnonzero(recording.seen[:, column])
     spline = CubicSpline(known, recording.positions[known, column])

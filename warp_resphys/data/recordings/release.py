@@ -1,4 +1,4 @@
-"""The moment in which a body begins to move: one that was held is let go, or a valve opens."""
+"""Detection of the time at which a body begins to move: the release of a held body, or the opening of a valve."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,33 +18,32 @@ _LEAST_DROP = 1e-3  # [m]
 _LEAST_REST = 0.03  # [s] that the body must be seen at rest
 _LEAST_MOTION = 5e-4  # [m]
 _FAST = 1.0 / 3.0  # of the largest speed: from there on the body certainly moves
-_STILL = 0.1  # of the largest speed: below that it does not yet
-_QUIET_SHARE = 0.2  # of the excursion: what a body at rest may wander
-_FITTED = 2  # frames of the motion; a line through more would begin too early, as sqrt(s) of a swing bends down
-_BEFORE = 1.0  # frames of it that noise and a slow start may hide
+_STILL = 0.1  # of the largest speed: below that the body is at rest
+_QUIET_SHARE = 0.2  # of the excursion: largest displacement of a body at rest
+_FITTED = 2  # frames of the motion; with more, the line would begin too early, as sqrt(s) of a swing is concave
+_BEFORE = 1.0  # frames of the motion that noise and a slow start may hide
 
 
 @dataclasses.dataclass(frozen=True)
 class Release:
-    """When a body that was held still began to move."""
+    """Release of a held body."""
 
     frame: float  # The moment of release, in frames and parts of a frame
-    rest: tuple[int, int]  # First and past-the-last frame of the quiet stretch before it, in which the body was held
+    rest: tuple[int, int]  # First and past-the-last frame of the quiet stretch before, in which the body was held
 
 
 def find_release(path: FloatArray, rate: float, source: str | Path = "the recording") -> Release:
-    """Finds when a point that was held still was let go, on a path (T, 3) [m] without NaN at a rate [Hz].
+    """Finds the release of a point on a path (T, 3) [m] without NaN at a rate [Hz].
 
-    The point moves fast for the first time where one frame's step reaches a third of the largest (of a path
-    through a three-frame median, which a sample gone astray does not pass). The body was held in the last
-    stretch before that which is quiet: it spreads by less than 2 % of the later excursion. A body let go from
-    rest first moves by s = a (t - t0)^2 / 2, so sqrt(s) of the first three frames of motion is a line, and
-    its zero is the release.
+    The fast motion begins where the step between two frames first reaches a third of the largest one, after a
+    median filter of three frames against outliers. The body was held in the last quiet stretch before, with a
+    spread of less than 2 % of the later excursion. A body released from rest first moves by
+    s = a (t - t0)^2 / 2, so sqrt(s) of the first three frames of motion is a line, and its zero is the release.
 
     A mean of several markers is the best path.
 
     Raises:
-        DataFileError: The path has no such moment.
+        DataFileError: The path has no release.
     """
     length = max(2, round(_QUIET * rate))
     smooth = median_filter(path, size=(3, 1), mode="nearest")
@@ -81,21 +80,21 @@ def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> f
     if line is None:
         return float(last_still)
     slope, zero = line
-    # A frame that noise hides may be the first of the motion: the line tells how long ago it was let go at most.
+    # Noise may hide the first frame of the motion: the line gives the earliest time of the release.
     moved = np.sqrt(max(travelled[last_still] + 2.0 * noise, 0.0))
     return float(np.clip(zero, last_still - min(moved / slope, 1.0), last_still + 1))
 
 
 def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
-    """Finds when a body at rest begins to move, between two frames.
+    """Finds the opening of a valve, at which a body at rest begins to move, between two frames.
 
-    The mean of the followed markers moves fast for the first time where its speed reaches a third of the largest. The
-    last frame before that which is slower than a tenth of it ends the rest. As pressure builds up, the body first moves
-    by about s = a (t - t0)^2 / 2, so sqrt(s) of the next two frames is a line, and its zero is the opening; it may lie
-    up to a frame before the end of the rest, as noise hides a slow start. Frames that are missing there cost up to
-    their number. A slow drift, as of a valve that leaks, is not taken for the opening.
+    The fast motion begins where the speed of the mean of the followed markers first reaches a third of the largest. The
+    rest ends in the last frame before with less than a tenth of the largest speed. As pressure builds up, the body
+    first moves by about s = a (t - t0)^2 / 2, so sqrt(s) of the next two frames is a line, and its zero is the opening;
+    it may be up to a frame before the end of the rest, as noise hides a slow start. Missing frames there add an error
+    of up to their number. A slow drift, such as that of a leaking valve, is not counted as the opening.
 
-    Frames in which one of these markers was not seen are left out; so should be those that repeat the one before
+    Frames in which a followed marker was not seen are ignored. Repeated frames should be masked before
     (`jumps.mask_repeats`).
 
     Returns:
@@ -138,7 +137,7 @@ def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
 
 
 def _root_line(time: FloatArray | NDArray[np.int64], travelled: FloatArray) -> tuple[float, float] | None:
-    """Slope and zero of a line through the roots of (T,) ways [m]; None where these do not grow.
+    """Slope and zero of a line through the square roots of distances (T,) [m]; None where these do not grow.
 
     A body that starts from rest first moves by s = a (t - t0)^2 / 2, so that the zero is t0.
     """

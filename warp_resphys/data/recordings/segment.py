@@ -1,7 +1,7 @@
-"""The published recordings of a pneumatic segment under steps of pressure: their layout, and the way into ours.
+"""Conversion of the published recordings of a pneumatic segment under steps of pressure.
 
-They are others' data; docs/recordings.md says where they are offered. The segment hangs along -z from its clamp at
-z = 0. The chamber that is inflated is the one towards +x: the tip goes towards -x.
+docs/recordings.md says where they are published. The segment hangs along -z from its clamp at z = 0. The inflated
+chamber is on the side of +x, so that the tip moves towards -x.
 """
 
 from dataclasses import replace
@@ -18,7 +18,7 @@ from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_record
 from .release import valve_opening
 
 LENGTH: Final = 0.1  # [m]
-# [m] where the markers should be: four on the clamp, three at the tip, in the order of the labels.
+# Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
 SEGMENT_NOMINAL: Final = np.array(
     [
         *((-0.0505, -0.0205, 0.102), (-0.0305, -0.0505, 0.102), (-0.0105, 0.0505, 0.102), (-0.0505, 0.0235, 0.102)),
@@ -29,14 +29,14 @@ CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
 SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)
 _LARGEST_PRESSURE: Final = 1e5  # mbar
-MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # which recorded marker each of the labels is
+MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # index of the recorded marker of every label
 
 
 def read_published_segment(path: str | Path) -> dict[int, Recording]:
     """Reads the recordings of the segment, by pressure in mbar.
 
-    Time zero is the opening of the valve, as `valve_opening` finds it; the actuation is the pressure asked for, a step.
-    `rest` is the median of the frames before it. Frames that repeat the one before were not measured, and are NaN.
+    Time zero is the opening of the valve, from `valve_opening`; the actuation is the commanded pressure, a step. `rest`
+    is the median of the frames before. Repeated frames were not measured, and are NaN.
 
     Args:
         path: an archive of `pressure_mbar` (R,), `markers` (R, T, 7, 3) [m] and `rate_hz`.

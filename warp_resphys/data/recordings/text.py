@@ -29,19 +29,19 @@ _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 _CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
 _CLOCKS = ("time", "frame")
 _SECONDS = {"s": 1.0, "ms": 1e-3}
-_UNEVEN = 0.25  # of a frame, that a time stamp may be off
-_LARGEST_STAMP = 1e12  # [s or 1], a time or frame number that is believed
+_UNEVEN = 0.25  # of a frame: largest error of a time stamp
+_LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
 @dataclass(frozen=True)
 class Table:
-    """What a table holds that does not say so itself, as logs of other programs do not.
+    """Description of a table without a known header, such as a log of another program.
 
     Attributes:
-        columns: the header that it should have had: a cell for each column, None for one that is not read.
-        header_lines: lines of the file that come before the numbers.
+        columns: the header in the known format, one cell for every column; None for a column that is not read.
+        header_lines: number of lines before the numbers.
     """
 
     columns: Sequence[str | None]
@@ -49,14 +49,14 @@ class Table:
 
 
 def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
-    """Reads a table, a Qualisys TSV or a Motive CSV; which one it is, its first line tells.
+    """Reads a table, a Qualisys TSV or a Motive CSV, detected from its first line.
 
     Args:
         path: of the file.
-        table: how it is to be read, whatever its first line says.
+        table: description of the file, in place of its first line.
 
     Raises:
-        DataFileError: The file is missing, empty or no text, has none of the layouts, or a cell or row is wrong.
+        DataFileError: The file is missing, empty or not text, has an unknown layout, or a cell or row is invalid.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -82,9 +82,9 @@ def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
 
 
 def _read_table(rows: Rows, path: Path) -> RawRecording:
-    """A header of `time [s]` or `frame`, then `<marker>.x`, `.y`, `.z` of each marker, and channels `name [unit]`.
+    """Reads a table with columns `time [s]` or `frame`, `<marker>.x`, `.y` and `.z`, and channels `name [unit]`.
 
-    A rigid body has its quaternion as well, in `.qw`, `.qx`, `.qy` and `.qz`.
+    A rigid body also has a quaternion, in `.qw`, `.qx`, `.qy` and `.qz`.
     """
     columns = [_name_and_unit(cell) for cell in rows[0]] if rows else []
     if not columns or columns[0][0].lower() not in _CLOCKS or len(columns) < 4:
@@ -96,7 +96,7 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
 
 
 def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
-    """The same, with the columns that the table is said to have; a length that is no marker's is a channel here."""
+    """Reads a table with described columns; a column in a length that is not of a marker is a channel."""
     rows = [*rows[: table.header_lines], *_without_empty_ends(rows[table.header_lines :], len(table.columns))]
     width = len(rows[table.header_lines]) if len(rows) > table.header_lines else 0
     if width != len(table.columns):
@@ -109,37 +109,37 @@ def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
 
 
 def _without_empty_ends(rows: Rows, width: int) -> Rows:
-    """The same rows without the cells beyond a width, where none of them holds anything."""
+    """Removes empty cells beyond a width from the rows."""
     return [row if any(row[width:]) else row[:width] for row in rows]
 
 
 def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:
-    """(T', C) channels (T, C) until the first of them ends, each from the start on as it is first told.
+    """Channels (T', C) from (T, C), cut off where one of them ends; missing first values equal the first known one.
 
-    A log may begin before what drives the body is switched on, and end after it is switched off.
+    A log may begin before the actuators are switched on, and end after they are switched off.
     """
-    told = np.isfinite(driven)
-    if np.isinf(driven).any() or not told.any(axis=0).all():
-        row = int(np.argmax((np.isinf(driven) | ~told.any(axis=0)).any(axis=1)))
+    known = np.isfinite(driven)
+    if np.isinf(driven).any() or not known.any(axis=0).all():
+        row = int(np.argmax((np.isinf(driven) | ~known.any(axis=0)).any(axis=1)))
         raise DataFileError(f"{path}, line {lines[row]}: an actuation is missing or infinite; every frame needs one.")
-    first = told.argmax(axis=0)
-    end = len(driven) - int(told[::-1].argmax(axis=0).max())
+    first = known.argmax(axis=0)
+    end = len(driven) - int(known[::-1].argmax(axis=0).max())
     frames = np.arange(end)[:, None]
-    found = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
-    if (missing := np.isnan(found).any(axis=1)).any():
+    filled = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
+    if (missing := np.isnan(filled).any(axis=1)).any():
         raise DataFileError(
             f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame between the first and "
             "the last one that has it needs one."
         )
     if first.any() or end < len(driven):
         log.warning(
-            "%s does not tell what drove the body in its first %d frames, where it counts as it is told first, nor in "
-            "its last %d, which are left out.",
+            "%s has no actuation in its first %d frames, which get its first known value, nor in its last %d, which are "
+            "left out.",
             *(path.name, int(first.max()), len(driven) - end),
         )
     if end < _LEAST_FRAMES:
-        raise DataFileError(f"{path} tells what drove the body in {end} frames: a recording needs two or more.")
-    return np.asarray(found)
+        raise DataFileError(f"{path} has an actuation in {end} frames: a recording needs two or more.")
+    return np.asarray(filled)
 
 
 def _read_columns(
@@ -150,15 +150,15 @@ def _read_columns(
     path: Path,
     planar: bool = False,
 ) -> RawRecording:
-    """The lines from ``first`` on, of columns whose names and units are known by their number.
+    """Reads the lines from ``first`` on, with column names and units by column index.
 
-    Where markers may be ``planar``, a coordinate that none of their columns has is zero.
+    With ``planar``, a coordinate that no marker has a column for is zero.
     """
     clocks = [number for number, (name, _) in columns.items() if name.lower() in _CLOCKS]
     if len(clocks) > 1:
         raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
-    clock, told = columns[clocks[0]] if clocks else ("frame", None)
-    timed, clock_unit = clock.lower() == "time", told or "s"
+    clock, unit_of_clock = columns[clocks[0]] if clocks else ("frame", None)
+    timed, clock_unit = clock.lower() == "time", unit_of_clock or "s"
     if timed and clock_unit not in _SECONDS:
         raise DataFileError(f"{path} gives its time in '{clock_unit}': it must be in s or ms, as in 'time [s]'.")
     named, turned, units, channels = [], {}, set(), {}
@@ -186,7 +186,7 @@ def _read_columns(
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
     width = len(rows[first]) if len(rows) > first else 0
     read, lines = _numbers(rows, first, list(columns), width if planar else len(columns), path)
-    values = np.zeros((len(read), max(columns, default=0) + 2))  # The last column is what planar markers lack.
+    values = np.zeros((len(read), max(columns, default=0) + 2))  # The last column stays zero, for planar markers.
     values[:, list(columns)] = read
     stamps = values[:, clocks[0]] if clocks else np.arange(len(values), dtype=np.float64)
     if timed:
@@ -201,39 +201,39 @@ def _read_columns(
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     start = float(stamps[0]) if timed else 0.0
-    found = np.full((len(values), len(labels), len(_QUATERNION)), np.nan)
-    for row, numbers in turns.items():
-        found[:, row] = values[:, numbers]
+    quaternions = np.full((len(values), len(labels), len(_QUATERNION)), np.nan)
+    for marker, numbers in turns.items():
+        quaternions[:, marker] = values[:, numbers]
     return RawRecording(
         *(_positions(frames, values[:, chosen]), labels, next(iter(units), None), rate, actuation),
         start=start,
-        turns=_spread(frames, found) if turns else None,
+        turns=_spread(frames, quaternions) if turns else None,
     )
 
 
 def _quaternions(turned: dict[tuple[str, str], int], labels: Sequence[str], path: Path) -> dict[int, list[int]]:
-    """By the number of a marker that is a rigid body, the columns of its quaternion, w first."""
-    found = {}
+    """Columns of the quaternions, w first, by the index of the rigid body among the markers."""
+    columns = {}
     for label in dict.fromkeys(label for label, _ in turned):
         missing = [axis for axis in _QUATERNION if (label, axis) not in turned]
         if label not in labels or missing:
             lacks = f"column '{label}.{missing[0]}'" if missing else "place"
             raise DataFileError(f"{path}: the rigid body {label} has no {lacks}: it needs x, y, z, qw, qx, qy and qz.")
-        found[labels.index(label)] = [turned[label, axis] for axis in _QUATERNION]
-    return found
+        columns[labels.index(label)] = [turned[label, axis] for axis in _QUATERNION]
+    return columns
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    """The parts of `name [unit]`; no unit without brackets at its end."""
+    """Splits `name [unit]`; the unit is None without brackets at the end."""
     name, bracket, unit = cell.removesuffix("]").rpartition("[")
     return (name.rstrip(), unit) if bracket and cell.endswith("]") else (cell, None)
 
 
 def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
-    """Lines of a key and its values, then perhaps a line of column names, then a line a frame; millimetres.
+    """Reads lines of a key and its values, an optional line of column names, and one line for every frame; millimetres.
 
-    A line may begin with its frame's number, or with that and its time. Qualisys writes 0.000 for all three
-    coordinates of a marker that it did not see, or leaves them empty.
+    A line may begin with its frame number, or with frame number and time. Qualisys writes 0.000 for all three
+    coordinates of an occluded marker, or leaves them empty.
     """
     first = next((number for number, row in enumerate(rows) if _is_data(row)), len(rows))
     keys = {row[0]: row[1:] for row in rows[:first] if row}
@@ -243,9 +243,9 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
     width = max((len(row) for row in rows[first:]), default=0)
     values, lines = _numbers(rows, first, range(width), width, path)
     leading = width - 3 * len(labels)
-    if "Frame" in keys:  # The line of column names.
+    if "Frame" in keys:  # There is a line of column names.
         leading = 2 if keys["Frame"][:1] == ["Time"] else 1
-    elif leading > 0 and np.isnan(values[:, -1]).all():  # Each line ends in a tab.
+    elif leading > 0 and np.isnan(values[:, -1]).all():  # Every line ends in a tab.
         leading -= 1
     if leading not in (0, 1, 2) or width - leading - 3 * len(labels) not in (0, 1):
         raise DataFileError(
@@ -254,7 +254,7 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
         )
     if leading:
         frames, _ = _frames(values[:, 0], False, lines, path)
-    else:  # Nothing but their number tells whether all of them are there.
+    else:  # Missing frames can be detected from the number of lines alone.
         frames = np.arange(len(values))
         declared = "".join(keys.get("NO_OF_FRAMES", [])[:1])
         if declared and declared != str(len(values)):
@@ -269,9 +269,9 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
 
 
 def _read_motive(rows: Rows, path: Path) -> RawRecording:
-    """A line of keys and values, lines of Type, Name and further properties, a line of axes, then a line a frame.
+    """Reads a line of keys and values, lines of Type, Name and others, a line of axes, and one line for every frame.
 
-    Of the columns, those of Type Marker are taken: the measured markers, not those of a solved rigid body.
+    Only columns of Type Marker are read: measured markers, not those of a solved rigid body.
     """
     keys = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     axes_line = next((number for number, row in enumerate(rows) if row[:1] == ["Frame"]), None)
@@ -294,23 +294,23 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
 
 
 def _markers(named: Iterable[tuple[str, str, int]], path: Path, planar: bool = False) -> tuple[list[str], list[int]]:
-    """Labels, and the columns of their x, y and z in turn, of columns by label and axis.
+    """Returns labels, and the columns of their x, y and z, from columns by label and axis.
 
-    The column of the one axis that planar markers lack is -1.
+    The column of the axis that planar markers do not have is -1.
     """
-    found: dict[tuple[str, str], int] = {}
+    columns: dict[tuple[str, str], int] = {}
     for label, axis, column in named:
-        if (label, axis) in found:
+        if (label, axis) in columns:
             raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these markers.")
-        found[label, axis] = column
-    labels = list(dict.fromkeys(label for label, _ in found))
-    axes = {axis for _, axis in found}
+        columns[label, axis] = column
+    labels = list(dict.fromkeys(label for label, _ in columns))
+    axes = {axis for _, axis in columns}
     flat = planar and len(axes) == 2
     for label in labels:
         for axis in _AXES:
-            if (label, axis) not in found and not (flat and axis not in axes):
+            if (label, axis) not in columns and not (flat and axis not in axes):
                 raise DataFileError(f"{path}: marker {label} has no column '{label}.{axis}'; export it again with all.")
-    return labels, [found.get((label, axis), -1) for label in labels for axis in _AXES]
+    return labels, [columns.get((label, axis), -1) for label in labels for axis in _AXES]
 
 
 def _is_data(row: Sequence[str]) -> bool:
@@ -327,7 +327,7 @@ def _number(cell: str) -> float | None:
 
 
 def _numbers(rows: Rows, first: int, columns: Sequence[int], width: int, path: Path) -> tuple[FloatArray, list[int]]:
-    """(T, C) these columns of the rows of one width from `first` on, NaN where a cell is empty; their line numbers."""
+    """Returns columns (T, C) of the rows from `first` on, NaN for empty cells, and the line numbers of the rows."""
     values, lines = [], []
     for line, row in enumerate(rows[first:], start=first + 1):
         if not any(row):
@@ -354,7 +354,7 @@ def _numbers(rows: Rows, first: int, columns: Sequence[int], width: int, path: P
 def _frames(
     stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path
 ) -> tuple[NDArray[np.int64], float | None]:
-    """Number of each row's frame, from 0 on, by its number or time [s]; and the rate [Hz] that times tell."""
+    """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
     known = np.abs(stamps) <= _LARGEST_STAMP
     steps = np.diff(np.where(known, stamps, np.nan))
     wrong = np.append(~known[0], ~(steps > 0.0))
@@ -367,7 +367,7 @@ def _frames(
     foreign = DataFileError(f"{path}: its times or frame numbers do not belong to one recording; check that column.")
     if _LEAST_RECORDED * span > interval * len(stamps):
         raise foreign
-    if timed:  # The whole recording tells the interval better than times that were rounded.
+    if timed:  # The whole recording gives the interval more precisely than rounded times.
         interval = span / round(span / interval)
     exact = (stamps - stamps[0]) / interval
     frames = np.round(exact).astype(np.int64)
@@ -387,12 +387,12 @@ def _frames(
 
 
 def _positions(frames: NDArray[np.int64], values: FloatArray) -> FloatArray:
-    """(T, M, 3) positions from (R, 3 M) rows at their frames; a frame that was not recorded is NaN."""
+    """Positions (T, M, 3) from rows (R, 3 M) at their frames; NaN in frames that were not recorded."""
     return _spread(frames, values.reshape(len(values), -1, 3))
 
 
 def _spread(frames: NDArray[np.int64], values: FloatArray) -> FloatArray:
-    """(T, ...) values from (R, ...) at their frames, NaN at others."""
+    """Values (T, ...) from (R, ...) at their frames, NaN in other frames."""
     spread = np.full((int(frames[-1]) + 1, *values.shape[1:]), np.nan)
     spread[frames] = values
     return spread

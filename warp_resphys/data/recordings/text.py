@@ -133,8 +133,8 @@ def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatA
         )
     if first.any() or end < len(driven):
         log.warning(
-            "%s has no actuation in its first %d frames, which get its first known value, nor in its last %d, which are "
-            "left out.",
+            "%s has no actuation in its first %d frames, which get its first known value, nor in its last %d, which "
+            "are left out.",
             *(path.name, int(first.max()), len(driven) - end),
         )
     if end < _LEAST_FRAMES:

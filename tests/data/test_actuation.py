@@ -34,12 +34,12 @@ def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
     assert abs(p.mean()) < 150.0
     assert p.std() == pytest.approx(1e3, rel=0.08)
     for lag in (5, 10):
-        found = (p[:, lag:] * p[:, :-lag]).mean() / p.var()
-        assert found == pytest.approx(np.exp(-0.5 * (lag * STEP / 0.1) ** 2), abs=0.06)
+        result = (p[:, lag:] * p[:, :-lag]).mean() / p.var()
+        assert result == pytest.approx(np.exp(-0.5 * (lag * STEP / 0.1) ** 2), abs=0.06)
     assert np.corrcoef(p[..., 0].ravel(), p[..., 1].ravel())[0, 1] == pytest.approx(0.6, abs=0.08)
 
 
-def test_a_seed_gives_its_sequence_and_another_one_another():
+def test_sequences_depend_on_the_seed_alone():
     first, again, other = (InputSequences().draw(100, STEP, 3, np.random.default_rng(i)) for i in (4, 4, 5))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e3
@@ -69,7 +69,7 @@ def test_recorded_pressures_are_checked():
         check_inputs(high, PRESSURE, 2, 2e4, "a.h5")
 
 
-def test_a_gauge_that_is_a_little_off_zero_is_believed_and_one_that_is_far_off_is_not():
+def test_a_small_zero_error_of_a_gauge_is_accepted_and_a_large_one_refused():
     tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
     np.testing.assert_array_equal(check_inputs(tension, TENSION, 2, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
     with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):

@@ -22,38 +22,38 @@ def seen(places=PLACES, noise=0.0, turn=TURN):
 
 @pytest.mark.parametrize("noise", [0.0, 3e-3])
 @pytest.mark.parametrize("extra", [0, 2])
-def test_markers_are_named_whatever_their_order_and_the_frame(noise, extra):
+def test_markers_are_named_in_any_order_and_frame(noise, extra):
     others = np.random.default_rng(1).uniform(-1.0, 1.0, (extra, 3))
-    found = assign(np.concatenate([others, seen(noise=noise)]), PLACES, NAMES, source="file")
-    np.testing.assert_array_equal(found.columns, extra + np.argsort(ORDER))
-    np.testing.assert_allclose(found.transform.rotation, TURN, atol=30.0 * noise + 1e-9)
-    assert found.rms <= 2.0 * noise + 1e-9 < found.next_rms
+    result = assign(np.concatenate([others, seen(noise=noise)]), PLACES, NAMES, source="file")
+    np.testing.assert_array_equal(result.columns, extra + np.argsort(ORDER))
+    np.testing.assert_allclose(result.transform.rotation, TURN, atol=30.0 * noise + 1e-9)
+    assert result.rms <= 2.0 * noise + 1e-9 < result.next_rms
 
 
-def test_one_marker_that_stands_still_is_enough_where_the_axes_are_known():
+def test_one_anchor_is_enough_with_known_axes():
     """The others may be centimetres from where they are expected, as on a body of unknown stiffness."""
     moved = PLACES + np.array([[0.0, 0.005, 0.0], [0.01, 0.02, 0.0], [0.01, 0.03, 0.01], [0.02, 0.04, 0.02], [0, 0, 0]])
-    found = assign(seen(moved), PLACES, NAMES, source="file", anchors=[4], rotation=TURN)
-    np.testing.assert_array_equal(found.columns, np.argsort(ORDER))
-    np.testing.assert_allclose(found.transform.translation, SHIFT, atol=1e-9)
+    result = assign(seen(moved), PLACES, NAMES, source="file", anchors=[4], rotation=TURN)
+    np.testing.assert_array_equal(result.columns, np.argsort(ORDER))
+    np.testing.assert_allclose(result.transform.translation, SHIFT, atol=1e-9)
 
 
-def test_three_anchors_tell_the_frame_of_a_bent_body():
+def test_three_anchors_determine_the_frame_of_a_bent_body():
     places = np.concatenate([PLACES, [[-0.05, 0.0, 0.0], [0.0, -0.06, 0.02]]])
     names, bent = (*NAMES, "base 2", "base 3"), places.copy()
     bent[:4, 0] += np.array([0.0, 0.01, 0.03, 0.06])
-    found = assign((bent - SHIFT) @ TURN, places, names, source="file", anchors=[4, 5, 6])
-    np.testing.assert_array_equal(found.columns, np.arange(7))
-    np.testing.assert_allclose(found.transform.rotation, TURN, atol=1e-9)
+    result = assign((bent - SHIFT) @ TURN, places, names, source="file", anchors=[4, 5, 6])
+    np.testing.assert_array_equal(result.columns, np.arange(7))
+    np.testing.assert_allclose(result.transform.rotation, TURN, atol=1e-9)
 
 
-def test_markers_that_cannot_be_told_apart_are_named():
+def test_ambiguous_markers_are_named():
     places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]])  # a square
     with pytest.raises(DataFileError, match=r"swing.csv: which of its markers is which is not clear: .* 'a', "):
         assign(places @ TURN, places, NAMES[:4], source="swing.csv")
 
 
-def test_what_cannot_be_assigned():
+def test_ambiguous_assignments_are_refused():
     hidden = seen()
     hidden[1] = np.nan
     with pytest.raises(DataFileError, match="file shows 4 markers, and 5 are configured"):

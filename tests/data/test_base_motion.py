@@ -40,7 +40,7 @@ def moved(poses, points=POINTS):
 
 
 class TestFunctions:
-    def test_nothing_moves_before_the_start_and_then_as_it_says(self):
+    def test_nothing_moves_before_the_start_of_the_sinusoids(self):
         poses = prescribed(SWING, TIMES)
         assert not poses[TIMES <= 0.3].any()
         after = TIMES >= 0.5
@@ -67,18 +67,18 @@ class TestTables:
         quaternions = Rotation.from_rotvec(known[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
         table = np.column_stack([TIMES, moved(known, place[None])[:, 0] + offset, quaternions])
         np.savetxt(tmp_path / "shaker.csv", table, delimiter=",", header="t, x, y, z, w, i, j, k")
-        found = prescribed(MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path)
-        np.testing.assert_allclose(moved(found), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
+        result = prescribed(MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path)
+        np.testing.assert_allclose(moved(result), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
 
     @pytest.mark.parametrize(
         "text", ["1,2,3\n", "a,b\n", "0,0,0,0,1,0,0,0\n" * 5, "0,0,0,0,0,0,0,0\n1,0,0,0,1,0,0,0\n" * 2]
     )
-    def test_what_is_no_table_of_poses_is_one_sentence(self, tmp_path, text):
+    def test_invalid_tables_of_poses_are_refused(self, tmp_path, text):
         (tmp_path / "bad.csv").write_text(text)
         with pytest.raises(DataFileError, match=r"bad\.csv.*(\.$|to be)"):
             prescribed(MotionSettings(**{"file": "bad.csv"}), TIMES, tmp_path)
 
-    def test_a_table_that_is_not_there(self, tmp_path):
+    def test_a_missing_table_is_an_error(self, tmp_path):
         with pytest.raises(DataFileError, match="cannot be read"):
             prescribed(MotionSettings(**{"file": "none.csv"}), TIMES, tmp_path)
 
@@ -90,13 +90,13 @@ class TestRecorded:
         turned = rigid(known).rotation @ start.rotation[0].T
         quaternions = Rotation.from_matrix(rigid(known).rotation).as_quat()[:, [3, 0, 1, 2]]
         quaternions[::3] *= -2.0  # the same rotations
-        found = rigid(since_first(known[:, :3], quaternions, "a.npz"))
-        np.testing.assert_allclose(found.rotation, turned, atol=1e-12)
-        again = found.apply(np.broadcast_to(start.apply(POINTS[None]), (len(known), *POINTS.shape)))
+        result = rigid(since_first(known[:, :3], quaternions, "a.npz"))
+        np.testing.assert_allclose(result.rotation, turned, atol=1e-12)
+        again = result.apply(np.broadcast_to(start.apply(POINTS[None]), (len(known), *POINTS.shape)))
         np.testing.assert_allclose(again, moved(known), atol=1e-12)
 
     @pytest.mark.parametrize("wrong", [np.nan, 0.0])
-    def test_a_quaternion_that_is_none(self, wrong):
+    def test_an_invalid_quaternion_is_refused(self, wrong):
         quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
         quaternions[2] = wrong
         with pytest.raises(DataFileError, match="'base' needs, in every frame"):
@@ -111,20 +111,20 @@ class TestRecorded:
 class TestFollowed:
     NOISE = 1e-4  # m
 
-    def test_markers_tell_the_motion_with_less_than_their_noise(self):
+    def test_the_base_motion_is_more_accurate_than_its_markers(self):
         draw = np.random.default_rng(0)
         known = prescribed(SWING, TIMES)
         markers = moved(known) + self.NOISE * draw.standard_normal((len(TIMES), *POINTS.shape))
         markers[20:25, 1] = markers[100, :2] = np.nan  # three of them are seen, then two
-        found = followed(markers, POINTS, "a.npz")
-        error = np.linalg.norm(moved(found) - moved(known), axis=-1)
+        result = followed(markers, POINTS, "a.npz")
+        error = np.linalg.norm(moved(result) - moved(known), axis=-1)
         assert error.mean() < self.NOISE
-        jerky = np.diff(moved(found), 2, axis=0) - np.diff(moved(known), 2, axis=0)
+        jerky = np.diff(moved(result), 2, axis=0) - np.diff(moved(known), 2, axis=0)
         assert np.abs(jerky).mean() < 0.2 * self.NOISE  # unsmoothed, 2.4 times the noise over the root of their number
 
-    def test_a_base_that_stands_still_stays_where_it_is(self):
-        found = followed(np.broadcast_to(POINTS, (50, *POINTS.shape)), POINTS, "a.npz")
-        assert np.abs(found).max() < 1e-12
+    def test_a_base_at_rest_has_no_motion(self):
+        result = followed(np.broadcast_to(POINTS, (50, *POINTS.shape)), POINTS, "a.npz")
+        assert np.abs(result).max() < 1e-12
 
     def test_too_few_markers(self):
         markers = moved(prescribed(SWING, TIMES))
@@ -142,8 +142,8 @@ class TestFollowed:
 
 def test_times_between_frames_and_beyond_them():
     poses = prescribed(SWING, TIMES)
-    found = at_times(poses, TIMES, TIMES[:-1] + 0.003)
-    np.testing.assert_allclose(found, prescribed(SWING, TIMES[:-1] + 0.003), atol=2e-5)
+    result = at_times(poses, TIMES, TIMES[:-1] + 0.003)
+    np.testing.assert_allclose(result, prescribed(SWING, TIMES[:-1] + 0.003), atol=2e-5)
     np.testing.assert_array_equal(at_times(poses, TIMES, np.array([-1.0, 3.0])), poses[[0, -1]])
 
 

@@ -38,7 +38,7 @@ def let_go(noise=0.0):
     return wr.ObservedMotion(pixels, resting=resting, observation=camera())
 
 
-def test_a_marker_is_where_the_pinhole_has_it():
+def test_a_marker_is_at_its_pinhole_projection():
     shown = camera()(torch.as_tensor(MESH.vertices)[None])[0].numpy()
     x, y, z = (PLACES @ TURN.T + SHIFT).T
     np.testing.assert_allclose(shown, np.column_stack([FOCAL * x / z, FOCAL * y / z]) + CENTRE, rtol=1e-12)
@@ -51,10 +51,10 @@ def test_the_derivative_is_that_of_differences():
     torch.testing.assert_close(sees.transposed_jacobian(at)[0].T @ way.flatten(), numeric, rtol=1e-7, atol=1e-5)
 
 
-def test_youngs_modulus_comes_back_from_pixels():
+def test_youngs_modulus_is_recovered_from_pixels():
     # A hundred and fifty numbers with noise of a pixel, while the tip moves by some twenty.
-    found = wr.identify(beam(180e3), let_go(noise=1.0), {"youngs_modulus": (1e5, 1e6)})
-    assert found.parameters["youngs_modulus"] == pytest.approx(264e3, rel=0.02)
+    result = wr.identify(beam(180e3), let_go(noise=1.0), {"youngs_modulus": (1e5, 1e6)})
+    assert result.parameters["youngs_modulus"] == pytest.approx(264e3, rel=0.02)
     exact = wr.identify(beam(180e3), let_go(), {"youngs_modulus": (1e5, 1e6)})
     assert exact.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
 

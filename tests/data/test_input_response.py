@@ -12,21 +12,21 @@ STEP = 0.01
 def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
     command = torch.full((50, 1, 1), 2e4, dtype=torch.float64)
     rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
-    found, _ = InputResponse(STEP, rise=rise).from_rest(command)
+    result, _ = InputResponse(STEP, rise=rise).from_rest(command)
     times = STEP * torch.arange(1, 51, dtype=torch.float64)
-    torch.testing.assert_close(found[:, 0, 0], 2e4 * (1 - torch.exp(-times / rise)))
-    found.sum().backward()
+    torch.testing.assert_close(result[:, 0, 0], 2e4 * (1 - torch.exp(-times / rise)))
+    result.sum().backward()
     expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
     torch.testing.assert_close(rise.grad[0], expected)
 
 
-def test_a_delay_moves_commands_and_shares_a_step():
+def test_a_delay_shifts_commands_and_averages_over_a_step():
     command = torch.arange(1.0, 6.0, dtype=torch.float64)[:, None, None].expand(-1, 3, 2)
     late = torch.tensor([0.0, 2.0, 1.25], dtype=torch.float64) * STEP
-    found = InputResponse(STEP, delay=late).from_rest(command)[0][..., 0]
-    assert found[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert found[:, 1].tolist() == [0.0, 0.0, 1.0, 2.0, 3.0]
-    torch.testing.assert_close(found[:, 2], torch.tensor([0.0, 0.75, 1.75, 2.75, 3.75], dtype=torch.float64))
+    result = InputResponse(STEP, delay=late).from_rest(command)[0][..., 0]
+    assert result[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert result[:, 1].tolist() == [0.0, 0.0, 1.0, 2.0, 3.0]
+    torch.testing.assert_close(result[:, 2], torch.tensor([0.0, 0.75, 1.75, 2.75, 3.75], dtype=torch.float64))
 
 
 def test_a_delay_is_differentiable():
@@ -36,14 +36,14 @@ def test_a_delay_is_differentiable():
     assert torch.autograd.gradcheck(delayed, (late,), eps=1e-4 * STEP, atol=1e-6)
 
 
-def test_means_remember_what_the_pressure_was():
+def test_means_are_exponential_averages_of_the_pressure():
     pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
     pressure[20:, :, 0] = 1e4
-    told = with_means(*InputResponse(STEP, filters=[0.1, 1.0]).from_rest(pressure))
-    assert told.shape == (100, 1, 6)
-    torch.testing.assert_close(told[..., :2], pressure)
-    assert not told[:20].any()
-    fast, slow = told[-1, 0, 2], told[-1, 0, 4]
+    context = with_means(*InputResponse(STEP, filters=[0.1, 1.0]).from_rest(pressure))
+    assert context.shape == (100, 1, 6)
+    torch.testing.assert_close(context[..., :2], pressure)
+    assert not context[:20].any()
+    fast, slow = context[-1, 0, 2], context[-1, 0, 4]
     assert float(fast) == pytest.approx(1e4, rel=1e-3)
     assert float(slow) == pytest.approx(1e4 * (1 - np.exp(-0.8)), rel=1e-9)
     torch.testing.assert_close(with_means(*InputResponse(STEP).from_rest(pressure)), pressure)
@@ -59,14 +59,14 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
         one, mean, memory = response(memory, now[None])
         np.testing.assert_allclose(one[0], acting[number], atol=1e-12)
         np.testing.assert_allclose(mean[:, 0], means[:, number], atol=1e-12)
-    of_each = [torch.tensor([1.0, each, 0.5 * each], dtype=torch.float64) for each in (0.8, delay, rise)]
-    found, told = InputResponse(STEP, *of_each, [0.1, 0.5]).from_rest(torch.as_tensor(commands))
-    np.testing.assert_allclose(found[:, 1], acting[:, 1], atol=1e-12)
-    np.testing.assert_allclose(told[:, :, 1], means[:, :, 1], atol=1e-12)
-    assert float((found[:, 0] - torch.as_tensor(acting[:, 0])).abs().max()) > 1e-3
+    of_each = [torch.tensor([1.0, value, 0.5 * value], dtype=torch.float64) for value in (0.8, delay, rise)]
+    result, context = InputResponse(STEP, *of_each, [0.1, 0.5]).from_rest(torch.as_tensor(commands))
+    np.testing.assert_allclose(result[:, 1], acting[:, 1], atol=1e-12)
+    np.testing.assert_allclose(context[:, :, 1], means[:, :, 1], atol=1e-12)
+    assert float((result[:, 0] - torch.as_tensor(acting[:, 0])).abs().max()) > 1e-3
 
 
-def test_constant_commands_are_remembered_as_if_they_had_always_been_given():
+def test_the_steady_memory_is_that_of_constant_commands():
     commands = np.array([[1.0, 2.0]])
     response = InputResponse(STEP, 0.8, 0.013, 0.02, [0.3])
     acting, means, _ = response(response.steady(commands), commands[None])

@@ -28,28 +28,28 @@ def shaken(scale=0.01, count=5):
 
 
 @pytest.mark.parametrize("name", VIEWS)
-def test_what_is_told_of_nominal_places_is_these(name):
+def test_the_view_of_nominal_places_is_the_identity(name):
     np.testing.assert_allclose(VIEWS[name].of_arrays(NOMINAL), NOMINAL, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", VIEWS)
-def test_what_is_told_twice_is_told_once(name):
+def test_a_view_is_idempotent(name):
     once = VIEWS[name].of_arrays(shaken())
     np.testing.assert_allclose(VIEWS[name].of_arrays(once), once, atol=1e-12)
 
 
-def test_depth_is_not_told():
+def test_depth_is_not_observed():
     points = shaken()
-    told = VIEWS["plane"].of_arrays(points)
-    np.testing.assert_array_equal(told[..., [0, 2]], points[..., [0, 2]])
-    np.testing.assert_array_equal(told[..., 1], np.broadcast_to(NOMINAL[:, 1], (5, 4)))
+    context = VIEWS["plane"].of_arrays(points)
+    np.testing.assert_array_equal(context[..., [0, 2]], points[..., [0, 2]])
+    np.testing.assert_array_equal(context[..., 1], np.broadcast_to(NOMINAL[:, 1], (5, 4)))
 
 
 @pytest.mark.parametrize(
     ("name", "axis"), [("own", [0.6, -0.64, 0.48]), ("own plane", [0, 1, 0]), ("own plane, turned", [1, 0, 0])]
 )
 @pytest.mark.parametrize("angle", [0.3, -2.0, 3.1])
-def test_a_shape_is_told_wherever_it_is(name, axis, angle):
+def test_the_view_of_a_shape_is_invariant_to_rigid_motion(name, axis, angle):
     """In three dimensions or in the plane, moved by any angle: the same shape, and no other."""
     points, view = shaken(), VIEWS[name]
     shift = np.array([0.3, -0.2, 0.1])
@@ -60,15 +60,15 @@ def test_a_shape_is_told_wherever_it_is(name, axis, angle):
 
 @pytest.mark.parametrize("name", ["own", "own plane"])
 def test_no_rigid_motion_is_closer_to_the_nominal_places(name):
-    told = VIEWS[name].of_arrays(shaken())
-    error = np.square(told - NOMINAL).sum()
+    context = VIEWS[name].of_arrays(shaken())
+    error = np.square(context - NOMINAL).sum()
     axes = np.eye(3) if name == "own" else [[0.0, 1.0, 0.0]]
     for angle in (-1e-2, 1e-2):
         for axis in axes:
-            middle = told.mean(axis=1, keepdims=True)
-            turned = moved(told - middle, angle, axis, 0.0) + middle
+            middle = context.mean(axis=1, keepdims=True)
+            turned = moved(context - middle, angle, axis, 0.0) + middle
             assert np.square(turned - NOMINAL).sum() > error
-    assert np.abs(told.mean(axis=1) - NOMINAL.mean(axis=0))[:, [0, 2]].max() < 1e-12
+    assert np.abs(context.mean(axis=1) - NOMINAL.mean(axis=0))[:, [0, 2]].max() < 1e-12
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -84,12 +84,12 @@ def test_a_body_is_carried_with_its_markers(name):
     """Where one of its points is a marker, that is where the marker is told to be; but for depth, which it keeps."""
     points, view = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), VIEWS[name]
     body = torch.cat([points, points.flip(-2) + 0.01], -2)
-    carried, told = view.carried(body, points), view(points)
+    carried, context = view.carried(body, points), view(points)
     if not view.own:
         assert carried is body
         return
     seen = [axis for axis in range(3) if axis != view.unseen]
-    np.testing.assert_allclose(carried[:, :4, seen], told[..., seen], atol=1e-12)
+    np.testing.assert_allclose(carried[:, :4, seen], context[..., seen], atol=1e-12)
     if view.plane is None:  # rigidly
         np.testing.assert_allclose(torch.cdist(carried, carried), torch.cdist(body, body), atol=1e-12)
     else:
@@ -106,13 +106,13 @@ def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
         False,
         False,
     ]
-    told = VIEWS["plane"].of_arrays(points)
-    assert np.argwhere(np.isnan(told).all(axis=2)).tolist() == [[2, 1]]
-    assert np.isnan(told).sum() == 3  # its depth neither
+    context = VIEWS["plane"].of_arrays(points)
+    assert np.argwhere(np.isnan(context).all(axis=2)).tolist() == [[2, 1]]
+    assert np.isnan(context).sum() == 3  # its depth neither
 
 
 @pytest.mark.parametrize("name", ["own", "own plane"])
-def test_markers_that_tell_no_frame_hide_it(name):
+def test_markers_that_determine_no_frame_are_masked(name):
     points = shaken()
     points[0] = 0.0  # as trackers write what they lost
     points[3] = [0.0, 0.01, 0.0] if name == "own plane" else np.linspace([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 4)
@@ -161,21 +161,21 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
         ((NOMINAL[:1], ["x", "z"], "own"), "the 1 markers that are seen together are at one place"),
     ],
 )
-def test_what_tells_nothing_is_refused(arguments, said):
+def test_degenerate_markers_are_refused(arguments, said):
     with pytest.raises(InputError, match=said):
         MarkerView.of(*arguments)
 
 
-def test_each_set_has_a_frame_of_its_own():
+def test_every_set_has_its_own_frame():
     """Markers of trials that share none, and one that no trial has: each is where it would be without the others."""
     places = np.concatenate([NOMINAL, NOMINAL[:3] + [0.01, 0.0, 0.02], NOMINAL[:1]])
     sets = ((0, 2, 3), (1, 4, 5, 6))
     points = torch.from_numpy(places + 0.01 * np.random.default_rng(3).normal(size=(5, 8, 3)))
     for plane in (None, ["x", "z"]):
-        found = MarkerView.of(places, plane, "own", sets)(points)
+        result = MarkerView.of(places, plane, "own", sets)(points)
         for some in sets:
             alone = MarkerView.of(places[list(some)], plane, "own")(points[:, some])
-            torch.testing.assert_close(found[:, some], alone, rtol=0.0, atol=1e-15)
+            torch.testing.assert_close(result[:, some], alone, rtol=0.0, atol=1e-15)
     torch.testing.assert_close(MarkerView.of(places, None, "own", sets)(points)[:, 7], points[:, 7])
 
 

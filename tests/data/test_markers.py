@@ -62,7 +62,7 @@ def poses(mesh):
 
 @pytest.mark.parametrize("kind", [*KINDS, MIXED], ids=[*KINDS, "mixed"])
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
-def test_they_are_where_they_were_measured_and_move_with_the_body(mesh, kind):
+def test_markers_are_at_their_measured_places_and_move_with_the_body(mesh, kind):
     markers = bind(kind, mesh)
     rest = torch.as_tensor(mesh.vertices)
     np.testing.assert_allclose(markers(rest[None])[0], POINTS, rtol=0, atol=1e-12)
@@ -82,8 +82,8 @@ def test_derivatives(kind):
         expected = (markers(q + step * direction) - markers(q - step * direction)) / (2.0 * step)
         transposed = markers.transposed_jacobian(q)
         assert transposed.shape == (4, q[0].numel(), POINTS.size)
-        found = (transposed.mT @ direction.flatten(1)[:, :, None]).view_as(expected)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+        result = (transposed.mT @ direction.flatten(1)[:, :, None]).view_as(expected)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=2e-6)
         along = q.clone().requires_grad_(True)
         weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(9 + seed), dtype=q.dtype)
         (markers(along) * weights).sum().backward()
@@ -119,14 +119,14 @@ def test_rigid_ones_follow_the_best_fit_to_the_face():
     markers, q = bind("rigid"), poses(MESH)
     assert isinstance(markers, RigidMarkers)
     face = MESH.vertices[TIP]
-    for pose, found in zip(q, markers(q), strict=True):
+    for pose, result in zip(q, markers(q), strict=True):
         now = pose[torch.as_tensor(TIP)].numpy()
         rotation, _ = Rotation.align_vectors(now - now.mean(0), face - face.mean(0))
         expected = rotation.apply(POINTS - face.mean(0)) + now.mean(0)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-10)
 
 
-def test_a_patch_follows_what_is_around_its_foot_and_nothing_else():
+def test_a_patch_follows_only_the_vertices_around_its_foot():
     markers = bind_markers(MESH, POINTS[:1], NAMES[:1], kind="patch", patch=0.025)
     near = np.linalg.norm(MESH.vertices - [0.043, 0.012, 0.03], axis=1) <= 0.025
     assert set(markers.vertices.tolist()) == set(np.flatnonzero(near))
@@ -147,7 +147,7 @@ def test_derivative_of_the_closest_rotation(spread):
     )
 
 
-def test_a_body_that_is_gone_has_no_markers_and_spoils_no_other():
+def test_a_diverged_body_has_no_markers_and_does_not_affect_others():
     q = poses(MESH)
     q[1] = torch.nan
     for kind in KINDS:
@@ -169,8 +169,8 @@ def test_the_derivative_of_linear_ones_is_their_weights():
     linear = MarkerMap(torch.tensor([[[0, 1], [5, 5]]]), torch.tensor([[[0.3, 0.7], [0.5, 0.5]]], dtype=torch.float64))
     expected = np.zeros((len(MESH.vertices), 3, 2, 3))
     expected[0, :, 0], expected[1, :, 0], expected[5, :, 1] = 0.3 * np.eye(3), 0.7 * np.eye(3), np.eye(3)
-    found = linear.transposed_jacobian(poses(MESH)[:1])
-    np.testing.assert_allclose(found[0], expected.reshape(-1, 6), rtol=0, atol=1e-14)
+    result = linear.transposed_jacobian(poses(MESH)[:1])
+    np.testing.assert_allclose(result[0], expected.reshape(-1, 6), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -148,18 +148,18 @@ def test_release_of_a_free_fall_is_found_between_frames(release):
     path += np.random.default_rng(0).normal(scale=5e-6, size=path.shape)
     path[:13] += [0.0, 3e-4, 0.0]  # a marker that was mistaken at first
     path[30, 2] += 8e-3  # one sample gone astray
-    found = find_release(path, 100.0)
-    assert found.frame == pytest.approx(release, abs=0.25)
-    assert 13 <= found.rest[0] < found.rest[1] <= 61
+    result = find_release(path, 100.0)
+    assert result.frame == pytest.approx(release, abs=0.25)
+    assert 13 <= result.rest[0] < result.rest[1] <= 61
 
 
 def test_release_of_recordings(shared_data):
     for name, first_moving in (("gravity", 71), ("load52", 44), ("load101", 52)):
         recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIP)
-        found = find_release(recording.positions.mean(axis=1), recording.rate)
-        assert first_moving - 1.1 <= found.frame < first_moving
-        assert found.rest[0] >= 13
-        assert found.rest[1] <= first_moving
+        result = find_release(recording.positions.mean(axis=1), recording.rate)
+        assert first_moving - 1.1 <= result.frame < first_moving
+        assert result.rest[0] >= 13
+        assert result.rest[1] <= first_moving
 
 
 def test_no_release():

@@ -104,9 +104,9 @@ def test_the_release_is_found_from_the_markers_that_are_seen():
     assert release_of(recording, TIP).frame == pytest.approx(RELEASE, abs=0.25)
     recording.positions[:8] = np.nan
     recording.positions[200:220, 1] = np.nan
-    found = release_of(recording, TIP)
-    assert found.frame == pytest.approx(RELEASE, abs=0.25)
-    assert 8 <= found.rest[0] < found.rest[1] <= 61
+    result = release_of(recording, TIP)
+    assert result.frame == pytest.approx(RELEASE, abs=0.25)
+    assert 8 <= result.rest[0] < result.rest[1] <= 61
     recording.positions[50:70, 1] = np.nan
     with pytest.raises(
         DataFileError, match=r"in swing\.c3d, frames 8 to 57, the first without a long gap: the tip never"
@@ -150,7 +150,7 @@ def test_jumps_are_found_with_frame_and_size(column):
     assert [jump.frame for jump in jumps] == [200, 203]
 
 
-def test_exchanged_labels_are_found():
+def test_exchanged_labels_are_detected():
     recording = swinging()
     recording.positions[120:, [2, 3]] = recording.positions[120:, [3, 2]]
     swaps = find_swaps(recording, find_jumps(recording))
@@ -160,7 +160,7 @@ def test_exchanged_labels_are_found():
     ]
 
 
-def test_a_marker_that_comes_back_under_another_name_is_found():
+def test_a_marker_that_reappears_under_another_name_is_detected():
     recording = swinging()
     recording.positions[120:140, [3, 4]] = np.nan
     recording.positions[140:, 3] = recording.positions[140:, 4]
@@ -174,8 +174,8 @@ def test_noise_is_measured_beside_motion_jumps_and_gaps(noise):
     recording = swinging(frames=500, noise=noise)
     recording.positions[200:, 3] += 1e-3
     recording.positions[::11, 4] = np.nan
-    found = noise_level(recording)
-    np.testing.assert_allclose(found, noise, rtol=0.25)
+    result = noise_level(recording)
+    np.testing.assert_allclose(result, noise, rtol=0.25)
     recording.positions[::3, 4] = np.nan
     assert np.isnan(noise_level(recording)[4])
 
@@ -210,13 +210,13 @@ def test_quality_of_a_recording():
         quality(recording, ["foot"])
 
 
-def test_the_release_is_no_jump_of_the_body_but_may_be_one_of_the_base():
+def test_the_release_is_not_a_jump_of_the_body_but_of_the_base():
     """A marker that is alone on its body jerks as it is let go; one on the clamp must not."""
     recording = swinging().select([TIP[0], *BASE])
     assert [jump.label for jump in find_jumps(recording)] == [TIP[0]]
     recording.positions[61:, 1] += 1e-3
     jumps = [marker.jumps for marker in quality(recording, BASE, Release(RELEASE, (40, 60))).markers]
-    assert [len(each) for each in jumps] == [0, 1, 0, 0]
+    assert [len(part) for part in jumps] == [0, 1, 0, 0]
 
 
 def test_base_markers_that_were_moved():

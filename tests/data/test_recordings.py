@@ -56,7 +56,7 @@ def test_table(tmp_path, positions, delimiter):
     np.testing.assert_array_equal(np.argwhere(~recording.seen), [[7, 1], [8, 1]])
 
 
-def test_a_table_that_says_nothing_of_itself(tmp_path, positions):
+def test_a_table_without_a_header(tmp_path, positions):
     """As a log has it: no header, semicolons, columns of no interest, times in milliseconds, a tendon's length."""
     path, wound = tmp_path / "swing.csv", np.linspace(0.0, 3.9, 40)
     rows = [[1000.0 + 10.0 * k, 7.0, *(1e3 * positions[k].ravel()), wound[k]] for k in range(40)]
@@ -86,7 +86,7 @@ class TestALogThatBeganBeforeItsWinch:
     def read(self, path):
         return read_recording(path, units="m", rate=100.0, table=self.TABLE)
 
-    def test_each_channel_is_filled_by_itself(self, tmp_path, positions, caplog):
+    def test_channels_are_filled_separately(self, tmp_path, positions, caplog):
         pulled, valve = np.linspace(2.0, 3.5, 40), np.arange(40.0)
         winch = np.where((np.arange(40) < 5) | (np.arange(40) >= 35), np.nan, pulled)
         recording = self.read(self.write(tmp_path / "swing.csv", positions, winch, valve))
@@ -109,7 +109,7 @@ class TestALogThatBeganBeforeItsWinch:
         with pytest.raises(DataFileError, match="has an actuation in 1 frames: a recording needs two"):
             self.read(self.write(path, positions, np.where(numbers > 0, np.nan, whole), whole))
 
-    def test_a_line_that_holds_more_than_its_columns_is_named(self, tmp_path, positions):
+    def test_a_line_with_too_many_cells_is_named(self, tmp_path, positions):
         path = self.write(tmp_path / "swing.csv", positions, np.ones(40), np.ones(40))
         rows = path.read_text().split("\n")
         path.write_text("\n".join([*rows[:21], rows[21] + "9", *rows[22:]]))
@@ -137,7 +137,7 @@ def test_a_table_of_markers_in_a_plane(tmp_path):
         (["a.x", "a.y", "a.z", None], 99, "line 100: 0 cells, but data.table.columns names 4"),
     ],
 )
-def test_tables_that_are_described_wrongly(tmp_path, columns, lines, message):
+def test_wrong_descriptions_of_tables(tmp_path, columns, lines, message):
     path = tmp_path / "swing.csv"
     np.savetxt(path, np.arange(40.0).reshape(10, 4), delimiter=",")
     with pytest.raises(DataFileError, match=message):
@@ -192,7 +192,7 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
         (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),  # not in cubic time
     ],
 )
-def test_wrong_tables_are_told_by_line_and_column(tmp_path, positions, line, change, message):
+def test_errors_of_tables_name_line_and_column(tmp_path, positions, line, change, message):
     path = edit(write_table(tmp_path / "swing.csv", positions), line, change)
     if message is None:
         assert read_recording(path).rate == 100.0
@@ -204,7 +204,7 @@ def test_wrong_tables_are_told_by_line_and_column(tmp_path, positions, line, cha
 @pytest.mark.parametrize(
     "stamps", [np.arange(40) * 1e-310, [*np.arange(39) * 1e-310, 1e3], 1e11 + np.arange(40) * 1e-6]
 )
-def test_times_that_are_hardly_apart_are_refused(tmp_path, positions, stamps):
+def test_times_that_are_too_close_are_refused(tmp_path, positions, stamps):
     path = write_table(tmp_path / "swing.csv", positions)
     for line, stamp in enumerate(stamps, start=2):
         edit(
@@ -434,11 +434,11 @@ def test_damaged_and_foreign_files(tmp_path, positions):
     for at in range(0, len(whole), 97):  # Whatever is overwritten, there is one sentence, or the same recording.
         (tmp_path / "spoilt.npz").write_bytes(whole[:at] + b"(" + whole[at + 1 :])
         try:
-            found = read_recording(tmp_path / "spoilt.npz").positions
+            result = read_recording(tmp_path / "spoilt.npz").positions
         except DataFileError as error:
             refused += "spoilt.npz" in str(error)
         else:
-            np.testing.assert_array_equal(found, expected)
+            np.testing.assert_array_equal(result, expected)
     assert refused > 10
     np.save(tmp_path / "single.npy", positions)
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")
@@ -466,7 +466,7 @@ def test_a_marker_with_one_coordinate_missing_is_not_seen(tmp_path, positions):
     np.testing.assert_array_equal(np.argwhere(np.isnan(recording.positions[:, 1]).all(axis=1))[:, 0], [4, 6])
 
 
-def test_what_is_given_is_checked(tmp_path, positions):
+def test_arguments_are_checked(tmp_path, positions):
     path = archive(tmp_path / "swing.npz", positions)
     for given, message in (
         ({"units": "inch"}, "units is 'inch'"),
@@ -511,7 +511,7 @@ def test_hdf5_of_another_program(tmp_path, positions):
         read_recording(tmp_path / "run.h5")
 
 
-def test_recorded_beam_in_the_wrong_unit_is_noticed(shared_data):
+def test_a_recording_in_the_wrong_unit_is_refused(shared_data):
     path = shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d"
     assert read_recording(path).labels[0] == "Tip - 1"
     with pytest.raises(DataFileError, match=r"all markers lie within 0\.098 mm"):

@@ -36,9 +36,9 @@ def measured(**moved):
     return MOTION.apply(points)
 
 
-def assert_inverse(found, atol=1e-12):
-    np.testing.assert_allclose(found.rotation @ MOTION.rotation, np.eye(3), rtol=0, atol=atol)
-    np.testing.assert_allclose(found.rotation @ MOTION.translation + found.translation, 0.0, atol=atol)
+def assert_inverse(result, atol=1e-12):
+    np.testing.assert_allclose(result.rotation @ MOTION.rotation, np.eye(3), rtol=0, atol=atol)
+    np.testing.assert_allclose(result.rotation @ MOTION.translation + result.translation, 0.0, atol=atol)
 
 
 def test_kabsch_finds_a_batch_of_rigid_motions():
@@ -78,65 +78,65 @@ def test_root_mean_square():
 
 
 class TestRegisterMarkers:
-    def test_a_known_motion_comes_back(self):
-        found = register_markers(measured(), NOMINAL, NAMES, source=SOURCE)
-        assert_inverse(found.transform)
-        np.testing.assert_allclose(found.positions, NOMINAL, rtol=0, atol=1e-12)
-        assert found.inliers.all()
-        assert found.outliers == ()
-        assert found.rms < 1e-12
+    def test_a_known_motion_is_recovered(self):
+        result = register_markers(measured(), NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(result.transform)
+        np.testing.assert_allclose(result.positions, NOMINAL, rtol=0, atol=1e-12)
+        assert result.inliers.all()
+        assert result.outliers == ()
+        assert result.rms < 1e-12
 
     @pytest.mark.parametrize("astray", range(6))
     def test_one_marker_ten_centimetres_off_changes_nothing(self, astray):
         points = measured(**{f"m{astray}": [0.06, 0.0, -0.08]})
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
-        assert_inverse(found.transform)
-        assert found.outliers == (NAMES[astray],)
-        assert list(np.flatnonzero(~found.inliers)) == [astray]
-        assert found.residual[astray] == pytest.approx(0.1)
-        assert found.rms < 1e-12
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(result.transform)
+        assert result.outliers == (NAMES[astray],)
+        assert list(np.flatnonzero(~result.inliers)) == [astray]
+        assert result.residual[astray] == pytest.approx(0.1)
+        assert result.rms < 1e-12
 
-    def test_swapped_names_are_left_out(self):
+    def test_markers_with_swapped_names_are_outliers(self):
         points = measured()[[0, 4, 2, 3, 1, 5]]
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
-        assert_inverse(found.transform)
-        assert found.outliers == ("Tip - 2", "Base - 2")
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(result.transform)
+        assert result.outliers == ("Tip - 2", "Base - 2")
 
     def test_seven_of_fifteen_may_be_anywhere(self):
         random = np.random.default_rng(0)
         nominal = random.normal(scale=0.1, size=(15, 3))
         points = MOTION.apply(nominal)
         points[::2][:7] += random.normal(scale=0.1, size=(7, 3))
-        found = register_markers(points, nominal, [f"m{i}" for i in range(15)], source=SOURCE)
-        assert_inverse(found.transform)
-        assert len(found.outliers) == 7
+        result = register_markers(points, nominal, [f"m{i}" for i in range(15)], source=SOURCE)
+        assert_inverse(result.transform)
+        assert len(result.outliers) == 7
 
-    def test_where_all_fit_it_is_the_least_squares_fit(self):
+    def test_without_outliers_it_is_the_least_squares_fit(self):
         points = measured() + np.random.default_rng(1).normal(scale=1e-3, size=NOMINAL.shape)
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE)
         plain = kabsch(points, NOMINAL)
-        np.testing.assert_allclose(found.transform.rotation, plain.rotation, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(result.transform.rotation, plain.rotation, rtol=0, atol=1e-12)
         residual = np.linalg.norm(plain.apply(points) - NOMINAL, axis=1)
-        np.testing.assert_allclose(found.residual, residual, rtol=0, atol=1e-12)
-        assert found.rms == pytest.approx(np.sqrt(np.mean(residual**2)))
+        np.testing.assert_allclose(result.residual, residual, rtol=0, atol=1e-12)
+        assert result.rms == pytest.approx(np.sqrt(np.mean(residual**2)))
 
     def test_base_only_ignores_a_tip_that_sags(self):
         points = measured(m0=[0, 0, -0.01], m1=[0, 0, -0.01], m2=[0, 0, -0.012])
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=BASE)
-        assert_inverse(found.transform)
-        np.testing.assert_allclose(found.residual, [0.01, 0.01, 0.012, 0, 0, 0], rtol=0, atol=1e-12)
-        assert list(found.inliers) == [False] * 3 + [True] * 3
-        assert found.outliers == ()
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=BASE)
+        assert_inverse(result.transform)
+        np.testing.assert_allclose(result.residual, [0.01, 0.01, 0.012, 0, 0, 0], rtol=0, atol=1e-12)
+        assert list(result.inliers) == [False] * 3 + [True] * 3
+        assert result.outliers == ()
 
     def test_a_marker_that_was_not_seen_is_left_out(self):
         points = measured()
         points[1] = np.nan
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE)
-        assert_inverse(found.transform)
-        assert np.isnan(found.residual[1])
-        assert np.isnan(found.positions[1]).all()
-        assert not found.inliers[1]
-        assert found.outliers == ()
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE)
+        assert_inverse(result.transform)
+        assert np.isnan(result.residual[1])
+        assert np.isnan(result.positions[1]).all()
+        assert not result.inliers[1]
+        assert result.outliers == ()
 
     @pytest.mark.parametrize(
         ("points", "settings", "sentence"),
@@ -182,14 +182,14 @@ def test_recordings_of_the_beam(shared_data, name, rms):
     positions = fill_gaps(recording).positions
     release = find_release(positions[:, :3].mean(axis=1), recording.rate)
     held = np.median(positions[slice(*release.rest)], axis=0)
-    found = register_markers(held, NOMINAL, NAMES, source=recording.source)
-    assert found.rms == pytest.approx(rms, abs=2e-6)
-    assert found.inliers.all()
+    result = register_markers(held, NOMINAL, NAMES, source=recording.source)
+    assert result.rms == pytest.approx(rms, abs=2e-6)
+    assert result.inliers.all()
     spoilt = held.copy()
     spoilt[4] += 0.1
     without = register_markers(spoilt, NOMINAL, NAMES, source=recording.source)
     assert without.outliers == ("Base - 2",)
-    assert np.linalg.norm(without.positions - found.positions, axis=1)[:3].max() < 2.5e-3
+    assert np.linalg.norm(without.positions - result.positions, axis=1)[:3].max() < 2.5e-3
 
 
 MESHES = {
@@ -206,18 +206,18 @@ def test_closest_points_of_a_box(mesh):
     high = np.array([0.1, 0.03, 0.03])
     outside = np.linalg.norm(np.maximum(np.maximum(-points, points - high), 0.0), axis=1)
     inside = np.minimum(points, high - points).min(axis=1)
-    found = closest_points(mesh, points)
-    np.testing.assert_allclose(found.distances, np.where(outside > 0.0, outside, -inside), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(points - found.points, axis=1), np.abs(found.distances), atol=1e-12)
-    corners = mesh.vertices[found.triangles]
-    heights = np.einsum("pki,pi->pk", corners - found.points[:, None], found.normals)
+    result = closest_points(mesh, points)
+    np.testing.assert_allclose(result.distances, np.where(outside > 0.0, outside, -inside), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(points - result.points, axis=1), np.abs(result.distances), atol=1e-12)
+    corners = mesh.vertices[result.triangles]
+    heights = np.einsum("pki,pi->pk", corners - result.points[:, None], result.normals)
     np.testing.assert_allclose(heights, 0.0, atol=1e-12)
     assert trimesh.Trimesh(mesh.vertices, boundary_triangles(mesh), process=False).volume > 0.0
 
 
 def test_beside_an_edge_the_face_below_is_the_closest():
-    found = closest_points(MESHES["hexahedra"], np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.011]]))
-    np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, -1, 0]], atol=1e-12)
+    result = closest_points(MESHES["hexahedra"], np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.011]]))
+    np.testing.assert_allclose(result.normals, [[0, 0, 1], [0, -1, 0]], atol=1e-12)
 
 
 def shifted(axes, **moved):
@@ -229,18 +229,18 @@ def shifted(axes, **moved):
     return (points - [0.3, -0.2, 1.5]) @ rotation, rotation
 
 
-def test_known_axes_leave_a_shift_that_one_marker_tells():
+def test_known_axes_leave_a_shift_that_one_marker_determines():
     points, rotation = shifted(["x", "z", "-y"])
     assert_allclose = np.testing.assert_allclose
     for use in (NAMES[3:4], BASE, None):
-        found = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=use, rotation=rotation)
-        assert_allclose(found.positions, NOMINAL, atol=1e-12)
-        assert found.rms < 1e-12
-        assert found.inliers.sum() == (len(NAMES) if use is None else len(use))
+        result = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=use, rotation=rotation)
+        assert_allclose(result.positions, NOMINAL, atol=1e-12)
+        assert result.rms < 1e-12
+        assert result.inliers.sum() == (len(NAMES) if use is None else len(use))
     off, rotation = shifted(["x", "z", "-y"], m3=[0.02, 0.0, 0.0], m0=[0.0, 0.001, 0.0])
-    found = register_markers(off, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
-    assert found.outliers == ("Base - 1",)
-    assert_allclose(found.residual[[3]], 0.02, atol=3e-4)
+    result = register_markers(off, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
+    assert result.outliers == ("Base - 1",)
+    assert_allclose(result.residual[[3]], 0.02, atol=3e-4)
 
 
 def test_axes_that_do_not_fit():
@@ -272,22 +272,22 @@ class TestWithAKnownVertical:
     @pytest.mark.parametrize(
         "nominal", [[[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]], [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]]]
     )
-    def test_two_markers_or_a_row_tell_how_a_body_stands(self, nominal, angle):
+    def test_two_markers_or_a_row_register_with_a_known_vertical(self, nominal, angle):
         result, turn = self.found(np.array(nominal), angle)
         np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-12)
         np.testing.assert_allclose(result.positions, nominal, atol=1e-12)
 
-    def test_a_recording_upside_down(self):
+    def test_a_recording_with_an_inverted_vertical_axis(self):
         result, turn = self.found(np.array([[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]]), lean=(np.pi, 0.0, 0.0))
         np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-9)
 
-    def test_three_markers_off_a_line_tell_the_vertical_themselves(self):
+    def test_three_markers_off_a_line_determine_the_vertical(self):
         nominal = np.array([[0.1, 0.0, 0.0], [-0.1, 0.05, 0.0], [0.0, 0.1, 0.05]])
         names = ["a", "b", "c"]
         leaning = register_markers(nominal, nominal, names, source=SOURCE, vertical=([0.1, 0.0, 1.0], self.UP))
         np.testing.assert_allclose(leaning.transform.rotation, np.eye(3), atol=1e-12)
 
-    def test_what_does_not_tell_is_refused(self):
+    def test_degenerate_views_are_refused(self):
         with pytest.raises(InputError, match=r"'B0', 'B1' lie above one another to within 4\.0 mm"):
             self.found(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
         pair = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])

@@ -43,8 +43,8 @@ def recorded(path, start=0.0):
 @pytest.mark.parametrize("opening", [0.07, 0.0725, 0.075, 0.0775, 0.2])
 @pytest.mark.parametrize("amplitude", [1e-3, 30e-3])
 def test_the_opening_is_found_between_frames(opening, amplitude):
-    found = valve_opening(recorded(swing(opening, amplitude)), ("a", "b"))
-    assert found == pytest.approx(opening, abs=3e-3)
+    result = valve_opening(recorded(swing(opening, amplitude)), ("a", "b"))
+    assert result == pytest.approx(opening, abs=3e-3)
 
 
 def test_the_opening_is_on_the_clock_of_the_recording():
@@ -52,20 +52,20 @@ def test_the_opening_is_on_the_clock_of_the_recording():
     assert valve_opening(recorded(swing(0.0725), start=-1.5), ("a",)) == pytest.approx(at_zero - 1.5, abs=1e-12)
 
 
-def test_a_leak_before_the_opening_is_not_taken_for_it():
+def test_a_leak_before_the_opening_is_not_the_opening():
     """As at 50 mbar: a tenth of the way comes slowly, the rest at once."""
     path = swing(0.2, 1.5e-3)
     leak = 1.2e-4 * np.clip(np.arange(150) / 18.0, 0.0, 1.0)
     assert valve_opening(recorded(path - leak[:, None] * [0.8, 0.0, 0.0]), ("a",)) == pytest.approx(0.2, abs=0.01)
 
 
-def test_one_frame_gone_astray_is_not_the_opening():
+def test_an_outlier_is_not_the_opening():
     path = swing(0.2)
     path[5] += 0.02
     assert valve_opening(recorded(path), ("a",)) == pytest.approx(0.2, abs=2.5e-3)
 
 
-def test_frames_that_were_not_seen_are_passed_over():
+def test_unseen_frames_are_ignored():
     recording = recorded(swing(0.0725))
     positions = recording.positions.copy()
     positions[[3, 8, 9, 12], 0] = np.nan
@@ -83,13 +83,13 @@ def test_frames_that_were_not_seen_are_passed_over():
         (swing(0.07), ("tip",), "no marker named 'tip'"),
     ],
 )
-def test_what_has_no_opening_is_refused(path, followed, message):
+def test_recordings_without_an_opening_are_refused(path, followed, message):
     with pytest.raises(DataFileError, match=message) as refused:
         valve_opening(recorded(path), followed)
     assert "swing.h5" in str(refused.value)
 
 
-def test_frames_that_repeat_the_one_before_are_masked():
+def test_repeated_frames_are_masked():
     recording = recorded(swing(0.07))
     positions = recording.positions.copy()
     positions[4:6] = positions[3]

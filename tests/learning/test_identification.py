@@ -65,11 +65,11 @@ def identify(noise=0.0, seed=0, bounds=RANGES, first=FIRST, truth=TRUTH, **optio
 
 
 def test_stiffness_and_damping_are_recovered_from_sparse_noisy_markers():
-    found = identify(noise=5e-5)
-    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
-    assert found.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
-    assert found.at_bounds == ()
-    assert len(found.history[0]) < 25
+    result = identify(noise=5e-5)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert result.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
+    assert result.at_bounds == ()
+    assert len(result.history[0]) < 25
 
 
 def test_without_noise_the_parameters_are_exact():
@@ -80,28 +80,28 @@ def test_without_noise_the_parameters_are_exact():
         "mass_damping": Bounds(0.0, 5.0),
     }
     first = {"youngs_modulus": 264e3, "poissons_ratio": 0.499, "mass_damping": 0.0}
-    found = identify(truth=truth, bounds=bounds, first=first)
+    result = identify(truth=truth, bounds=bounds, first=first)
     for name, value in truth.items():
-        assert found.parameters[name] == pytest.approx(value, rel=1e-3), name
-    assert found.loss < 1e-9
+        assert result.parameters[name] == pytest.approx(value, rel=1e-3), name
+    assert result.loss < 1e-9
 
 
-def test_the_predicted_deviation_is_that_of_repetitions():
+def test_the_predicted_deviation_agrees_with_repetitions():
     replay, release = replay_of(simulator(), TRUTH, masses=(0.05,), frames=12)
-    clean, found, predicted = replay.trials, [], []
+    clean, outcome, predicted = replay.trials, [], []
     generator = torch.Generator().manual_seed(1)
     for _ in range(10):
         markers = clean.observed + 3e-4 * torch.randn(clean.observed.shape, generator=generator, dtype=torch.float64)
         motions = replace(clean, observed=markers)
         result = Identifier([(Replay(replay.simulator, MARKERS, motions), release)], RANGES).run([TRUTH], 2)
-        found.append([result.parameters[name] for name in RANGES])
+        outcome.append([result.parameters[name] for name in RANGES])
         predicted.append([result.uncertainty.deviation[name] for name in RANGES])
-    ratio = np.std(found, axis=0, ddof=1) / np.mean(predicted, axis=0)
+    ratio = np.std(outcome, axis=0, ddof=1) / np.mean(predicted, axis=0)
     assert (ratio > 0.5).all()
     assert (ratio < 2.0).all()
 
 
-def test_ninety_per_cent_of_the_intervals_hold_the_truth():
+def test_ninety_per_cent_of_the_intervals_contain_the_truth():
     """Of parameters identified from markers whose errors go on for a few frames."""
     replay, release = replay_of(simulator(), TRUTH, frames=24)
     clean, held, generator = replay.trials, [], torch.Generator().manual_seed(5)
@@ -116,7 +116,7 @@ def test_ninety_per_cent_of_the_intervals_hold_the_truth():
     assert 0.83 <= np.mean(held) <= 0.96
 
 
-def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
+def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
     bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
@@ -131,9 +131,9 @@ def test_stiffness_and_density_of_a_body_without_weights_cannot_be_told_apart():
 
 def test_a_parameter_outside_its_range_ends_on_the_bound():
     bounds = {"youngs_modulus": Bounds(3e5, 1e6, logarithmic=True)}
-    found = identify(truth={"youngs_modulus": 215e3}, bounds=bounds, first={"youngs_modulus": 6e5}, frames=12)
-    assert found.at_bounds == ("youngs_modulus",)
-    assert found.parameters["youngs_modulus"] == pytest.approx(3e5)
+    result = identify(truth={"youngs_modulus": 215e3}, bounds=bounds, first={"youngs_modulus": 6e5}, frames=12)
+    assert result.at_bounds == ("youngs_modulus",)
+    assert result.parameters["youngs_modulus"] == pytest.approx(3e5)
 
 
 def test_a_grid_has_its_minimum_at_the_truth_and_the_axes_asked_for():
@@ -177,9 +177,9 @@ def test_a_start_where_the_simulation_fails_is_passed_over(monkeypatch):
     monkeypatch.setattr(Replay, "__call__", fragile)
     soft = FIRST | {"youngs_modulus": 120e3}
     identifier = Identifier([(replay, release)], RANGES)
-    found = identifier.run([soft, FIRST], 20)
-    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
-    assert found.history[0] == []
+    result = identifier.run([soft, FIRST], 20)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert result.history[0] == []
     with pytest.raises(ConvergenceError, match="every start"):
         identifier.run([soft], 20)
 
@@ -194,7 +194,7 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
 
 
-def test_finished_starts_are_not_done_again():
+def test_finished_starts_are_skipped():
     replay, release = replay_of(simulator(), TRUTH, frames=10)
     kept, calls = [], []
     starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
@@ -226,7 +226,7 @@ def test_only_the_first_seconds_count():
         ({"stiffness": Bounds(0.0, 1.0)}, "no parameter 'stiffness'"),
     ],
 )
-def test_what_cannot_be_identified_is_refused(bounds, sentence):
+def test_unknown_parameters_are_refused(bounds, sentence):
     replay, release = replay_of(simulator(), TRUTH, frames=3)
     with pytest.raises(InputError, match=sentence):
         Identifier([(replay, release)], bounds)
@@ -284,33 +284,33 @@ def resting_pose(sim):
     return Replay(sim, MARKERS, replace(still, observed=seen)), start
 
 
-def test_poses_tell_the_stiffness_beside_motions():
+def test_stiffness_and_damping_are_identified_from_poses_and_motions():
     """A pose under a weight depends on the stiffness alone: the damping is still found, from the motion."""
     motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
     pose, start = resting_pose(motion.simulator)
-    found = Identifier([(motion, release), (pose, start)], RANGES).run([FIRST], 40)
-    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
-    assert found.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
+    result = Identifier([(motion, release), (pose, start)], RANGES).run([FIRST], 40)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
+    assert result.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
     alone = Identifier([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}).run([FIRST], 40)
     assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
 
 
-def test_equilibria_are_looked_for_where_the_parameters_lead_the_last_ones(monkeypatch):
+def test_equilibria_are_predicted_from_those_of_nearby_parameters(monkeypatch):
     """Closer to where they are than the last ones were, but for the first step, which is taken without slopes."""
     pose, start = resting_pose(simulator())
-    solve, guesses, found = Simulator.static_equilibrium, [], []
+    solve, guesses, result = Simulator.static_equilibrium, [], []
 
     def watched(self, inputs, constants, start):
         state = solve(self, inputs, constants, start=start)
         if len(start) == 1:  # Not those that differ to tell slopes.
             guesses.append(start.detach())
-            found.append(state.q.detach())
+            result.append(state.q.detach())
         return state
 
     monkeypatch.setattr(Simulator, "static_equilibrium", watched)
     Identifier([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}).run([FIRST], 40)
-    moves = [float((after - before).norm()) for before, after in pairwise(found)]
-    misses = [float((guess - after).norm()) for guess, after in zip(guesses[1:], found[1:], strict=True)]
+    moves = [float((after - before).norm()) for before, after in pairwise(result)]
+    misses = [float((guess - after).norm()) for guess, after in zip(guesses[1:], result[1:], strict=True)]
     steps = [(miss, move) for miss, move in zip(misses, moves, strict=True) if move > 1e-6]
     assert len(steps) > 2
     assert all(miss < 0.5 * move for miss, move in steps[1:-1])

@@ -30,22 +30,22 @@ def trials(count, seed, noise, frames=60):
     ("noise", "scale"),
     [(lambda moved: 1e-3 + 0.0 * moved, "constant"), (lambda moved: 1e-4 + 0.2 * moved, "displacement")],
 )
-def test_ninety_per_cent_hold_on_other_trials(noise, scale):
+def test_intervals_have_their_coverage_on_other_trials(noise, scale):
     """On average over many sets of calibrating trials, whatever the errors, few trials or many."""
     for count in (3, 10):
-        found, scales = [], []
+        result, scales = [], []
         for seed in range(40):
             intervals = Intervals.calibrated(*trials(count, seed, noise), REST)
-            found.append(intervals.coverage(*trials(20, 1000 + seed, noise), REST)["coverage"])
+            result.append(intervals.coverage(*trials(20, 1000 + seed, noise), REST)["coverage"])
             scales.append(intervals.scale)
-        assert 0.85 < np.mean(found) < 0.95, count
+        assert 0.85 < np.mean(result) < 0.95, count
         assert scales.count(scale) > 30
 
 
-def test_wider_for_a_marker_that_is_further_off():
+def test_intervals_are_wider_for_a_marker_with_larger_errors():
     simulated, observed = trials(8, 0, lambda moved: 1e-3 + 0.0 * moved)
-    for each in observed:
-        each[:, 1] += 0.004
+    for markers in observed:
+        markers[:, 1] += 0.004
     intervals = Intervals.calibrated(simulated, observed, REST)
     assert intervals.factor[1] > 1.5 * intervals.factor[0]
     again = Intervals.from_plain(intervals.plain())
@@ -55,11 +55,11 @@ def test_wider_for_a_marker_that_is_further_off():
     assert 1.5 < held["half_width_mm"] < 6.0
 
 
-def test_what_was_not_seen_counts_nowhere():
+def test_unseen_markers_have_no_influence_on_intervals():
     simulated, observed = trials(6, 1, lambda moved: 1e-3 + 0.0 * moved)
     whole = Intervals.calibrated(simulated, observed, REST)
-    for each in observed[:3]:
-        each[10:, 0] = np.nan
+    for markers in observed[:3]:
+        markers[10:, 0] = np.nan
     some = Intervals.calibrated(simulated, observed, REST)
     assert some.factor == pytest.approx(whole.factor, rel=0.3)
     observed[0][:] = np.nan
@@ -72,22 +72,22 @@ def test_a_model_that_diverges_has_no_intervals():
     assert Intervals.calibrated(simulated, observed, REST) is None
 
 
-def test_a_marker_that_calibrates_nothing_is_taken_for_the_worst_of_the_others():
+def test_a_marker_that_was_never_seen_has_the_widest_interval():
     simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
     simulated, observed = ([x[:, [0, 1, 1]].copy() for x in some] for some in (simulated, observed))
     rest = REST[[0, 1, 1]]
-    for each in observed:
-        each[:, 1] += 0.004
+    for markers in observed:
+        markers[:, 1] += 0.004
     known = Intervals.calibrated(simulated, observed, rest)
-    for each in observed:
-        each[:, 2] = np.nan
-    found = Intervals.calibrated(simulated, observed, rest)
-    assert found.factor[2] == found.factor[1] > 1.5 * found.factor[0]
-    assert found.factor[:2] == pytest.approx(known.factor[:2], rel=1e-9)
-    assert found.standing == pytest.approx(known.standing)
+    for markers in observed:
+        markers[:, 2] = np.nan
+    result = Intervals.calibrated(simulated, observed, rest)
+    assert result.factor[2] == result.factor[1] > 1.5 * result.factor[0]
+    assert result.factor[:2] == pytest.approx(known.factor[:2], rel=1e-9)
+    assert result.standing == pytest.approx(known.standing)
     rest = REST
     observed = [x[:, :2] for x in observed]
     simulated = [x[:, :2] for x in simulated]
-    for each in observed:
-        each[:] = np.nan
+    for markers in observed:
+        markers[:] = np.nan
     assert Intervals.calibrated(simulated, observed, rest) is None

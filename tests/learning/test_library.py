@@ -46,12 +46,12 @@ def robot():
 
 
 @pytest.mark.parametrize("markers", [MARKERS, WHOLE_STATE], ids=["markers", "whole states"])
-def test_youngs_modulus_comes_back(robot, markers):
+def test_youngs_modulus_is_recovered(robot, markers):
     motion = let_go(robot, 0.05, 0.1, markers=markers)
-    found = wr.identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
-    assert found.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
-    assert not found.at_bounds
-    assert float(wr.evaluate(beam(180e3), motion, parameters=found.parameters).max()) < 1e-6
+    result = wr.identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
+    assert result.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
+    assert not result.at_bounds
+    assert float(wr.evaluate(beam(180e3), motion, parameters=result.parameters).max()) < 1e-6
     assert float(wr.evaluate(beam(180e3), motion).mean()) > 1e-4
 
 
@@ -81,7 +81,7 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     assert float(wr.evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
 
 
-def test_the_network_sees_what_drives_a_body():
+def test_the_network_has_the_actuation_as_input():
     """Tendons of two tensions; the force that is missing is that of a third of the tension."""
     cable = wr.Tendons([[[0.0, 0.01, 0.0], [0.05, 0.01, 0.0], [0.1, 0.01, 0.0]]])
     body = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[cable])
@@ -125,7 +125,7 @@ def test_one_motion_needs_no_axis_of_motions(robot):
     assert float(wr.evaluate(robot, one).max()) == 0.0
 
 
-def test_what_cannot_be_compared_is_refused(robot):
+def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
     with pytest.raises(wr.InputError, match="observed has shape"):
         wr.ObservedMotion(torch.zeros(3), start)

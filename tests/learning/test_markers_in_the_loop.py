@@ -70,32 +70,32 @@ class TestAtSteps:
         return motions_of(self.TIMES[None], markers)
 
     def test_it_starts_where_the_markers_were_held_and_ends_with_the_last_frame(self):
-        found = at_steps(self.seen(), STEP)
-        assert found.shape == (1, 20, 2, 3)  # 0 to 0.19 s, the last frame at 0.193 s
-        np.testing.assert_allclose(found[0], self.path(STEP * np.arange(20)), rtol=0, atol=1e-12)
+        result = at_steps(self.seen(), STEP)
+        assert result.shape == (1, 20, 2, 3)  # 0 to 0.19 s, the last frame at 0.193 s
+        np.testing.assert_allclose(result[0], self.path(STEP * np.arange(20)), rtol=0, atol=1e-12)
         finer = at_steps(self.seen(), 0.5 * STEP)[0]
         np.testing.assert_allclose(finer, self.path(0.5 * STEP * np.arange(39)), rtol=0, atol=1e-12)
 
     def test_short_gaps_are_bridged_and_long_ones_are_not_seen(self):
-        found = at_steps(self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP)[0]
+        result = at_steps(self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP)[0]
         # Frames 9 and 15, at 0.093 and 0.153 s, are the last and first sight; 0.015 s around them count.
-        lost = np.isnan(found[:, 0]).all(1)
+        lost = np.isnan(result[:, 0]).all(1)
         np.testing.assert_array_equal(np.flatnonzero(lost), [11, 12, 13])
-        np.testing.assert_allclose(found[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
-        assert np.isnan(found[:, 1]).all()  # three sights with that at the release: too few for a cubic
+        np.testing.assert_allclose(result[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
+        assert np.isnan(result[:, 1]).all()  # three sights with that at the release: too few for a cubic
 
     def test_a_motion_that_ends_early_is_not_seen_from_there(self):
         short = self.TIMES.clone()
         short[12:] = short[11]
         markers = self.path(torch.stack([self.TIMES, short]))
         markers[1, 12:] = torch.nan
-        found = at_steps(motions_of(torch.stack([self.TIMES, short]), markers), STEP)
-        assert np.isfinite(found[0]).all()
-        np.testing.assert_array_equal(np.isnan(found[1]).all((1, 2)), np.arange(20) > 11)
+        result = at_steps(motions_of(torch.stack([self.TIMES, short]), markers), STEP)
+        assert np.isfinite(result[0]).all()
+        np.testing.assert_array_equal(np.isnan(result[1]).all((1, 2)), np.arange(20) > 11)
 
     def test_a_late_release_is_time_zero(self):
-        found = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
-        np.testing.assert_allclose(found[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
+        result = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
+        np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
 
 
 def test_errors_are_means_over_the_markers_that_were_seen():
@@ -120,13 +120,13 @@ def test_markers_at_frames_follow_the_steps_and_are_lost_with_them():
     times = (0.004 + STEP * torch.arange(10, dtype=torch.float64)).repeat(2, 1)
     motions = motions_of(times, torch.as_tensor(POINTS).repeat(2, 10, 1, 1))
     release = Start(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
-    seen = torch.stack([MARKERS(each) for each in q])
-    found = Replay(sim, MARKERS, motions).at_frames(seen, release)
+    seen = torch.stack([MARKERS(positions) for positions in q])
+    result = Replay(sim, MARKERS, motions).at_frames(seen, release)
     since = (times - release.delay[:, None]).clamp_min(0.0)
     expected = torch.as_tensor(POINTS) + since[..., None, None] * velocity
-    torch.testing.assert_close(found[0], expected[0], rtol=0.0, atol=1e-9)
-    torch.testing.assert_close(found[1, :6], expected[1, :6], rtol=0.0, atol=1e-9)
-    assert bool(found[1, 7:].isnan().all())  # from 0.068 s on, the step before the first that is lost
+    torch.testing.assert_close(result[0], expected[0], rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(result[1, :6], expected[1, :6], rtol=0.0, atol=1e-9)
+    assert bool(result[1, 7:].isnan().all())  # from 0.068 s on, the step before the first that is lost
 
 
 def observed_motions(frames=8):
@@ -164,7 +164,7 @@ def finish(trainer):
 
 class TestMarkersInTheLoop:
     @pytest.mark.parametrize("changes", [{}, {"layers": 1, "blocks": 2}, {"kind": "nodal"}])
-    def test_it_starts_at_the_simulator_as_it_is(self, loss, changes):
+    def test_training_starts_at_zero_force(self, loss, changes):
         model = network(**changes)
         assert float(loss(model).detach()) != pytest.approx(float(loss(None)), rel=1e-6)
         trainer = MarkersInTheLoop(model, loss, None, CONFIG.changed(epochs=1))
@@ -177,7 +177,7 @@ class TestMarkersInTheLoop:
             assert first["train_loss"] == pytest.approx(float(loss(None)), rel=1e-9)
         assert second["train_loss"] < first["train_loss"]
 
-    def test_the_gradient_is_that_of_central_differences(self, loss):
+    def test_the_gradient_agrees_with_central_differences(self, loss):
         model = network(layers=1)
         loss(model).backward()
         random = torch.Generator().manual_seed(3)
@@ -218,7 +218,7 @@ class TestMarkersInTheLoop:
         one, other = (trainer.use_best().state_dict() for trainer in (whole, again))
         assert all(torch.equal(one[key], other[key]) for key in one)
 
-    def test_the_line_search_comes_back_from_a_simulation_that_fails(self, loss, monkeypatch):
+    def test_the_line_search_steps_back_from_a_failed_simulation(self, loss, monkeypatch):
         calls = []
         call = MotionLoss.__call__
 
@@ -234,7 +234,7 @@ class TestMarkersInTheLoop:
         assert losses[2] < losses[0]
         assert all(torch.isfinite(w).all() for w in trainer.model.network.parameters())
 
-    def test_a_validation_that_fails_is_infinitely_wrong(self, loss, monkeypatch):
+    def test_a_failed_validation_has_an_infinite_loss(self, loss, monkeypatch):
         def failing(*_, **__):
             raise ConvergenceError("no", torch.zeros(1), None)
 
@@ -247,7 +247,7 @@ class TestMarkersInTheLoop:
         assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
         assert not model(rest.q, rest.v, 0.0 * LOADS).any()
 
-    def test_epochs_are_those_that_serve_motions_held_out(self, loss):
+    def test_cross_validation_selects_the_number_of_epochs(self, loss):
         """Here the held-out motions are those of training, there such as the simulator makes without a force."""
         motions, release = observed_motions()
         sim = simulator()
@@ -275,7 +275,7 @@ class TestMarkersInTheLoop:
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
 
-    def test_groups_weigh_what_their_trials_do(self, loss):
+    def test_groups_are_weighted_by_their_number_of_trials(self, loss):
         """Motions in groups of their own, as those that begin otherwise are, give the loss and error of one group."""
         motions, release = observed_motions()
         sim, model = simulator(), network()
@@ -284,7 +284,7 @@ class TestMarkersInTheLoop:
             for row in (1, 0)
         ]
         apart = MotionLoss(watched, {})
-        for each in (None, model):
-            assert float(apart(each).detach()) == pytest.approx(float(loss(each).detach()), rel=1e-9)
-            assert apart.error_mm(each) == pytest.approx(loss.error_mm(each), rel=1e-9)
+        for force in (None, model):
+            assert float(apart(force).detach()) == pytest.approx(float(loss(force).detach()), rel=1e-9)
+            assert apart.error_mm(force) == pytest.approx(loss.error_mm(force), rel=1e-9)
         assert [len(markers) for markers in apart.markers(None)] == [1, 1]

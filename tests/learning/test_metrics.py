@@ -34,7 +34,7 @@ def test_summary_pools_steps_and_takes_the_deviation_of_the_vertex_means() -> No
     assert summary == {"mean": 3.0, "std": pytest.approx(np.sqrt(3.5)), "trajectories": 2, "diverged": 0}
 
 
-def test_trajectories_of_unequal_length_weigh_by_their_steps() -> None:
+def test_trajectories_are_weighted_by_their_steps() -> None:
     assert summarise([np.array([4.0]), np.array([1.0, 1.0])])["mean"] == pytest.approx(2.0)
 
 
@@ -52,12 +52,12 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
         1,
         2,
     )
-    each = summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
-    assert [entry["errors_mm"]["resphys"] for entry in each] == [pytest.approx(1.0), None]
-    json.dumps([summary, each], allow_nan=False)
+    entries = summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
+    assert [entry["errors_mm"]["resphys"] for entry in entries] == [pytest.approx(1.0), None]
+    json.dumps([summary, entries], allow_nan=False)
 
 
-def test_what_cannot_be_summarised_is_refused() -> None:
+def test_empty_errors_are_refused() -> None:
     with pytest.raises(InputError, match="at least one step"):
         summarise([])
     with pytest.raises(InputError, match="1 roll-outs for 2"):
@@ -70,31 +70,31 @@ def test_published_numbers() -> None:
     assert PUBLISHED_MM["sopra"]["resphys"] == (5.77, 3.00)
 
 
-def test_folds_weigh_the_same_whatever_their_length() -> None:
+def test_folds_have_equal_weight() -> None:
     folds = [
         {"resphys": summarise([np.array([1.0, 1.0, 1.0])]), "simfree": summarise([np.array([2.0])])},
         {"resphys": summarise([np.array([3.0]), np.array([5.0])]), "simfree": summarise([np.array([np.nan])])},
     ]
-    found = summarise_folds(folds)
-    assert found["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
-    assert found["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
+    result = summarise_folds(folds)
+    assert result["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
+    assert result["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
     assert summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}
 
 
 def test_a_paired_gain_is_that_of_the_means_with_the_spread_of_the_trials():
-    found = paired_gain([2.0, 1.0, 3.0], [1.0, 0.5, 1.5])
-    assert found.share == found.lower == found.upper == pytest.approx(0.5)  # the same on each trial, however large
+    result = paired_gain([2.0, 1.0, 3.0], [1.0, 0.5, 1.5])
+    assert result.share == result.lower == result.upper == pytest.approx(0.5)  # the same on each trial, however large
     assert paired_gain([1.0], [1.2]) == (pytest.approx(-0.2), pytest.approx(-0.2), pytest.approx(-0.2), 1)
     two = paired_gain([1.0, 1.0], [0.5, 0.9])
     assert (two.share, two.lower, two.upper) == (pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.5))
 
 
 @pytest.mark.parametrize("count", [5, 20])
-def test_intervals_of_gains_cover_as_often_as_they_say(count):
+def test_intervals_of_gains_have_their_stated_coverage(count):
     """Trials whose gains scatter by as much again as their mean: 85 to 95 % where 90 % are meant."""
     draw, inside = np.random.default_rng(3), 0
     for _ in range(300):
         before = draw.uniform(0.5, 2.0, count)
-        found = paired_gain(before, before * (0.8 + 0.2 * draw.normal(size=count)))
-        inside += found.lower <= 0.2 <= found.upper
+        result = paired_gain(before, before * (0.8 + 0.2 * draw.normal(size=count)))
+        inside += result.lower <= 0.2 <= result.upper
     assert 0.85 < inside / 300 < 0.95

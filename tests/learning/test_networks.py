@@ -156,7 +156,7 @@ class TestResidualForce:
             together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
         )
 
-    def test_ridge_is_what_noisy_inputs_teach(self):
+    def test_ridge_regression_is_least_squares_with_noisy_inputs(self):
         model, *_ = built("reduced")
         random = np.random.default_rng(1)
         x, y = random.normal(size=(20, 7)), random.normal(size=(20, 5))
@@ -178,10 +178,10 @@ class TestResidualForce:
         with torch.no_grad():
             model.linear.copy_(torch.linalg.lstsq(inputs, model.encode_outputs(force)).solution)
             model.remainder.zero_()
-            found = model(q, v)
+            result = model(q, v)
         wanted = model.coders[0].decode((inputs @ model.linear).double())
-        assert found.dtype == torch.float64
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+        assert result.dtype == torch.float64
+        np.testing.assert_allclose(result, wanted, rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_saved_and_restored_it_gives_identical_forces(self, kind, tmp_path):
@@ -230,13 +230,13 @@ class TestActuation:
             assert not torch.equal(model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0])
 
     @pytest.mark.parametrize("build", [build_model, build_next_state])
-    def test_outside_its_training_a_model_is_held_at_the_edge(self, build):
+    def test_inputs_outside_the_training_range_are_clamped(self, build):
         model, q, v = self.built(build)
         model = model.double().eval()
         with torch.no_grad():
             held = Range.of(model.encode(q, v, self.LOADS))
-        told = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])  # during each of four steps
-        watched = LearnedPredictor(model, told, held)
+        context = torch.stack([self.LOADS[i : i + 5] for i in (0, 5, 0, 0)])  # during each of four steps
+        watched = LearnedPredictor(model, context, held)
 
         def predicted(q, v, step):
             given = watched(State(q, v), step)
@@ -244,7 +244,7 @@ class TestActuation:
 
         with torch.no_grad():
             for step in (0, 1):
-                expected = model.predict(q[:5], v[:5], told[step])
+                expected = model.predict(q[:5], v[:5], context[step])
                 for one, other in zip(predicted(q[:5], v[:5], step), expected, strict=True):
                     torch.testing.assert_close(one, other)
             assert watched.left_at.tolist() == [-1] * 5
@@ -280,12 +280,12 @@ def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
     force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
     force[:, -1, 2] = 1e-5
     moved = simulator.static_equilibrium(Inputs(force)).q - simulator.rest_positions
-    found = stiffness.displacements(force.reshape(-1, 1).numpy())
-    np.testing.assert_allclose(found[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
-    np.testing.assert_allclose(stiffness.forces(found), force.reshape(-1, 1).numpy(), atol=1e-15)
+    result = stiffness.displacements(force.reshape(-1, 1).numpy())
+    np.testing.assert_allclose(result[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
+    np.testing.assert_allclose(stiffness.forces(result), force.reshape(-1, 1).numpy(), atol=1e-15)
 
 
-def test_modes_of_displacements_keep_the_weak_force_that_bends_and_drop_the_strong_one_that_does_not():
+def test_displacement_modes_keep_a_weak_bending_force_and_drop_a_strong_one_without_effect():
     simulator = clamped_beam()
     stiffness, n = RestStiffness(simulator), simulator.body.n_vertices
     random = torch.Generator().manual_seed(0)
@@ -306,7 +306,7 @@ def test_modes_of_displacements_keep_the_weak_force_that_bends_and_drop_the_stro
     torch.testing.assert_close(both.decode(both.encode(forces)), forces, rtol=0.0, atol=1e-12)
 
 
-def test_a_network_may_be_blind_for_velocities_and_is_restored_with_its_dual_modes():
+def test_a_network_without_velocity_inputs_is_restored_with_its_dual_modes():
     simulator = clamped_beam()
     rest, n = simulator.rest_positions, simulator.body.n_vertices
     random = torch.Generator().manual_seed(0)

@@ -43,19 +43,19 @@ def poses():
 
 
 @pytest.mark.parametrize("kind", [*KINDS, MIXED], ids=[*KINDS, "mixed"])
-def test_markers_elsewhere_are_where_they_sit_and_turn_with_their_stems(kind):
+def test_moved_markers_are_at_their_offsets_and_rotate_with_their_stems(kind):
     markers = bind(kind)
     np.testing.assert_allclose(markers.moved(MOVED)(REST[None])[0], torch.as_tensor(PLACES) + MOVED, atol=1e-12)
     q = poses()
     turns = torch.stack([markers.moved(axis.expand(4, 3))(q) - markers(q) for axis in torch.eye(3).double()], -1)
     np.testing.assert_allclose(turns.mT @ turns, torch.eye(3).double().expand(3, 4, 3, 3), atol=1e-9)
-    at, found = DisplacedMarkers.split(DisplacedMarkers(markers, 4)(q))
-    np.testing.assert_allclose(found, turns, atol=1e-12)
-    moved = at + (found @ MOVED[..., None])[..., 0]
+    at, result = DisplacedMarkers.split(DisplacedMarkers(markers, 4)(q))
+    np.testing.assert_allclose(result, turns, atol=1e-12)
+    moved = at + (result @ MOVED[..., None])[..., 0]
     np.testing.assert_allclose(markers.moved(MOVED)(q), moved, atol=1e-12)
 
 
-def test_a_placement_turns_about_its_centre():
+def test_a_placement_rotates_about_its_centre():
     points = torch.as_tensor(PLACES)
     turn = torch.as_tensor(Rotation.from_rotvec(ASKEW.turn.numpy()).as_matrix())
     np.testing.assert_allclose(ASKEW.apply(points), (points - CENTRE) @ turn.T + CENTRE + ASKEW.shift, atol=1e-15)
@@ -69,14 +69,14 @@ def test_derivatives_of_placed_markers():
     markers, q, step = PlacedMarkers.of(bind(MIXED), ASKEW), poses(), 1e-6
     direction = torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     expected = (markers(q + step * direction) - markers(q - step * direction)) / (2.0 * step)
-    found = (markers.transposed_jacobian(q).mT @ direction.flatten(1)[:, :, None]).view_as(expected)
-    np.testing.assert_allclose(found, expected, atol=2e-6)
+    result = (markers.transposed_jacobian(q).mT @ direction.flatten(1)[:, :, None]).view_as(expected)
+    np.testing.assert_allclose(result, expected, atol=2e-6)
     single = markers.to(torch.zeros(1))(q.float())
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single, markers(q), atol=1e-6)
 
 
-def test_the_estimate_is_the_minimum_of_its_squares():
+def test_the_placement_minimises_its_sum_of_squares():
     """With turns of degrees, which are not linear; and what is known exactly stays."""
     draw = torch.Generator().manual_seed(1)
     errors = [1e-2 * torch.randn(2, 3, 4, 3, generator=draw, dtype=torch.float64)]
@@ -95,14 +95,14 @@ def test_the_estimate_is_the_minimum_of_its_squares():
         scaled = torch.cat([b[:12] / 1e-3, b[12:15] / 2e-3, b[15:] / 0.1])
         return (left.square().sum((1, 2, 3)) * weights[0]).sum() + 1e-5 * scaled.square().sum()
 
-    found, inside = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
-    assert float(found.turn.norm()) > 0.02
+    result, inside = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    assert float(result.turn.norm()) > 0.02
     gradients = []
-    for b in (torch.zeros(18).double(), torch.cat([found.offsets.flatten(), found.shift, found.turn])):
+    for b in (torch.zeros(18).double(), torch.cat([result.offsets.flatten(), result.shift, result.turn])):
         b.requires_grad_()
         gradients.append(torch.autograd.grad(loss(b), b)[0])
     assert float(gradients[1].norm()) < 1e-4 * float(gradients[0].norm())
-    np.testing.assert_allclose(inside[12:15], found.shift / 2e-3, rtol=1e-9)
+    np.testing.assert_allclose(inside[12:15], result.shift / 2e-3, rtol=1e-9)
     held, _ = estimate_placement(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5)
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
@@ -143,28 +143,28 @@ def identifier(pair, bounds=RANGES, accuracy=ACCURACY):
     return Identifier([pair], bounds, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist())
 
 
-def test_a_modulus_comes_back_from_markers_that_sit_elsewhere():
+def test_the_modulus_is_recovered_from_misplaced_markers():
     pair = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
     naive = Identifier([pair], RANGES).run([{"youngs_modulus": 4e5}], 30)
-    found = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
-    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
-    assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(found.parameters["youngs_modulus"] - 215e3)
-    assert found.placement["offsets"].keys() == set(LABELS)
-    placed = PlacedMarkers.of(bind(), Placement.from_plain(found.placement, LABELS))
+    result = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
+    assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(result.parameters["youngs_modulus"] - 215e3)
+    assert result.placement["offsets"].keys() == set(LABELS)
+    placed = PlacedMarkers.of(bind(), Placement.from_plain(result.placement, LABELS))
     q = SIM.static_equilibrium(pair[0].trials.inputs, {name: one(x) for name, x in TRUTH.items()}).q
     off = (placed(q) - PlacedMarkers.of(bind(), ASKEW)(q)).norm(dim=-1)
     assert float(off.max()) < 2e-4  # where the recording shows them, though frame and offsets are not told apart
-    deviation = found.uncertainty.deviation["youngs_modulus"]
-    assert deviation > 0.2 * abs(found.parameters["youngs_modulus"] - 215e3)
+    deviation = result.uncertainty.deviation["youngs_modulus"]
+    assert deviation > 0.2 * abs(result.parameters["youngs_modulus"] - 215e3)
 
 
-def test_recordings_without_any_error_are_no_trouble():
-    found = identifier(posed(bind())).run([TRUTH], 3)
-    assert found.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-6)
-    assert max(abs(x) for offset in found.placement["offsets"].values() for x in offset) < 1e-6
+def test_recordings_without_errors_are_identified_exactly():
+    result = identifier(posed(bind())).run([TRUTH], 3)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-6)
+    assert max(abs(x) for offset in result.placement["offsets"].values() for x in offset) < 1e-6
 
 
-def test_the_gradient_takes_the_placement_with_it():
+def test_the_gradient_includes_the_placement():
     pair = posed(PlacedMarkers.of(bind(), ASKEW))
     misfit = Misfit([pair], RANGES, accuracy=ACCURACY, centre=CENTRE.tolist())
     unit = np.array([0.5])
@@ -175,17 +175,17 @@ def test_the_gradient_takes_the_placement_with_it():
     assert gradient[0] == pytest.approx((losses[0] - losses[1]) / 2e-4, rel=1e-4)
 
 
-def test_what_is_known_beforehand_decides_what_poses_cannot_tell():
+def test_a_prior_determines_what_poses_do_not():
     """Weight against stiffness: poses under no other load than the body's own tell their ratio alone."""
     ranges = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "density": Bounds(800.0, 1600.0)}
     prior = replace(ranges["density"], prior=Prior(1200.0, 40.0))
     still, start = posed(bind(), noise=1e-5, truth={"youngs_modulus": 215e3, "density": 1070.0})
     own = still.trials.select([0])
     pair = Replay(SIM, bind(), own), start.select([0])
-    found = Identifier([pair], {**ranges, "density": prior}).run([{"youngs_modulus": 3e5, "density": 1000.0}], 30)
-    assert found.parameters["density"] == pytest.approx(1200.0, abs=4.0)
-    assert found.parameters["youngs_modulus"] / 215e3 == pytest.approx(1200.0 / 1070.0, rel=0.01)
-    assert found.uncertainty.deviation["density"] == pytest.approx(40.0, rel=0.1)
+    result = Identifier([pair], {**ranges, "density": prior}).run([{"youngs_modulus": 3e5, "density": 1000.0}], 30)
+    assert result.parameters["density"] == pytest.approx(1200.0, abs=4.0)
+    assert result.parameters["youngs_modulus"] / 215e3 == pytest.approx(1200.0 / 1070.0, rel=0.01)
+    assert result.uncertainty.deviation["density"] == pytest.approx(40.0, rel=0.1)
     apart = Identifier([(still, start)], {**ranges, "density": prior}).run(
         [{"youngs_modulus": 3e5, "density": 1e3}], 30
     )
@@ -194,9 +194,9 @@ def test_what_is_known_beforehand_decides_what_poses_cannot_tell():
 
 
 @pytest.mark.slow
-def test_deviations_cover_what_placements_do():
+def test_deviations_cover_the_effect_of_placements():
     """Over drawn placements and noise, moduli scatter as much as they are said to."""
-    draw, found = np.random.default_rng(0), []
+    draw, outcome = np.random.default_rng(0), []
     for seed in range(24):
         askew = Placement(
             *(
@@ -208,11 +208,11 @@ def test_deviations_cover_what_placements_do():
         pair = posed(PlacedMarkers.of(bind(), askew), noise=2e-4, seed=seed)
         result = identifier(pair).run([{"youngs_modulus": 3e5}], 20)
         off = result.parameters["youngs_modulus"] - 215e3
-        found.append(off / result.uncertainty.deviation["youngs_modulus"])
-    assert 0.6 < math.sqrt(np.mean(np.square(found))) < 1.5
+        outcome.append(off / result.uncertainty.deviation["youngs_modulus"])
+    assert 0.6 < math.sqrt(np.mean(np.square(outcome))) < 1.5
 
 
-def test_vertices_cannot_sit_elsewhere_and_priors_lie_in_their_range():
+def test_misplaced_vertices_and_priors_out_of_range_are_refused():
     replay, start = posed(bind())
     with pytest.raises(InputError, match=r"leave identify\.placement out"):
         Identifier([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY)

@@ -177,7 +177,7 @@ class TestGaussNewton:
         assert misfits[0] < 1e-8
         assert forces[-1] < 1e-2 * forces[0]
 
-    def test_environments_do_not_see_each_other(self):
+    def test_environments_are_independent(self):
         weights = (0.02, 0.1, 0.3)
         observed, start = observation(2, weights)
         sim = simulator()
@@ -187,7 +187,7 @@ class TestGaussNewton:
             alone = solver.step(State(start.q[b : b + 1], start.v[b : b + 1]), observed[1, b : b + 1])
             np.testing.assert_allclose(alone.state.q[0], together.state.q[b], rtol=0, atol=1e-11)
 
-    def test_arguments_stay_as_they_are_and_fixed_vertices_carry_no_force(self):
+    def test_arguments_are_unchanged_and_fixed_vertices_have_no_force(self):
         observed, start = observation()
         moved = observed[1] + 1e-3
         kept, q = moved.clone(), start.q.clone()
@@ -267,7 +267,7 @@ class TestClosedLoop:
         positions = closed_loop(Rollout(sim, lambda state, step: force[step]), start, 5)
         np.testing.assert_allclose(positions, observed.transpose(0, 1), rtol=0, atol=1e-9)
 
-    def test_what_diverges_is_marked_and_does_not_touch_the_others(self):
+    def test_a_diverged_motion_is_marked_and_does_not_affect_others(self):
         _, start = observation(1, (0.05, 0.2, 0.1))
         few = SolverSettings(on_failure="count", max_iterations=15)
         counting = Simulator(BODY, MODEL, H, solver=few)

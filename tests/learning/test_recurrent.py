@@ -82,14 +82,14 @@ def rolled_out(model, samples):
     return torch.stack(forces, 1)[:, :, 0, 0], samples.outputs[0].unflatten(0, (TRIALS, STEPS))[:, :, 0, 0]
 
 
-def test_it_learns_a_lag_that_a_map_of_the_present_cannot(model):
-    found, true = rolled_out(*model)
+def test_a_recurrent_network_learns_a_lag(model):
+    result, true = rolled_out(*model)
     present = model[1].q[:, 0, 0].view(TRIALS, STEPS) * 1e3
-    ratio = ((found - true).square().mean() / (present - true).square().mean()).sqrt()
+    ratio = ((result - true).square().mean() / (present - true).square().mean()).sqrt()
     assert float(ratio) < 0.3
 
 
-def test_the_hidden_state_goes_with_each_environment(model):
+def test_every_environment_has_its_hidden_state(model):
     """Trials that are rolled out alone give what they give in a batch, and each begins from nothing."""
     learned, samples = model
     together, _ = rolled_out(learned, samples)
@@ -102,14 +102,14 @@ def test_the_hidden_state_goes_with_each_environment(model):
     assert predict.hidden.shape == (1, 8)
 
 
-def test_a_hidden_state_of_another_size_costs_one_sentence(model):
+def test_a_hidden_state_of_another_size_is_refused(model):
     inputs = torch.zeros(3, 1)
     for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
         with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
             model[0].standardised(inputs, wrong)
 
 
-def test_it_comes_back_from_its_description(model):
+def test_a_range_is_restored_from_its_description(model):
     learned, samples = model
     again = restore(ResidualForce, learned.state_dict(), learned.description())
     torch.testing.assert_close(rolled_out(again, samples)[0], rolled_out(learned, samples)[0])

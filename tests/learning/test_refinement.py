@@ -36,8 +36,8 @@ def motion(integrator="implicit_euler", seed=0):
     load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
     random = torch.Generator().manual_seed(seed)
     load[:, select_vertices(MESH, x=0.06)] = 0.1 * torch.rand(2, 1, 3, generator=random, dtype=torch.float64) - 0.05
-    found = real.rollout(real.static_equilibrium(Inputs(load)), FRAMES - 1)
-    q, v = found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous()
+    result = real.rollout(real.static_equilibrium(Inputs(load)), FRAMES - 1)
+    q, v = result.q.transpose(0, 1).contiguous(), result.v.transpose(0, 1).contiguous()
     return motion_of(q, v, q)
 
 
@@ -107,7 +107,7 @@ def same(a, b):
 
 
 class TestLoss:
-    def test_its_gradient_is_that_of_central_differences(self):
+    def test_its_gradient_agrees_with_central_differences(self):
         model = network().double()
         loss = window_loss(model, window=4)
         windows = windows_of([0, 1, 1], [0, 2, 5])
@@ -128,7 +128,7 @@ class TestLoss:
             assert float((weight.grad * direction).sum()) == pytest.approx(expected, rel=1e-6)
 
     @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
-    def test_the_right_force_has_none(self, integrator):
+    def test_the_exact_force_has_no_loss(self, integrator):
         no_force = Formula(lambda q, v: torch.zeros_like(q))
         loss = WindowLoss(no_force, lambda: simulator(REALITY, integrator), 4, 3)
         target = motion(integrator)
@@ -138,12 +138,12 @@ class TestLoss:
         assert window_loss(no_force, 4, integrator=integrator).measure(windows, [target])[0] > 1e-3
 
     @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-    def test_windows_of_a_material_that_relaxes_begin_with_what_it_carries(self, integrator):
+    def test_windows_of_a_viscoelastic_material_begin_with_its_internal_variables(self, integrator):
         no_force, creeping = Formula(lambda q, v: torch.zeros_like(q)), replace(REALITY, prony=[(0.5, 0.05)])
         sim = simulator(creeping, integrator)
         load = Inputs(torch.full((2, len(MESH.vertices), 3), -1e-3, dtype=torch.float64))
-        found = sim.rollout(sim.static_equilibrium(load), FRAMES - 1)
-        q, v = found.q.transpose(0, 1).contiguous(), found.v.transpose(0, 1).contiguous()
+        result = sim.rollout(sim.static_equilibrium(load), FRAMES - 1)
+        q, v = result.q.transpose(0, 1).contiguous(), result.v.transpose(0, 1).contiguous()
         loss = WindowLoss(no_force, lambda: simulator(creeping, integrator), 4, 3)
         target = motion_of(q, v, q)
         assert loss.measure(loss.consecutive([target]), [target])[0] < 1e-12  # mm^2
@@ -168,7 +168,7 @@ class TestLoss:
         assert loss.backward(windows, [TRAIN], 2.0) == pytest.approx(expected / 2.0, rel=1e-6)
 
     @pytest.mark.parametrize("value", [math.nan, 1e6])
-    def test_a_window_that_fails_poisons_no_other(self, value):
+    def test_a_failed_window_does_not_affect_others(self, value):
         """The force is no good in windows of the second trajectory after its frame 4."""
         model = network()
 
@@ -191,13 +191,13 @@ class TestLoss:
         for weight, gradient in zip(model.parameters(), gradients, strict=True):
             torch.testing.assert_close(weight.grad, 0.75 * gradient, rtol=1e-4, atol=1e-9)
 
-    def test_it_is_of_what_was_seen_under_the_inputs_of_each_window(self):
+    def test_the_loss_uses_seen_points_and_the_inputs_of_every_window(self):
         """Weights that grow in time: with them, the simulator that made the trials is off nowhere; without, it is."""
         sim, frames = simulator(), 7
         force = torch.zeros(frames - 1, 2, *sim.rest_positions.shape, dtype=torch.float64)
         force[:, :, -1, 2] = -0.01 * torch.arange(frames - 1, dtype=torch.float64)[:, None]
-        found = sim.rollout(sim.rest_state(2), frames - 1, Inputs(force))
-        q, v = (x.transpose(0, 1).contiguous() for x in (found.q, found.v))
+        result = sim.rollout(sim.rest_state(2), frames - 1, Inputs(force))
+        q, v = (x.transpose(0, 1).contiguous() for x in (result.q, result.v))
         target = q[:, :, -2:].clone()  # two markers
         target[0, 2:4, 0] = torch.nan
         target[1, 1:4] = torch.nan
@@ -228,7 +228,7 @@ class TestTraining:
             history[run.state.best_epoch]["rollout_error_mm"] == run.best_error < 0.5 * history[0]["rollout_error_mm"]
         )
 
-    def test_the_weights_that_it_starts_from_win_unless_others_are_better(self):
+    def test_the_initial_weights_are_kept_unless_others_are_better(self):
         before = {k: t.clone() for k, t in network().state_dict().items()}
         errors = iter([1.0, 2.0, 1.0, math.inf, 3.0])
         run = finish(trainer(error=lambda model: next(errors)))
@@ -273,7 +273,7 @@ class TestTraining:
         again.resume(*read_checkpoint(tmp_path / "a.safetensors", "training"))
         assert again.run_epoch()["train_loss"] < run.state.history[1]["train_loss"]
 
-    def test_nothing_can_be_simulated(self):
+    def test_a_simulator_that_always_fails_is_refused(self):
         loss = window_loss(Formula(lambda q, v: torch.full_like(q, math.nan)))
         run = SolverInTheLoop(network(), loss, [TRAIN], [VALIDATION], lambda model: 1.0, CONFIG)
         with pytest.raises(InputError, match="the simulator fails in every window of the training split"):

@@ -122,7 +122,7 @@ def test_sets_of_parameters_at_once_are_those_one_by_one():
         replay(release, {"stiffness": double([1.0])})
 
 
-def test_parts_have_parameters_of_their_own():
+def test_parts_have_their_own_parameters():
     """One that is named alone leaves the others at what they are, or at what is given for all."""
     routes = [[[0.0, 0.01, z], [0.1, 0.01, z]] for z in (0.005, 0.015)]
     tendons = Tendons(routes, stiffness=[300.0, 400.0], labels=("low", "high"))
@@ -136,8 +136,8 @@ def test_parts_have_parameters_of_their_own():
         ({"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value}, [[1.0, 5.0], [2.0, 10.0]]),
     ):
         constants, _, _ = replay.prepare(given)
-        found = constants.values["tendon_stiffness"]  # two trials for each set of parameters
-        torch.testing.assert_close(found, double(wanted).repeat_interleave(2, 0))
+        result = constants.values["tendon_stiffness"]  # two trials for each set of parameters
+        torch.testing.assert_close(result, double(wanted).repeat_interleave(2, 0))
 
 
 def test_configured_parameters_are_those_of_the_simulator():
@@ -205,7 +205,7 @@ def test_markers_that_were_not_seen_have_no_influence():
         replace(motions, observed=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.observed))
 
 
-def test_motions_can_be_cut_and_chosen():
+def test_trials_can_be_cut_and_selected():
     motions = blank(frames=12)
     motions.times[1, 8:] = 0.07
     motions.observed[1, 8:] = torch.nan
@@ -236,7 +236,7 @@ def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
     assert bool(bent.isfinite().all())
 
 
-def test_a_body_that_nothing_holds_rests_under_gravity_and_its_weight():
+def test_without_hold_modes_a_body_rests_under_gravity_and_its_weight():
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
     q = hold(replay, 0)
@@ -266,12 +266,12 @@ def test_the_delay_and_the_push_of_a_release_are_recovered_in_any_basis(angle, m
     velocity = torch.einsum("bk,knc->bnc", pushes, shapes)
     seen = replay(Start(State(q, velocity), delay))[0]
     settings = ReleaseSettings(velocity_modes=2, delay=0.01, window=0.1, noise=1e-5, iterations=8)
-    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
-    torch.testing.assert_close(found.delay, delay, rtol=0.0, atol=5e-4)
-    torch.testing.assert_close(found.state.v, velocity, rtol=0.0, atol=3e-3)
-    again = replay(found)[0]
+    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    torch.testing.assert_close(result.delay, delay, rtol=0.0, atol=5e-4)
+    torch.testing.assert_close(result.state.v, velocity, rtol=0.0, atol=3e-3)
+    again = replay(result)[0]
     assert float((again - seen).norm(dim=-1).mean()) < 2e-5
-    assert found.shift is None
+    assert result.shift is None
     kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(velocity_modes=0, delay=0.0))
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
 
@@ -287,11 +287,11 @@ def test_releases_within_twice_what_is_expected_are_recovered(seed):
     release = Start(State(q, velocity), 0.01 * values[:, 0])
     seen = Replay(sim, MARKERS, motions)(release)[0]
     settings = ReleaseSettings(hold_modes=6, velocity_modes=2, delay=0.01, window=0.1, noise=1e-5)
-    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
-    torch.testing.assert_close(found.delay, release.delay, rtol=0.0, atol=5e-4)
+    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    torch.testing.assert_close(result.delay, release.delay, rtol=0.0, atol=5e-4)
 
 
-def test_a_body_held_sideways_shows_it_once_it_is_initial_motion():
+def test_a_sideways_held_body_is_identified_from_its_initial_motion():
     sim, motions = simulator(), blank(frames=16)
     replay, shapes = Replay(sim, MARKERS, motions), sideways_shapes(sim)
     q = hold(replay, 6)
@@ -301,11 +301,11 @@ def test_a_body_held_sideways_shows_it_once_it_is_initial_motion():
     seen = replay(truth)[0]
     torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
     settings = ReleaseSettings(velocity_modes=0, delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
-    found = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
-    torch.testing.assert_close(found.state.q, bent, rtol=0.0, atol=2e-5)
-    torch.testing.assert_close(replay(found)[0], seen, rtol=0.0, atol=1e-5)
-    torch.testing.assert_close(found.select([1]).shift, found.shift[1:])
-    torch.testing.assert_close(found.bound(found.shifted(seen)), seen)
+    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    torch.testing.assert_close(result.state.q, bent, rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(replay(result)[0], seen, rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(result.select([1]).shift, result.shift[1:])
+    torch.testing.assert_close(result.bound(result.shifted(seen)), seen)
     straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings.changed(sideways=0.0))
     assert straight.shift is None
     assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
@@ -327,7 +327,7 @@ def test_bodies_bend_sideways_across_gravity(gravity):
     assert abs(float(across[0] @ across[1])) < 0.05
 
 
-def test_the_shape_of_bending_is_found_in_single_precision_and_for_stiff_bodies():
+def test_bending_shapes_in_single_precision_and_of_stiff_bodies():
     exact = sideways_shapes(simulator())
     for modulus in (215e3, 1e9):
         sim = simulator(material=Corotated(modulus, 0.45), dtype=torch.float32, relative_tolerance=1e-4)
@@ -337,7 +337,7 @@ def test_the_shape_of_bending_is_found_in_single_precision_and_for_stiff_bodies(
         torch.testing.assert_close(sign * rough, exact, rtol=0.0, atol=0.03)
 
 
-def test_a_body_that_cannot_be_held_says_so(monkeypatch):
+def test_a_body_that_cannot_be_held_is_an_error(monkeypatch):
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
 

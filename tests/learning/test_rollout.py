@@ -8,7 +8,7 @@ from warp_resphys.learning.rollout import Rollout
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_what_is_lost_stands_at_rest_and_carries_nothing_while_the_others_go_on(integrator):
+def test_lost_environments_stand_at_rest_without_inputs(integrator):
     mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
     settings = SolverSettings(on_failure="count")

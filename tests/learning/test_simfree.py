@@ -79,7 +79,7 @@ def test_a_saved_model_predicts_the_same(system, kind, tmp_path):
 
 
 @pytest.mark.parametrize("value", [float("nan"), 1.01 * DIVERGENCE_DISTANCE])
-def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
+def test_a_diverged_roll_out_stays_lost_and_does_not_affect_others(value):
     """The second of three environments leaves at its third step, and would come back if it was asked."""
     calls = []
 
@@ -102,7 +102,7 @@ def test_a_roll_out_that_diverges_is_lost_for_good_and_touches_no_other(value):
     assert all(torch.equal(q[1], REST) for q in calls[3:])  # stands at rest from then on
 
 
-def test_just_short_of_diverging_is_no_divergence():
+def test_positions_below_the_limit_have_not_diverged():
     far = REST.expand(1, -1, -1) + 0.99 * DIVERGENCE_DISTANCE * 0.1
     rollout = Rollout(SIMULATOR, lambda state, step: State(far, state.v))
     positions = closed_loop(rollout, SIMULATOR.rest_state(1), 2)

@@ -81,7 +81,7 @@ class TestMarkerMap:
 def test_in_single_precision(method, options):
     """Two steps in a row of a nearly incompressible beam, so that states keep their type."""
     observed, start = observation(2)
-    found = []
+    result = []
     for dtype in (torch.float64, torch.float32):
         sim = simulator(poissons_ratio=0.499, dtype=dtype, relative_tolerance=1e-8)
         first = State(start.q.to(dtype), start.v.to(dtype))
@@ -91,9 +91,9 @@ def test_in_single_precision(method, options):
             solver = make_sparse_reconstructor(sim, markers_at([5, 10]), method, 1e-6, 1e-6, 60, **options)
         q, force = reconstruct(solver, first, observed.to(dtype))
         assert q.dtype == force.dtype == dtype
-        found.append((q.double(), force.double()))
-    torch.testing.assert_close(found[1][0], found[0][0], rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(found[1][1], found[0][1], rtol=0.0, atol=1e-2 * float(found[0][1].abs().max()))
+        result.append((q.double(), force.double()))
+    torch.testing.assert_close(result[1][0], result[0][0], rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(result[1][1], result[0][1], rtol=0.0, atol=1e-2 * float(result[0][1].abs().max()))
 
 
 class TestGaussNewton:
@@ -147,7 +147,7 @@ class TestGaussNewton:
         np.testing.assert_allclose(replayed, q, rtol=0, atol=1e-9)
         assert float((q - observed[1:]).norm()) < 0.3 * float((uncorrected - observed[1:]).norm())
 
-    def test_environments_do_not_see_each_other(self):
+    def test_environments_are_independent(self):
         observed, start = observation(1, (0.02, 0.3))
         both = gauss_newton(simulator(), markers_at([5, 8], [9, 10]), 1e-6, **TIGHT)
         together = both.step(start, both.observation(observed[1]))
@@ -183,7 +183,7 @@ class TestGaussNewton:
             replayed, _ = sim.step(start, Inputs(force))
         np.testing.assert_allclose(replayed.q, ours.state.q, rtol=0, atol=1e-9)
 
-    def test_it_says_when_it_did_not_settle(self):
+    def test_failed_convergence_is_an_error(self):
         observed, start = observation()
         solver = gauss_newton(simulator(), markers_at([8]), 1e-6, tolerance=1e-12, max_iterations=1)
         with pytest.raises(ConvergenceError, match=r"the 1th: raise reconstruction\.regularisation"):
@@ -217,26 +217,26 @@ class TestLevenbergMarquardt:
         _, start = observation(1, (0.1, 0.1))
         sim, markers = simulator(), markers_at([6, 11], [6, 11])
         target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
-        found = levenberg_marquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
-        force = found.force.clone().requires_grad_(True)
+        result = levenberg_marquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
+        force = result.force.clone().requires_grad_(True)
         new, _ = sim.step(start, Inputs(force))
         objective = (markers(new.q) - target).square().sum() + 1e-5 * force.square().sum()
         (gradient,) = torch.autograd.grad(objective, force)
-        np.testing.assert_allclose(new.q.detach(), found.state.q, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(new.q.detach(), result.state.q, rtol=0, atol=1e-9)
         free = [i for i in range(12) if i not in BODY.fixed_vertices]
-        assert float(gradient[:, free].abs().max()) < 1e-4 * 2e-5 * float(found.force.abs().max())
+        assert float(gradient[:, free].abs().max()) < 1e-4 * 2e-5 * float(result.force.abs().max())
 
-    def test_full_steps_that_do_not_settle_are_followed_by_damped_ones(self, caplog):
+    def test_damped_steps_follow_full_steps_that_do_not_converge(self, caplog):
         _, start = observation(1, (0.1, 0.1))
         sim, markers = simulator(), markers_at([6, 11], [6, 11])
         target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
         damped = levenberg_marquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
         with caplog.at_level("INFO"):
-            found = gauss_newton(sim, markers, 1e-5, 1e-10, 200).step(start, target)
+            result = gauss_newton(sim, markers, 1e-5, 1e-10, 200).step(start, target)
         assert "damped ones follow" in caplog.text
-        np.testing.assert_array_equal(found.force, damped.force)
+        np.testing.assert_array_equal(result.force, damped.force)
 
-    def test_a_first_guess_that_fails_is_left(self, monkeypatch):
+    def test_a_first_guess_that_fails_is_dropped(self, monkeypatch):
         observed, start = observation()
         sim, markers = simulator(), markers_at([8])
         solver = levenberg_marquardt(sim, markers, 1e-6, **TIGHT)
@@ -249,10 +249,10 @@ class TestLevenbergMarquardt:
             return step(self, state, inputs, parameters)
 
         monkeypatch.setattr(Simulator, "step", fragile)
-        found = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))
-        np.testing.assert_allclose(found.force, expected.force, rtol=0, atol=1e-9)
+        result = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))
+        np.testing.assert_allclose(result.force, expected.force, rtol=0, atol=1e-9)
 
-    def test_a_simulator_that_never_gets_there_is_no_result(self, monkeypatch):
+    def test_an_unreachable_target_is_an_error(self, monkeypatch):
         observed, start = observation()
         solver = levenberg_marquardt(simulator(), markers_at([8]), 1e-6, 1e-6, 5)
 

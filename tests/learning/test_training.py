@@ -81,7 +81,7 @@ class TestResume:
         assert second.best_error == whole.best_error
         assert same(second.state.best, whole.state.best)
 
-    def test_with_nothing_but_diverged_roll_outs(self, tmp_path):
+    def test_all_roll_outs_diverge(self, tmp_path):
         first = trainer(error=lambda model: math.inf)
         for _ in range(3):
             first.run_epoch()
@@ -99,7 +99,7 @@ class TestSelection:
         ("errors", "best"),
         [([3.0, 1.0, 2.0], 1), ([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
     )
-    def test_the_smallest_roll_out_error_wins_whatever_the_loss(self, errors, best):
+    def test_the_smallest_roll_out_error_is_selected(self, errors, best):
         queue, weights = list(errors), []
 
         def error(model):
@@ -120,7 +120,7 @@ class TestSelection:
         assert all(torch.isfinite(t).all() for t in run.use_best().state_dict().values())
 
     @pytest.mark.parametrize("measured", [3.0, math.inf])
-    def test_the_smallest_validation_loss_wins_whatever_the_roll_outs(self, monkeypatch, measured):
+    def test_the_smallest_validation_loss_is_selected(self, monkeypatch, measured):
         losses, weights, asked = [5.0, 4.0, 2.0, 3.0, math.nan, 6.0], [], []
         run = trainer(selection="validation_loss", error=lambda model: asked.append(model) or measured)
 
@@ -164,7 +164,7 @@ class TestRepeatability:
 
 
 class TestLearning:
-    def test_losses_fall_below_what_the_linear_part_leaves(self):
+    def test_losses_fall_below_the_remainder_of_the_linear_part(self):
         run = finish(trainer(epochs=100, batch_size=8, noise=0.0))
         linear = float(run.model.remainder) ** 2
         assert 0.1 < linear < 1.0
@@ -174,8 +174,8 @@ class TestLearning:
         run = finish(trainer(epochs=1))
         with torch.no_grad():
             wanted = run.model.coders[0].encode(VALIDATION.outputs[0])
-            found = run.model.coders[0].encode(run.model(VALIDATION.q, VALIDATION.v))
-        expected = float((found - wanted).square().mean())
+            result = run.model.coders[0].encode(run.model(VALIDATION.q, VALIDATION.v))
+        expected = float((result - wanted).square().mean())
         assert run.state.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
 
     def test_without_linear_part(self):
@@ -205,12 +205,12 @@ def test_empty_split(name):
 
 
 @pytest.mark.parametrize(("exponent", "smallest"), [(0.0, 1.0), (1.0, 0.1)])
-def test_outputs_weigh_by_their_deviation(exponent, smallest):
+def test_outputs_are_weighted_by_their_deviation(exponent, smallest):
     """With the power one, the validation loss is the squared error of the forces themselves, in units of theirs."""
     forces = TRAIN.outputs[0] * torch.tensor([1.0, 1.0, 1.0, 0.1])[:, None]
     torch.manual_seed(0)
     model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
-    data = [replace(each, outputs=(forces[: len(each.q)],)) for each in (TRAIN, VALIDATION)]
+    data = [replace(samples, outputs=(forces[: len(samples.q)],)) for samples in (TRAIN, VALIDATION)]
     run = Trainer(model, *data, rollout_error, TrainerSettings(**{**CONFIG, "scale_weight": exponent}), 0)
     loss = run.run_epoch()["validation_loss"]
     (coder,) = model.coders

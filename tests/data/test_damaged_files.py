@@ -1,4 +1,4 @@
-"""Files that were damaged at random: every reader gives what it read or one sentence, within memory and time."""
+"""Randomly damaged files: every reader returns data or raises one sentence, within limits of memory and time."""
 
 import contextlib
 import multiprocessing

@@ -1,4 +1,4 @@
-"""Valves that lag, commands that are late, and means of what an input was."""
+"""Lag of valves, delay of commands, and exponential means of inputs."""
 
 import numpy as np
 import pytest

@@ -81,7 +81,7 @@ def test_gradients_at_rest_and_after_a_large_turn(name):
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_a_body_is_carried_with_its_markers(name):
-    """Where one of its points is a marker, that is where the marker is told to be; but for depth, which it keeps."""
+    """A point of the body at a marker has the marker's viewed position, apart from the unseen depth."""
     points, view = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), VIEWS[name]
     body = torch.cat([points, points.flip(-2) + 0.01], -2)
     carried, context = view.carried(body, points), view(points)

@@ -211,7 +211,7 @@ def test_quality_of_a_recording():
 
 
 def test_the_release_is_not_a_jump_of_the_body_but_of_the_base():
-    """A marker that is alone on its body jerks as it is let go; one on the clamp must not."""
+    """The jerk of a single marker at the release is no jump; that of a marker on the clamp is one."""
     recording = swinging().select([TIP[0], *BASE])
     assert [jump.label for jump in find_jumps(recording)] == [TIP[0]]
     recording.positions[61:, 1] += 1e-3

@@ -69,7 +69,7 @@ def test_a_table_without_a_header(tmp_path, positions):
 
 
 class TestALogThatBeganBeforeItsWinch:
-    """It is as it was first told, and ends with what is told last; a note at the side of the header is none of it."""
+    """Missing first values equal the first known one, the recording ends with the last one; notes are ignored."""
 
     COLUMNS = ("frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]", "valve [Pa]")
     TABLE = Table(COLUMNS, header_lines=1)

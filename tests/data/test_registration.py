@@ -260,7 +260,7 @@ class TestWithAKnownVertical:
 
     UP = np.array([0.0, 0.0, 1.0])
 
-    def found(self, nominal, angle=2.0, lean=(0.7, -0.4, 0.0), **more):
+    def register(self, nominal, angle=2.0, lean=(0.7, -0.4, 0.0), **more):
         turn = Rotation.from_rotvec(np.asarray(lean)) * Rotation.from_rotvec(angle * self.UP)
         measured = turn.apply(nominal) + [0.3, 0.2, -0.1]
         below = Rotation.from_rotvec(np.asarray(lean)).apply(self.UP)
@@ -273,12 +273,12 @@ class TestWithAKnownVertical:
         "nominal", [[[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]], [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]]]
     )
     def test_two_markers_or_a_row_register_with_a_known_vertical(self, nominal, angle):
-        result, turn = self.found(np.array(nominal), angle)
+        result, turn = self.register(np.array(nominal), angle)
         np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-12)
         np.testing.assert_allclose(result.positions, nominal, atol=1e-12)
 
     def test_a_recording_with_an_inverted_vertical_axis(self):
-        result, turn = self.found(np.array([[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]]), lean=(np.pi, 0.0, 0.0))
+        result, turn = self.register(np.array([[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]]), lean=(np.pi, 0.0, 0.0))
         np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-9)
 
     def test_three_markers_off_a_line_determine_the_vertical(self):
@@ -289,7 +289,7 @@ class TestWithAKnownVertical:
 
     def test_degenerate_views_are_refused(self):
         with pytest.raises(InputError, match=r"'B0', 'B1' lie above one another to within 4\.0 mm"):
-            self.found(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
+            self.register(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
         pair = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])
         with pytest.raises(DataFileError, match="mm off where the vertical and 'B0', 'B1' tell how the body stands"):
             register_markers(pair * 1.2, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))

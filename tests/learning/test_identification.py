@@ -285,7 +285,7 @@ def resting_pose(sim):
 
 
 def test_stiffness_and_damping_are_identified_from_poses_and_motions():
-    """A pose under a weight depends on the stiffness alone: the damping is still found, from the motion."""
+    """A pose under a weight depends on the stiffness alone: the damping is identified from the motion."""
     motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
     pose, start = resting_pose(motion.simulator)
     result = Identifier([(motion, release), (pose, start)], RANGES).run([FIRST], 40)

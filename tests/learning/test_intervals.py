@@ -1,4 +1,4 @@
-"""Prediction intervals: how often they hold where the errors are known, and what they are scaled by."""
+"""Prediction intervals: coverage with known errors, and the choice of the scale."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ REST = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
 
 
 def trials(count, seed, noise, frames=60):
-    """Swinging markers, and what was observed: off by ``noise`` of how far each has moved [m], slowly varying."""
+    """Swinging markers, and observed ones with slowly varying errors of size ``noise(displacement)`` [m]."""
     draw = np.random.default_rng(seed)
     simulated, observed = [], []
     for _ in range(count):
@@ -31,7 +31,7 @@ def trials(count, seed, noise, frames=60):
     [(lambda moved: 1e-3 + 0.0 * moved, "constant"), (lambda moved: 1e-4 + 0.2 * moved, "displacement")],
 )
 def test_intervals_have_their_coverage_on_other_trials(noise, scale):
-    """On average over many sets of calibrating trials, whatever the errors, few trials or many."""
+    """Mean coverage over many calibrations, with few or many trials, for both kinds of errors."""
     for count in (3, 10):
         result, scales = [], []
         for seed in range(40):

@@ -1,4 +1,4 @@
-"""Learning from markers: what they say at the steps, the errors of roll-outs, and training through the simulator."""
+"""Learning from markers: observations at the steps, errors of roll-outs, and training through the simulator."""
 
 import numpy as np
 import pytest
@@ -276,7 +276,7 @@ class TestMarkersInTheLoop:
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
 
     def test_groups_are_weighted_by_their_number_of_trials(self, loss):
-        """Motions in groups of their own, as those that begin otherwise are, give the loss and error of one group."""
+        """Motions split into groups have the loss and error of one group."""
         motions, release = observed_motions()
         sim, model = simulator(), network()
         watched = [

@@ -1,4 +1,4 @@
-"""Markers beside their nominal places, recordings that lie askew, and what is known of parameters beforehand."""
+"""Misplaced markers, rotated recordings, and priors of parameters."""
 
 import math
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_derivatives_of_placed_markers():
 
 
 def test_the_placement_minimises_its_sum_of_squares():
-    """With turns of degrees, which are not linear; and what is known exactly stays."""
+    """With nonlinear rotations by degrees; quantities that are known exactly stay."""
     draw = torch.Generator().manual_seed(1)
     errors = [1e-2 * torch.randn(2, 3, 4, 3, generator=draw, dtype=torch.float64)]
     at, turns = (
@@ -120,7 +120,7 @@ def one(value):
 
 
 def posed(observe, noise=0.0, seed=0, truth=TRUTH):
-    """A replay of poses as nominal markers expect them, of what others saw."""
+    """A replay of poses with nominal markers, of measurements by other markers."""
     attached = torch.zeros(len(WEIGHTS), len(REST), dtype=torch.float64)
     for row, weights in enumerate(WEIGHTS):
         for edge, mass in zip(EDGES, weights, strict=True):
@@ -153,7 +153,7 @@ def test_the_modulus_is_recovered_from_misplaced_markers():
     placed = PlacedMarkers.of(bind(), Placement.from_plain(result.placement, LABELS))
     q = SIM.static_equilibrium(pair[0].trials.inputs, {name: one(x) for name, x in TRUTH.items()}).q
     off = (placed(q) - PlacedMarkers.of(bind(), ASKEW)(q)).norm(dim=-1)
-    assert float(off.max()) < 2e-4  # where the recording shows them, though frame and offsets are not told apart
+    assert float(off.max()) < 2e-4  # where the recording shows them, though frame and offsets are not distinguishable
     deviation = result.uncertainty.deviation["youngs_modulus"]
     assert deviation > 0.2 * abs(result.parameters["youngs_modulus"] - 215e3)
 

@@ -1,4 +1,4 @@
-"""A recurrent predictor learns what depends on the past, and its hidden state goes with the roll-out."""
+"""A recurrent predictor learns a dependence on the past, with its hidden state in the roll-out."""
 
 import pytest
 import torch
@@ -90,7 +90,7 @@ def test_a_recurrent_network_learns_a_lag(model):
 
 
 def test_every_environment_has_its_hidden_state(model):
-    """Trials that are rolled out alone give what they give in a batch, and each begins from nothing."""
+    """Trials have the same roll-outs alone and in a batch, all from no hidden state."""
     learned, samples = model
     together, _ = rolled_out(learned, samples)
     q = samples.q.unflatten(0, (TRIALS, STEPS))[3:4]

@@ -42,7 +42,7 @@ def motion(integrator="implicit_euler", seed=0):
 
 
 def motion_of(q, v, target, inputs=None, context=None):
-    """Two trials at the steps of the simulator, and what should be observed of them."""
+    """Two trials at the steps of the simulator, and their targets."""
     times = real_time(target.shape[1]).expand(2, -1)
     trials = Trials(("a", "b"), times, target, target[:, 0], Inputs() if inputs is None else inputs)
     return RefinementBatch(q, v, target, trials, context)

@@ -123,7 +123,7 @@ def test_sets_of_parameters_at_once_are_those_one_by_one():
 
 
 def test_parts_have_their_own_parameters():
-    """One that is named alone leaves the others at what they are, or at what is given for all."""
+    """The parameter of one part leaves the other parts at their own or their common value."""
     routes = [[[0.0, 0.01, z], [0.1, 0.01, z]] for z in (0.005, 0.015)]
     tendons = Tendons(routes, stiffness=[300.0, 400.0], labels=("low", "high"))
     sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=(tendons,)))
@@ -141,7 +141,7 @@ def test_parts_have_their_own_parameters():
 
 
 def test_configured_parameters_are_those_of_the_simulator():
-    """A part's is its own; what is called like a command of an input need not be one."""
+    """A part has its own value; a name like that of an input's response need not be one."""
     mesh = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
     routes = {name: [(0.0, y, 0.015), (0.1, y, 0.015)] for name, y in (("low", 0.01), ("rise", 0.02))}
     tendons = Tendons([*routes.values()], stiffness=[300.0, 400.0], labels=[*routes])

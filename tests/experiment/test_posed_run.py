@@ -136,7 +136,7 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
     arm = GeneratedArm(kind="arm_generated", size=0.006)
     assert finer(arm, 2.0) == arm.changed(size=0.003)
     assert finer(arm.changed(layers=0.01), 2.0) == arm.changed(size=0.003, layers=0.005)
-    with pytest.raises(InputError, match="cells of a mesh of the kind 'file' are given"):
+    with pytest.raises(InputError, match="a mesh of the kind 'file' cannot be refined"):
         finer(FileMesh(kind="file", path="a.vtk"), 2.0)
 
 
@@ -146,7 +146,7 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
         (["data.axes=[x,z,y]"], r"data.axes: the axes \(x, z, y\) would mirror the recording"),
         (["data.axes=[x,x,y]"], "data.axes is .*twice"),
         (["mesh_check=1"], "mesh_check is 1: .* above 1"),
-        (["data.axes=null"], "markers.reference names 1 .* it takes 3, or data.axes and one"),
+        (["data.axes=null"], "markers.reference names 1: static poses need 3 .*, or data.axes and one"),
         (["data.table.columns=[1,2]"], "data.table.columns is"),
         (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is"),
         (
@@ -158,7 +158,7 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
             "names tendon_offset_1 and its parts, tendon_offset_1_first, tendon_offset_1_second: choose one",
         ),
         (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
-        (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0 .* it takes 1"),
+        (["markers.reference={}", "~markers.reference.Base"], "markers.reference names 0: static poses need 1"),
     ],
 )
 def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, poses, monkeypatch):

@@ -185,7 +185,7 @@ def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_p
         shutil.copy(finished / "run" / name, tmp_path)
     monkeypatch.setattr(reconstruct, "replayed_errors", lambda *rest: np.full(rest[3]["force"].shape[:2], np.inf))
     reconstruct.reconstruct(StageContext("reconstruct_resphys", tmp_path, "", stage))
-    assert "the forces lead inf mm away from the markers" in caplog.text
+    assert "replaying the forces gives a marker error of inf mm" in caplog.text
     assert json.loads((tmp_path / "reconstruction.json").read_text())["resphys"]["replayed_mm"] is None
 
 

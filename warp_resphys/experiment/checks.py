@@ -236,8 +236,8 @@ def _check_release(run: RunSettings, data: RecordedData) -> None:
         return
     if data.rest != "held":
         raise InputError(
-            f"release.sideways is {sideways:g} m, but data.rest {data.rest} gives the markers on the undeformed body: "
-            "set release.sideways to 0."
+            f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives the markers on the "
+            "undeformed body: set release.sideways to 0."
         )
     if not any(run.gravity):
         raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")

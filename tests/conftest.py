@@ -70,7 +70,8 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_report(monkeypatch):
     """Replaces the report, which takes most of a tiny run's time and has tests of its own."""
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+    for name in ("make_report", "make_folds_report"):
+        monkeypatch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 @pytest.fixture(scope="session")

@@ -58,13 +58,13 @@ def finished(tmp_path_factory):
 
 
 def test_more_markers_leave_less_error_and_spread(finished):
-    found = json.loads((finished / "metrics.json").read_text())
-    assert found["uncorrected_mm"] > 0.3
+    results = json.loads((finished / "metrics.json").read_text())
+    assert results["uncorrected_mm"] > 0.3
     medians = [row["median_mm"] for row in rows(finished)]
     assert np.diff(medians).max() <= 1e-9 * medians[0]  # The last count only adds markers that cannot move.
-    assert medians[1] < 0.2 * found["uncorrected_mm"]
+    assert medians[1] < 0.2 * results["uncorrected_mm"]
     assert rows(finished)[2]["interquartile_range_mm"] < 0.1 * rows(finished)[0]["interquartile_range_mm"]
-    assert list(found["seconds"]) == ["generate", "ablation", "report"]
+    assert list(results["seconds"]) == ["generate", "ablation", "report"]
 
 
 def test_sets_are_of_free_surface_vertices_unless_these_are_too_few(finished):
@@ -77,8 +77,8 @@ def test_sets_are_of_free_surface_vertices_unless_these_are_too_few(finished):
     for count, draws in zip(COUNTS, sets, strict=True):
         assert (draws[:, count:] == -1).all()
         chosen = [frozenset(row[:count].tolist()) for row in draws]
-        assert all(len(each) == count for each in chosen)
-        assert all(each <= set(SURFACE) - (set(CLAMPED) if count <= 33 else set()) for each in chosen)
+        assert all(len(markers) == count for markers in chosen)
+        assert all(markers <= set(SURFACE) - (set(CLAMPED) if count <= 33 else set()) for markers in chosen)
     assert len({frozenset(row[:4].tolist()) for row in sets[1]}) > 1
 
 
@@ -142,9 +142,9 @@ def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a
     ):
         for name in ("count", "markers", "error", "misfit"):
             np.testing.assert_array_equal(file[name][:], serial[name][:])
-    found, serial = (json.loads((each / "metrics.json").read_text()) for each in (Path("run"), finished))
+    results, serial = (json.loads((folder / "metrics.json").read_text()) for folder in (Path("run"), finished))
     # Two processes that have loaded torch and Warp; what this one has kept of other tests counts in both runs.
-    assert found["peak_memory_gib"] > serial["peak_memory_gib"] + 2 * 0.25
+    assert results["peak_memory_gib"] > serial["peak_memory_gib"] + 2 * 0.25
     written = Path("run/ablation.h5").stat().st_mtime_ns
     assert run(*TINY, "ablation.processes=3")[0] == 0
     assert Path("run/ablation.h5").stat().st_mtime_ns == written
@@ -152,13 +152,13 @@ def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a
 
 def children_of(pid):
     """Processes that a process has started and that still run."""
-    found = []
+    results = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             state, parent = path.read_text().rpartition(")")[2].split()[:2]
             if int(parent) == pid and state != "Z":
-                found.append(int(path.parent.name))
-    return found
+                results.append(int(path.parent.name))
+    return results
 
 
 def gone(pids):

@@ -38,10 +38,10 @@ def finished(tmp_path_factory):
 
 
 def test_files_and_metrics(finished):
-    found = json.loads((finished / "metrics.json").read_text())
-    assert [each["name"] for each in found["per_trajectory"]] == ["60°", "140°"]
-    assert found["errors_mm"].keys() == {"simulation", "reconstruction", "resphys", "simfree"}
-    assert all(each["trajectories"] == 2 for each in found["errors_mm"].values())
+    results = json.loads((finished / "metrics.json").read_text())
+    assert [trial["name"] for trial in results["per_trajectory"]] == ["60°", "140°"]
+    assert results["errors_mm"].keys() == {"simulation", "reconstruction", "resphys", "simfree"}
+    assert all(summary["trajectories"] == 2 for summary in results["errors_mm"].values())
     expected = {"dataset.h5", "reconstruction_resphys.h5", "resphys.safetensors", "simfree.safetensors", "rollouts.h5"}
     assert expected | {"errors.json", "times.json", "report.html"} <= {path.name for path in finished.iterdir()}
     page = (finished / "report.html").read_text()
@@ -50,11 +50,11 @@ def test_files_and_metrics(finished):
 
 
 def test_the_correction_corrects(finished):
-    found = json.loads((finished / "metrics.json").read_text())["errors_mm"]
-    assert found["simulation"]["mean"] > 0.1
-    assert found["resphys"]["mean"] < 0.1 * found["simulation"]["mean"]
-    assert found["reconstruction"]["mean"] < 1e-3
-    assert all(found[model]["diverged"] == 0 for model in ("simulation", "resphys", "reconstruction"))
+    results = json.loads((finished / "metrics.json").read_text())["errors_mm"]
+    assert results["simulation"]["mean"] > 0.1
+    assert results["resphys"]["mean"] < 0.1 * results["simulation"]["mean"]
+    assert results["reconstruction"]["mean"] < 1e-3
+    assert all(results[model]["diverged"] == 0 for model in ("simulation", "resphys", "reconstruction"))
 
 
 def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured_angles(finished):
@@ -91,14 +91,14 @@ def test_the_quick_budget_picks_evenly(experiment, unit, factor):
     for name, limit in dict(quick.limit).items():
         row, picked = [f"{x:g}{unit}" for x in getattr(full.amounts, name)], list(getattr(split, name))
         assert list(getattr(whole, name)) == row
-        places = [row.index(each) for each in picked]
+        places = [row.index(name) for name in picked]
         assert len(picked) == limit < len(row)
         if limit > 1:
             assert (places[0], places[-1]) == (0, len(row) - 1)
             assert np.ptp(np.diff(places)) <= 1  # strides differ by one at most
             assert np.diff(places).min() >= 1
         chosen = np.array([getattr(full.amounts, name)[place] for place in places])
-        np.testing.assert_allclose([amounts[each] for each in picked], factor * chosen)
+        np.testing.assert_allclose([amounts[name] for name in picked], factor * chosen)
 
 
 @pytest.mark.parametrize(

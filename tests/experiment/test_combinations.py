@@ -7,37 +7,22 @@ import numpy as np
 import pytest
 from main_job import IN_RUN, TINY, run
 from played_run import check_robots
+from segment_run import TRACKED, place_segment
 
-from warp_resphys import pipeline
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.settings import parse
 from warp_resphys.settings.trials import MotionSettings
 
-# A short segment with two chambers of some 70 vertices, on which everything takes seconds.
-SEGMENT = """# @package _global_
-defaults: [sopra, {override /mesh: segment}, _self_]
-name: tiny
-tip: {z: -0.1}
-chambers: {count: 2}
-mesh: {size: 0.03, layers: 0.05, chambers: 2}
-data:
-  {steps: 12, sequences: 4, train: 2, validation: 1, test: 1, horizons: [], rest_seconds: 0.01, cutoff: 20.0}
-markers:
-  tracked: null
-  reference: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
-  bind: rigid
-  bind_to: {z: -0.1}
-parallel: {processes: 1, batch: 2}
-identify:
-  {trials: null, seconds: 0.1, max_evaluations: 4, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
-network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
-trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
-laboratory:
-  mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
-    size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
-  sequences: {rest: 0.01, correlation_time: 0.03}
-"""
+SEGMENT = [
+    "experiment=tiny",
+    TRACKED,
+    "data.sequences=4",
+    "data.horizons=[]",
+    "identify.trials=null",
+    "identify.seconds=0.1",
+    "identify.max_evaluations=4",
+]
 # A beam of two elements' length whose releases and poses a laboratory records.
 BEAM = [
     "experiment=beam_synthetic",
@@ -62,17 +47,12 @@ BEAM = [
     "laboratory.validation=[m60]",
     "laboratory.test=[m30]",
 ]
-TRACKED = "markers.tracked={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 
 
 @pytest.fixture(autouse=True)
-def _place(folder, monkeypatch):
-    place = Path("configs/experiment/tiny.yaml")
-    place.parent.mkdir(parents=True)
-    place.write_text(SEGMENT)
-    for name in ("make_report", "make_folds_report"):
-        monkeypatch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
+def _place(folder, no_report):
+    place_segment(folder)
 
 
 def done(*arguments):
@@ -83,26 +63,28 @@ def done(*arguments):
 
 
 def segment(*overrides):
-    return done("experiment=tiny", TRACKED, *overrides)
+    return done(*SEGMENT, *overrides)
 
 
-def finite(found):
-    assert all(summary["mean"] is not None and np.isfinite(summary["mean"]) for summary in found["errors_mm"].values())
+def finite(results):
+    assert all(
+        summary["mean"] is not None and np.isfinite(summary["mean"]) for summary in results["errors_mm"].values()
+    )
 
 
 def dataset(*names):
     with read_hdf5("run/dataset.h5", "dataset") as file:
-        words = {key: [str(each) for each in file.attrs[key]] for key in ("names", "begins")}
+        words = {key: [str(value) for value in file.attrs[key]] for key in ("names", "begins")}
         return words, [read_array(file, name) for name in names]
 
 
 def test_a_force_under_pressure_is_refined_through_the_simulator():
-    found = segment("refinement=solver_in_the_loop", "refinement.window=3", "refinement.epochs=3")
-    finite(found)
+    results = segment("refinement=solver_in_the_loop", "refinement.window=3", "refinement.epochs=3")
+    finite(results)
     history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
     assert history[-1]["train_loss"] < 0.99 * history[0]["train_loss"]
-    start = found["networks"]["resphys"]["validation_rollout_error_mm"]
-    assert found["networks"]["resphys_refined"]["validation_rollout_error_mm"] <= start * (1.0 + 1e-9)
+    start = results["networks"]["resphys"]["validation_rollout_error_mm"]
+    assert results["networks"]["resphys_refined"]["validation_rollout_error_mm"] <= start * (1.0 + 1e-9)
     described = [
         read_checkpoint(Path(f"run/{name}.safetensors"), "residual force")[1] for name in ("resphys", "resphys_refined")
     ]
@@ -111,31 +93,31 @@ def test_a_force_under_pressure_is_refined_through_the_simulator():
 
 
 def test_a_force_that_was_trained_on_markers_is_refined_over_windows():
-    found = done(*BEAM, "refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=2")
-    finite(found)
+    results = done(*BEAM, "refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=2")
+    finite(results)
     history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
     assert history[-1]["train_loss"] < history[0]["train_loss"]
 
 
-@pytest.mark.parametrize("arguments", [["experiment=tiny", TRACKED], [*TINY, "force_frame=corotated"]])
+@pytest.mark.parametrize("arguments", [SEGMENT, [*TINY, "force_frame=corotated"]])
 def test_every_trial_is_the_test_of_a_fold(arguments):
-    lists = ["data.weights_g={train:[60,90],validation:[120],test:[150]}"] if len(arguments) > 2 else []
+    lists = [] if arguments is SEGMENT else ["data.weights_g={train:[60,90],validation:[120],test:[150]}"]
     fold = "data.folds=leave_one_out" if not lists else "+data.folds=leave_one_out"
-    found = done(*arguments, *lists, fold, "trainer.epochs=2", "trainer.rollout_every=2", "timing=false")
+    results = done(*arguments, *lists, fold, "trainer.epochs=2", "trainer.rollout_every=2", "timing=false")
     names = {"60 g", "90 g", "120 g", "150 g"} if lists else {"t000", "t001", "t002", "t003"}
-    assert set(found["folds"]) == names
-    for trial, fold in found["folds"].items():
+    assert set(results["folds"]) == names
+    for trial, fold in results["folds"].items():
         assert [row["name"] for row in fold["per_trajectory"]] == [trial]
-    mean = np.mean([fold["errors_mm"]["simulation"]["mean"] for fold in found["folds"].values()])
-    assert found["errors_mm"]["simulation"]["mean"] == pytest.approx(mean)
+    mean = np.mean([fold["errors_mm"]["simulation"]["mean"] for fold in results["folds"].values()])
+    assert results["errors_mm"]["simulation"]["mean"] == pytest.approx(mean)
 
 
 def test_an_arm_under_pressure_carries_payloads_that_the_networks_see():
     own = "+laboratory.trials={t000:{payload:0.0},t001:{payload:0.03},t002:{payload:0.01},t003:{payload:0.02}}"
     factor = "+identify.parameters.attached_mass_factor={lower:0.5,upper:1.5}"
-    found = segment("data.payload_at={z:-0.1}", "actuation.sees_payload=true", own, factor)
-    finite(found)
-    assert found["parameters"]["sysid"].keys() == {"youngs_modulus", "poissons_ratio", "attached_mass_factor"}
+    results = segment("data.payload_at={z:-0.1}", "actuation.sees_payload=true", own, factor)
+    finite(results)
+    assert results["parameters"]["sysid"].keys() == {"youngs_modulus", "poissons_ratio", "attached_mass_factor"}
     _, (payload, observed) = dataset("payload", "observed")
     np.testing.assert_allclose(payload, [0.0, 0.03, 0.01, 0.02])
     heights = observed[:, 0, :, 2].mean(-1)  # m, at rest: the heavier, the lower
@@ -143,40 +125,40 @@ def test_an_arm_under_pressure_carries_payloads_that_the_networks_see():
     tensors, _ = read_checkpoint(Path("run/resphys.safetensors"), "residual force")
     assert len(tensors["actuation.scale"]) == 1 + 2 * 2  # the payload, two pressures and their means
     check_robots("run")
-    code, err = run("experiment=tiny", TRACKED, own, *QUIET)
+    code, err = run(*SEGMENT, own, *QUIET)
     assert (code, "data.payload_at is not set" in err) == (2, True)
 
 
 def test_an_arm_that_is_pulled_aside_is_initial_motion():
     pulls = "+laboratory.trials={a:{pull:[0.9,0,0]},b:{pull:[0,0.9,0]},c:{pull:[0.6,0.6,0]},d:{pull:[-0.6,0.4,0]}}"
     own = ["+laboratory.held_seconds=0.3", "+laboratory.seconds=0.15", pulls, "data.sequences=0", "data.cutoff=null"]
-    found = segment("data.begins=held", "data.rest=file", "data.seconds=0.1", *own, "data.alignment=own")
-    finite(found)
+    results = segment("data.begins=held", "data.rest=file", "data.seconds=0.1", *own, "data.alignment=own")
+    finite(results)
     words, (held, bound) = dataset("held", "bound")
     assert words["begins"] == ["released"] * 4
     moved = (held - bound).mean(1)  # (4, 3) [m]
     for row, direction in zip(moved, ([1, 0], [0, 1], [1, 1], [-0.6, 0.4]), strict=True):
         towards = np.array(direction) / np.linalg.norm(direction)
         assert row[:2] @ towards > 0.95 * np.linalg.norm(row[:2]) > 2e-3
-    code, err = run("experiment=tiny", TRACKED, "data.begins=held", "data.seconds=0.1", *own, *QUIET)
+    code, err = run(*SEGMENT, "data.begins=held", "data.seconds=0.1", *own, *QUIET)
     assert (code, "set data.rest to file" in err) == (2, True)
 
 
 def test_poses_and_motions_under_pressure_are_identified_and_corrected_together():
     poses = ["+laboratory.trials={t000:{begins:static},t003:{begins:static}}", "data.sequences=5"]
     split = ["data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003,t004]"]
-    found = segment(*poses, *split)
-    finite(found)
+    results = segment(*poses, *split)
+    finite(results)
     words, (observed, pressure) = dataset("observed", "pressure")
     assert words["begins"] == ["static", "rest", "rest", "static", "rest"]
     assert np.isfinite(observed[0, 0]).all()
     assert np.isnan(observed[0, 1:]).all()  # a pose has one frame
     assert (pressure[0] == pressure[0, :1]).all()
-    assert [row["name"] for row in found["per_trajectory"]] == ["t003", "t004"]
+    assert [row["name"] for row in results["per_trajectory"]] == ["t003", "t004"]
     with read_hdf5("run/reconstruction_resphys.h5", "reconstruction") as file:
-        order = [str(each) for each in file.attrs["names"]]
+        order = [str(name) for name in file.attrs["names"]]
         error = read_array(file, "error")[order.index("t000")]
-    before = found["errors_mm"]["sysid"]["mean"]
+    before = results["errors_mm"]["sysid"]["mean"]
     assert error[1] < 0.2 * before  # [mm]: a force brings the pose to its markers
     check_robots("run")
 
@@ -185,10 +167,10 @@ def test_poses_under_weights_and_releases_are_identified_and_corrected_together(
     """The stiffness of poses and releases is one; a pose knows nothing of damping."""
     poses = "+laboratory.trials={p50:{payload:0.05,begins:static},p70:{payload:0.07,begins:static}}"
     overrides = ["laboratory.train=[m0,m40,p70]", "laboratory.validation=[m60]", "laboratory.test=[p50,m30]"]
-    found = done(*BEAM[:-3], poses, *overrides)
-    finite(found)
-    assert found["parameters"]["sysid"]["youngs_modulus"] == pytest.approx(250e3, rel=0.3)
-    rows = {row["name"]: row["errors_mm"] for row in found["per_trajectory"]}
+    results = done(*BEAM[:-3], poses, *overrides)
+    finite(results)
+    assert results["parameters"]["sysid"]["youngs_modulus"] == pytest.approx(250e3, rel=0.3)
+    rows = {row["name"]: row["errors_mm"] for row in results["per_trajectory"]}
     assert rows["p50"]["sysid"] < 0.7 * rows["p50"]["simulation"]
     assert rows["p50"]["resphys"] <= 1.2 * rows["p50"]["sysid"]
     check_robots("run")
@@ -205,15 +187,15 @@ def test_poses_under_weights_and_releases_are_identified_and_corrected_together(
         "~identify.parameters.stiffness_damping",
         "simfree.network.velocity_modes=0",
     ]
-    found = done(*BEAM[:-3], static, *alone, *take_out)
-    finite(found)
-    assert found["errors_mm"]["sysid"]["mean"] < found["errors_mm"]["simulation"]["mean"]
+    results = done(*BEAM[:-3], static, *alone, *take_out)
+    finite(results)
+    assert results["errors_mm"]["sysid"]["mean"] < results["errors_mm"]["simulation"]["mean"]
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["experiment=tiny", TRACKED, "tune=reduced", "tune.space.network.width=[4,8]", "tune.settings.trainer={}"],
+        [*SEGMENT, "tune=reduced", "tune.space.network.width=[4,8]", "tune.settings.trainer={}"],
         [*BEAM, "tune=in_the_loop"],
     ],
     ids=["pressure", "released"],
@@ -236,8 +218,8 @@ def test_a_search_where_the_force_is_trained_on_motions_has_its_own_group():
 
 def test_what_is_seen_is_held_in_the_range_of_the_training_or_not():
     for guard in ("true", "false"):
-        found = done(*TINY, f"range_guard={guard}", "timing=false")
-        assert ("range" in found) == (guard == "true")
+        results = done(*TINY, f"range_guard={guard}", "timing=false")
+        assert ("range" in results) == (guard == "true")
         _, described = read_checkpoint(Path("run/resphys.safetensors"), "residual force")
         assert (described["range"] is not None) == (guard == "true")
 
@@ -256,7 +238,11 @@ SWINGS = (
     + "}"
 )
 MOVING = [
-    *(each for each in BEAM if not each.startswith(("laboratory.t", "laboratory.v", "data.seconds", "experiment"))),
+    *(
+        option
+        for option in BEAM
+        if not option.startswith(("laboratory.t", "laboratory.v", "data.seconds", "experiment"))
+    ),
     "experiment=beam_moving_base",
     "data.steps=30",
     "laboratory.train=[s0,s1]",
@@ -268,8 +254,8 @@ MOVING = [
 
 @pytest.mark.parametrize("known", ["reference", "recorded"])
 def test_a_base_that_moves_is_told_by_markers_or_by_a_record(known):
-    found = done(*MOVING, f"data.base_motion={known}")
-    errors = {name: each["mean"] for name, each in found["errors_mm"].items()}
+    results = done(*MOVING, f"data.base_motion={known}")
+    errors = {name: summary["mean"] for name, summary in results["errors_mm"].items()}
     assert errors["simulation"] > 3.0  # mm
     assert errors["sysid"] < 0.7 * errors["simulation"]
     assert errors["resphys"] < 1.05 * errors["sysid"]
@@ -293,13 +279,13 @@ def test_a_base_moves_as_a_table_says_where_every_vertex_is_known(tmp_path):
     place = 0.01 * np.sin(25.0 * times) ** 2
     Path("shaker.csv").write_text("".join(f"{t},0,0,{x},1,0,0,0\n" for t, x in zip(times, place, strict=True)))
     amounts = "data.amplitudes={train:[1.0,2.0,3.0],validation:[1.5],test:[2.5,0.5]}"
-    moving = [each for each in TINY if not each.startswith("data.weights")]
+    moving = [option for option in TINY if not option.startswith("data.weights")]
     swing = "data.base_motion={swings:{a:{frequency:4.0,translation:[0,0,0.01],rotation:[0,0.1,0]}}}"
     for motion in (swing, "data.base_motion={file:shaker.csv}"):
         more = ["data.kind=moving_base", "~data.load", "~data.weights_g", f"+{amounts}", f"+{motion}", "timing=false"]
-        found = done(*moving, *more)
-        finite(found)
-        assert found["errors_mm"]["resphys"]["mean"] < 0.7 * found["errors_mm"]["simulation"]["mean"]
+        results = done(*moving, *more)
+        finite(results)
+        assert results["errors_mm"]["resphys"]["mean"] < 0.7 * results["errors_mm"]["simulation"]["mean"]
         _, (observed, base) = dataset("observed", "base")
         assert base.shape == (6, 13, 6)
         fixed = np.flatnonzero(observed[0, 0, :, 0] == 0.0)

@@ -18,7 +18,7 @@ from warp_resphys.io.stages import Stage, StageInterrupted
 
 
 def write(context):
-    """Notes the process and the number of the run; fails or waits where it is told to."""
+    """Notes the process and the number of the run; fails or waits as configured."""
     if context.settings["fails"]:
         raise ConvergenceError("the simulation fails.", None, None)
     time.sleep(context.settings["seconds"])
@@ -34,8 +34,7 @@ def stages(name, fails, seconds, workers):
 
 
 def folds(folder, names="abcd", fails="", seconds=0.0):
-    found = {n: Fold(n, Path(folder) / f"fold_{n}", partial(stages, n, n in fails, seconds)) for n in names}
-    return found
+    return {n: Fold(n, Path(folder) / f"fold_{n}", partial(stages, n, n in fails, seconds)) for n in names}
 
 
 def written(folder, name="second"):
@@ -45,9 +44,9 @@ def written(folder, name="second"):
 @pytest.mark.parametrize("processes", [1, 2])
 def test_every_fold_is_run_once(tmp_path, processes):
     run_folds(folds(tmp_path), Workers(processes))
-    found = written(tmp_path)
-    assert {name: each["name"] for name, each in found.items()} == dict(zip("abcd", "abcd", strict=True))
-    others = {each["process"] for each in found.values()} - {os.getpid()}
+    results = written(tmp_path)
+    assert {name: fold["name"] for name, fold in results.items()} == dict(zip("abcd", "abcd", strict=True))
+    others = {fold["process"] for fold in results.values()} - {os.getpid()}
     assert len(others) == (2 if processes > 1 else 0)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
     run_folds(folds(tmp_path), Workers(processes))
@@ -87,11 +86,11 @@ def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
     run_folds(folds(tmp_path, "abc"), Workers(1))
     asked = []
 
-    def told(workers):
+    def stages_for(workers):
         asked.append(workers)
         return stages("d", False, 0.0, workers)
 
-    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", told)}, Workers(4))
+    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", stages_for)}, Workers(4))
     assert asked[-1] == Workers(4)
 
 
@@ -117,7 +116,7 @@ def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path):
     assert f"{StageInterrupted.__name__}: interrupted in the folds " in said
     assert "the same command resumes there" in said
     done = {path.parents[1].name[-1] for path in tmp_path.glob("fold_*/stages/first.json")}
-    kept = {name: each["process"] for name, each in written(tmp_path, "first").items() if name in done}
+    kept = {name: fold["process"] for name, fold in written(tmp_path, "first").items() if name in done}
     assert kept
     run_folds(folds(tmp_path, "abcd", seconds=1.0), Workers(2))
     after = written(tmp_path, "first")

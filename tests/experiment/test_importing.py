@@ -65,11 +65,11 @@ def true_markers(played, setup, trials, times):
     """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
     simulator = laboratory_simulator(played, setup.gravity)
     read = bound_markers(played.binding, simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
-    masses = payload_inputs(simulator.body, played.payload_at, np.array([each.payload for each in trials]))
+    masses = payload_inputs(simulator.body, played.payload_at, np.array([trial.payload for trial in trials]))
     held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
     blank = held[:, None].expand(-1, times.shape[1], -1, -1)
     inputs = Inputs(attached_mass=torch.as_tensor(masses["attached_mass"]))
-    motions = Trials(tuple(each.name for each in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs)
+    motions = Trials(tuple(trial.name for trial in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs)
     start = Start(simulator.rest_state(len(trials)), torch.zeros(len(trials), dtype=torch.float64))
     with torch.no_grad():
         return Replay(simulator, read, motions)(start)[0].numpy()
@@ -94,8 +94,8 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     played = PlayedSettings.of(run, files={})
     setup = make_setup(played)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
-    found = np.array([each["release_frame"] for each in read_json(folder / QUALITY).values()]) / RATE
-    times = motions.times.numpy() + (found - released)[:, None]
+    results = np.array([trial["release_frame"] for trial in read_json(folder / QUALITY).values()]) / RATE
+    times = motions.times.numpy() + (results - released)[:, None]
     true = true_markers(played, setup, trials_of(run), times)
     # The nominal places turn the frame by a little; what has to come back is the motion in it.
     turn, _ = Rotation.align_vectors(bound - bound.mean(0), setup.tracked - setup.tracked.mean(0))
@@ -114,7 +114,7 @@ def test_a_laboratory_binds_its_markers_as_they_are_configured():
     """Whatever changes where markers go makes its recordings anew."""
     changes = ("markers.bind=patch", "markers.patch=0.05", "markers.largest_distance=0.03")
     made = [acquisition_stages(settings("experiment=beam_real", *SMALL, *changes[:count]))[0] for count in range(4)]
-    assert len({fingerprint(each, {}) for each in made}) == 4
+    assert len({fingerprint(stage, {}) for stage in made}) == 4
     assert made[2].settings.binding.patch == 0.05
 
 
@@ -165,7 +165,7 @@ def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
     again = settings("experiment=beam_real", *SMALL, "seed=1")
     assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(run)[0], {})
-    one, other = (make_setup(PlayedSettings.of(each, files={})) for each in (again, run))
+    one, other = (make_setup(PlayedSettings.of(own, files={})) for own in (again, run))
     assert np.abs(one.translation - other.translation).min() > 1e-3
 
 
@@ -221,12 +221,12 @@ def shelf(tmp_path, laboratory):
 
 def test_recordings_of_a_folder_give_what_the_run_folder_gave(shelf, laboratory):
     shelf.learned = ["bare", "load52"]
-    found = shelf.bring_in()
+    results = shelf.bring_in()
     with read_hdf5(laboratory[0] / DATASET, "dataset") as file:
-        np.testing.assert_array_equal(found["observed"], file["observed"][()])
-        np.testing.assert_array_equal(found["bound"], file["bound"][()])
-    assert list(found["names"]) == ["bare", "load52", "load101"]
-    np.testing.assert_array_equal(found["payload"], [0.0, 0.05, 0.09])
+        np.testing.assert_array_equal(results["observed"], file["observed"][()])
+        np.testing.assert_array_equal(results["bound"], file["bound"][()])
+    assert list(results["names"]) == ["bare", "load52", "load101"]
+    np.testing.assert_array_equal(results["payload"], [0.0, 0.05, 0.09])
 
 
 def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
@@ -243,21 +243,21 @@ def test_short_gaps_are_filled_and_long_ones_masked(shelf):
     positions = shelf.recordings["load52"].positions.copy()
     positions[50:53, 0] = positions[60:70, 1] = np.nan
     shelf.write("load52", positions=positions)
-    found = shelf.bring_in()["observed"]
-    np.testing.assert_allclose(found[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
+    results = shelf.bring_in()["observed"]
+    np.testing.assert_allclose(results[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
     first = 60 - int(np.ceil(read_json(shelf.folder / QUALITY)["load52"]["release_frame"]))
-    hidden = np.zeros(found.shape[1], bool)
+    hidden = np.zeros(results.shape[1], bool)
     hidden[first : first + 10] = True
-    np.testing.assert_array_equal(np.isnan(found[1, :, 1]).all(1), hidden | np.isnan(whole[1, :, 1]).all(1))
-    np.testing.assert_array_equal(found[2], whole[2])
+    np.testing.assert_array_equal(np.isnan(results[1, :, 1]).all(1), hidden | np.isnan(whole[1, :, 1]).all(1))
+    np.testing.assert_array_equal(results[2], whole[2])
 
 
 def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
     shelf.write("bare", rate=130.0)
     with caplog.at_level(logging.INFO):
-        found = shelf.bring_in()
+        results = shelf.bring_in()
     assert "bare.h5 has 130 frames per second and the simulation 100 steps" in caplog.text
-    steps = np.diff(found["times"][0])
+    steps = np.diff(results["times"][0])
     np.testing.assert_allclose(steps[steps > 0.0], 1.0 / 130.0)
     assert "load52.h5 has" not in caplog.text
 
@@ -271,7 +271,7 @@ def test_each_trial_stands_where_the_mean_of_all_does(shelf):
     np.testing.assert_allclose(whole["observed"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
     shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
     moved = shelf.bring_in()
-    swing, same = (found["observed"][1] - found["bound"] for found in (rest, moved))
+    swing, same = (results["observed"][1] - results["bound"] for results in (rest, moved))
     np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
     assert moved["held"][1] == pytest.approx(moved["bound"])
     shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
@@ -290,21 +290,21 @@ def test_a_trial_with_markers_of_its_own(shelf):
         shelf.config["data"]["trials"][name]["labels"] = ["Tip - 1", own, "Tip - 3", *BASES]
     check(shelf.config)
     shelf.learned = ["bare", "load52"]
-    found = shelf.bring_in()
-    assert list(found["labels"]) == [*TIPS, "Tip - 4"]
-    np.testing.assert_array_equal(np.isfinite(found["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]])
-    hidden = np.isnan(found["observed"]).all((1, 3))
-    np.testing.assert_array_equal(hidden, ~np.isfinite(found["held"]).all(2))
-    np.testing.assert_allclose(found["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
+    results = shelf.bring_in()
+    assert list(results["labels"]) == [*TIPS, "Tip - 4"]
+    np.testing.assert_array_equal(np.isfinite(results["held"]).all(2), [[1, 1, 1, 0], [1, 1, 1, 0], [1, 0, 1, 1]])
+    hidden = np.isnan(results["observed"]).all((1, 3))
+    np.testing.assert_array_equal(hidden, ~np.isfinite(results["held"]).all(2))
+    np.testing.assert_allclose(results["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
     shelf.learned = ["bare", "load52", "load101"]
     mean = shelf.bring_in()["bound"]
     assert (
-        np.abs(mean[[0, 2]] - found["bound"][[0, 2]]).max() > 1e-5
+        np.abs(mean[[0, 2]] - results["bound"][[0, 2]]).max() > 1e-5
     )  # that trial has a say where it is learned from, and
-    np.testing.assert_array_equal(mean[[1, 3]], found["bound"][[1, 3]])  # none on markers that it does not have
-    apart = np.linalg.norm(found["bound"][3] - found["bound"][1])  # ``away`` is in the frame of the recording
+    np.testing.assert_array_equal(mean[[1, 3]], results["bound"][[1, 3]])  # none on markers that it does not have
+    apart = np.linalg.norm(results["bound"][3] - results["bound"][1])  # ``away`` is in the frame of the recording
     assert apart == pytest.approx(np.linalg.norm(away), abs=2e-4)
-    swing, same = (each["observed"][2] - each["held"][2] for each in (found, whole))
+    swing, same = (data["observed"][2] - data["held"][2] for data in (results, whole))
     np.testing.assert_allclose(swing[:, [0, 3, 2]], same, rtol=0.0, atol=5e-5)
     assert set(read_json(shelf.folder / REGISTRATION)["load101"]["shift_mm"]) == {"Tip - 1", "Tip - 3", "Tip - 4"}
     assert read_dataset(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
@@ -330,12 +330,12 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     for name in shelf.recordings:
         published_layout(shelf, name, first=44)
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
-    found = shelf.bring_in()
-    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=2e-5)
-    np.testing.assert_allclose(found["held"], found["observed"][:, 0], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(found["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
-    np.testing.assert_allclose(found["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5)
-    assert np.linalg.norm(found["held"] - found["bound"], axis=2).min() > 5e-4
+    results = shelf.bring_in()
+    np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(results["held"], results["observed"][:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(results["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
+    np.testing.assert_allclose(results["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5)
+    assert np.linalg.norm(results["held"] - results["bound"], axis=2).min() > 5e-4
 
 
 def test_a_recording_without_its_rest_is_named(shelf):
@@ -417,9 +417,9 @@ def test_one_outlier_among_six_is_left_out_and_named(shelf):
     whole = shelf.bring_in()
     for name in shelf.recordings:
         shelf.move(name, "Base - 3", [0.0, 0.0, 0.012])
-    found = shelf.bring_in()
+    results = shelf.bring_in()
     assert read_json(shelf.folder / REGISTRATION)["bare"]["outliers"] == ["Base - 3"]
-    np.testing.assert_allclose(found["bound"], whole["bound"], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=1e-3)
 
 
 def test_a_trial_without_a_release_is_named(shelf):
@@ -474,7 +474,7 @@ def test_the_three_beams(shared_data, tmp_path):
     check_run(run)
     run_stages(acquisition_stages(run), tmp_path)
     registration = read_json(tmp_path / REGISTRATION)
-    rms = {name: round(each["rms_mm"], 2) for name, each in registration.items()}
+    rms = {name: round(trial["rms_mm"], 2) for name, trial in registration.items()}
     assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
     dataset, motions = read_motions(tmp_path, run)
     bound, gravity = dataset.bound, dataset.gravity
@@ -569,9 +569,9 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     check_run(run)
     run_stages(acquisition_stages(run), tmp_path)
     quality, registration = read_json(tmp_path / QUALITY), read_json(tmp_path / REGISTRATION)
-    for line, (name, each) in zip(log, quality.items(), strict=True):
+    for line, (name, trial) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
-        assert line == f"import: {name} is released in frame {each['release_frame']:.1f}, registered to {rms:.2f} mm"
+        assert line == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to {rms:.2f} mm"
 
 
 def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
@@ -587,7 +587,7 @@ def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, ca
     check_run(run)
     with caplog.at_level("INFO"):
         run_stages(acquisition_stages(run), tmp_path)
-    assert [each for each in caplog.messages if "are assigned by their places" in each] == log
+    assert [message for message in caplog.messages if "are assigned by their places" in message] == log
 
 
 def test_an_experiment_may_set_gravity(tmp_path):

@@ -57,28 +57,28 @@ class TestCompleteRun:
         assert names == data | {"errors.json", "metrics.json", "report.html"}
 
     def test_metrics(self, finished):
-        found = metrics(finished[0])
+        results = metrics(finished[0])
         keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
         keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
         keys |= {"first_guesses"}
-        assert set(found) == keys
-        assert set(found["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
-        assert set(found["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
-        assert set(found["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
-        assert list(found["seconds"]) == STAGES
-        assert all(0.0 < s < 600.0 for s in found["seconds"].values())
-        assert 0.1 < found["peak_memory_gib"] < 4.0
-        assert found["versions"] == package_versions()
-        assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(found["versions"])
-        assert found["device"] in ("cpu", "cuda")
-        assert [each["name"] for each in found["per_trajectory"]] == ["70 g", "150 g"]
+        assert set(results) == keys
+        assert set(results["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
+        assert set(results["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
+        assert set(results["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
+        assert list(results["seconds"]) == STAGES
+        assert all(0.0 < s < 600.0 for s in results["seconds"].values())
+        assert 0.1 < results["peak_memory_gib"] < 4.0
+        assert results["versions"] == package_versions()
+        assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(results["versions"])
+        assert results["device"] in ("cpu", "cuda")
+        assert [trial["name"] for trial in results["per_trajectory"]] == ["70 g", "150 g"]
 
     def test_the_correction_corrects(self, finished):
-        found = metrics(finished[0])["errors_mm"]
-        assert found["simulation"]["mean"] > 0.5
-        assert found["resphys"]["mean"] < 0.02 * found["simulation"]["mean"]
-        assert found["reconstruction"]["mean"] < 1e-3
-        assert all(found[model]["diverged"] == 0 for model in MODELS)
+        results = metrics(finished[0])["errors_mm"]
+        assert results["simulation"]["mean"] > 0.5
+        assert results["resphys"]["mean"] < 0.02 * results["simulation"]["mean"]
+        assert results["reconstruction"]["mean"] < 1e-3
+        assert all(results[model]["diverged"] == 0 for model in MODELS)
 
     def test_errors_are_those_of_the_stored_positions(self, finished):
         with read_hdf5(finished[0] / "dataset.h5", "dataset") as file:
@@ -91,13 +91,13 @@ class TestCompleteRun:
         with read_hdf5(finished[0] / "reconstruction_resphys.h5", "reconstruction") as file:
             stored["reconstruction"] = file["q"][4:, 1:]
             assert not file["force"][:, 0].any()
-        found = metrics(finished[0])
+        results = metrics(finished[0])
         for model, q in stored.items():
             distances = 1e3 * np.linalg.norm(q - target, axis=-1).mean(-1)
-            summary = found["errors_mm"][model]
+            summary = results["errors_mm"][model]
             np.testing.assert_allclose([summary["mean"], summary["std"]], [distances.mean(), distances.std()])
         against = 1e3 * np.linalg.norm(stored["resphys"] - stored["reconstruction"], axis=-1).mean()
-        np.testing.assert_allclose(found["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
+        np.testing.assert_allclose(results["errors_vs_reconstruction_mm"]["resphys"]["mean"], against)
 
     def test_the_roll_out_starts_from_the_target_and_knows_nothing_else_of_it(self, finished):
         with read_hdf5(finished[0] / "dataset.h5", "dataset") as file:
@@ -163,10 +163,10 @@ class TestChanges:
         assert (code, "Traceback" in err) == (0, False)
         folders = sorted(Path("runs/beam_oscillation").glob("*/metrics.json"))
         assert len(folders) == 2
-        found = [errors(path.parent) for path in folders]
+        results = [errors(path.parent) for path in folders]
         seeds = [OmegaConf.load(path.parent / ".hydra" / "config.yaml").seed for path in folders]
-        same_errors(found[seeds.index(0)], errors(finished[0]))
-        assert found[0] != found[1]
+        same_errors(results[seeds.index(0)], errors(finished[0]))
+        assert results[0] != results[1]
         same_errors(*(metrics(path.parent)["errors_mm"]["simulation"]["mean"] for path in folders))
 
     @pytest.mark.parametrize(
@@ -187,9 +187,9 @@ class TestChanges:
     def test_other_options_run_and_the_correction_corrects(self, folder, options):
         code, err = run(*options, IN_RUN)
         assert (code, "Warning" in err) == (0, False)
-        found = metrics()["errors_mm"]
-        assert found["reconstruction"]["mean"] < 0.1 * found["simulation"]["mean"]
-        assert found["resphys"]["mean"] < 0.5 * found["simulation"]["mean"]
+        results = metrics()["errors_mm"]
+        assert results["reconstruction"]["mean"] < 0.1 * results["simulation"]["mean"]
+        assert results["resphys"]["mean"] < 0.5 * results["simulation"]["mean"]
 
     def test_the_published_network_runs(self, folder):
         short = [option for option in TINY if not option.startswith("network")]
@@ -223,11 +223,11 @@ class TestChanges:
         history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
         assert [r["epoch"] for r in history] == [0, 1, 2, 3]
         assert history[3]["train_loss"] < history[0]["train_loss"]
-        found, before = metrics()["networks"], metrics(finished[0])["networks"]
-        assert found["resphys"] == before["resphys"]
-        assert found["resphys_refined"]["epoch"] == 0
-        start = found["resphys"]["validation_rollout_error_mm"]
-        assert found["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
+        results, before = metrics()["networks"], metrics(finished[0])["networks"]
+        assert results["resphys"] == before["resphys"]
+        assert results["resphys_refined"]["epoch"] == 0
+        start = results["resphys"]["validation_rollout_error_mm"]
+        assert results["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
         same_errors(errors(), errors(finished[0]))
         before = files()
         assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
@@ -236,43 +236,43 @@ class TestChanges:
     def test_refinement_helps_a_poor_network(self, folder):
         poor = [*TINY, "trainer.epochs=3", "trainer.linear_noise=null"]
         assert run(*poor, *REFINE, "hydra.run.dir=run")[0] == 0
-        found, refined = metrics(), files()
-        assert found["networks"]["resphys_refined"]["epoch"] > 0
-        start = found["networks"]["resphys"]["validation_rollout_error_mm"]
-        assert found["networks"]["resphys_refined"]["validation_rollout_error_mm"] < 0.9 * start
-        assert list(found["seconds"]) == REFINED
+        results, refined = metrics(), files()
+        assert results["networks"]["resphys_refined"]["epoch"] > 0
+        start = results["networks"]["resphys"]["validation_rollout_error_mm"]
+        assert results["networks"]["resphys_refined"]["validation_rollout_error_mm"] < 0.9 * start
+        assert list(results["seconds"]) == REFINED
         assert run(*poor, IN_RUN)[0] == 0  # without it again
         assert ran(refined) == ["evaluate", "time", "report"]
         assert list(metrics()["seconds"]) == STAGES
-        assert found["errors_mm"]["resphys"]["mean"] < 0.9 * metrics()["errors_mm"]["resphys"]["mean"]
+        assert results["errors_mm"]["resphys"]["mean"] < 0.9 * metrics()["errors_mm"]["resphys"]["mean"]
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
 
         class Diverging(LearnedPredictor):
             def __call__(self, state, step):
-                found = super().__call__(state, step)
+                results = super().__call__(state, step)
                 if isinstance(self.model, ResidualForce):
-                    found[1] *= torch.nan if step == 4 else 1.0
-                return found
+                    results[1] *= torch.nan if step == 4 else 1.0
+                return results
 
         monkeypatch.setattr(models, "LearnedPredictor", Diverging)
         Path("run/rollouts.h5").unlink()
         assert run(*TINY, IN_RUN)[0] == 0
-        found, before = metrics(), metrics(finished[0])
+        results, before = metrics(), metrics(finished[0])
         for group in ("errors_mm", "errors_vs_reconstruction_mm"):
             lost = {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
             expected = {model: pytest.approx(summary, rel=1e-6) for model, summary in before[group].items()}
-            assert found[group] == {**expected, "resphys": lost}
-        rows, expected = ([each["errors_mm"] for each in m["per_trajectory"]] for m in (found, before))
+            assert results[group] == {**expected, "resphys": lost}
+        rows, expected = ([trial["errors_mm"] for trial in m["per_trajectory"]] for m in (results, before))
         assert rows[0] == pytest.approx(expected[0], rel=1e-6)
         assert rows[1].pop("resphys") is None
         assert expected[1].pop("resphys") is not None
         assert rows[1] == pytest.approx(expected[1], rel=1e-6)
         with read_hdf5("run/rollouts.h5", "rollouts") as file:
-            found = file["resphys_observed"][:]
-        assert np.isnan(found).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
-        assert np.isfinite(found[1, :5]).all()
+            results = file["resphys_observed"][:]
+        assert np.isnan(results).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
+        assert np.isfinite(results[1, :5]).all()
 
 
 def stages_of(wanted):

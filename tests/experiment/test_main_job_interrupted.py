@@ -93,7 +93,7 @@ class TestInterruption:
         assert run(*TINY, *REFINE, IN_RUN)[0] == 0
         assert interruption.done["epochs"] in (3, 4)
         first, second = (json.loads(Path(f"{name}/refinement_resphys.json").read_text()) for name in ("run", "whole"))
-        losses = [[r["train_loss"] for r in found["epochs"]] for found in (first, second)]
+        losses = [[r["train_loss"] for r in results["epochs"]] for results in (first, second)]
         assert losses[0] == losses[1]
         same_errors(errors(), errors("whole"))
 

@@ -34,7 +34,7 @@ TINY = [
     *(
         "~identify.parameters.tendon_offset_2_first",
         "~identify.parameters.tendon_offset_2_second",
-    ),  # hardly told from E
+    ),  # hardly distinguishable from E
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 TRIALS = [
@@ -46,9 +46,9 @@ TRIALS = [
 def moved(tendons):
     """Tendons whose guides are where the recorded body has them."""
     routes = {}
-    for name, each in tendons.routes.items():
-        guides = np.array(each.guides) + OFFSETS[name] * np.array(each.offsets[0])
-        routes[name] = {"guides": guides.tolist(), "pieces": each.pieces}
+    for name, route in tendons.routes.items():
+        guides = np.array(route.guides) + OFFSETS[name] * np.array(route.offsets[0])
+        routes[name] = {"guides": guides.tolist(), "pieces": route.pieces}
     return tendons.changed(routes=routes)
 
 
@@ -71,11 +71,11 @@ def of_modulus(run, modulus):
     return MaterialSettings(**{**run.simulation.plain(), "youngs_modulus": modulus})
 
 
-def write(folder, found):
+def write(folder, places_of_poses):
     """Files as a tracker writes them: no header, another order in each, y against the rod, 0.1 mm of noise."""
     folder.mkdir()
     draw = np.random.default_rng(0)
-    for name, places in zip(POSES, found, strict=True):
+    for name, places in zip(POSES, places_of_poses, strict=True):
         turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1)  # so that (x, z, -y) turns it back
         row = turned[draw.permutation(5)] + [0.3, 0.4, -0.1]
         frames = row.ravel() + 1e-4 * draw.normal(size=(40, 15))
@@ -84,23 +84,21 @@ def write(folder, found):
 
 
 def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):
-    found = poses
     monkeypatch.chdir(tmp_path)
-    write(Path("recordings"), found)
+    write(Path("recordings"), poses)
     code, err = run(*TINY, *TRIALS)
     assert (code, err[-500:] if code else "") == (0, "")
     dataset = read_dataset(Path("run/dataset.h5"))
     rows = [dataset.names.index(name) for name in POSES]
     assert set(dataset.begins) == {"static"}
-    np.testing.assert_allclose(dataset.observed[rows, 0], found[:, :4], atol=3e-4)  # named and turned back
+    np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=3e-4)  # named and turned back
     np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
     identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
     assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(OFFSETS, abs=2e-4)
     assert "First offset of the tendon &#39;first&#39;" in Path("run/report.html").read_text()
-    errors = {
-        name: each["mean"] for name, each in json.loads(Path("run/metrics.json").read_text())["errors_mm"].items()
-    }
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
     check_of_the_mesh()
@@ -109,7 +107,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
 
 def check_of_the_mesh():
     """What the run tells of its mesh is what two simulators differ by."""
-    found = json.loads(Path("run/metrics.json").read_text())["mesh_check"]
+    checked = json.loads(Path("run/metrics.json").read_text())["mesh_check"]
     parameters = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     shown = []
     for layers in (4, 6):
@@ -121,10 +119,10 @@ def check_of_the_mesh():
         tension = torch.tensor([POSES["both"]], dtype=torch.float64)
         given = {"tendon_offset_1": torch.tensor(offsets, dtype=torch.float64)}
         shown.append(read(sim.static_equilibrium(Inputs(tendon_tension=tension), given).q)[0])
-        assert found["cells"][len(shown) - 1] == len(sim.body.mesh.cells)
+        assert checked["cells"][len(shown) - 1] == len(sim.body.mesh.cells)
     moved = 1e3 * float((shown[1] - shown[0]).norm(dim=1).mean())
     assert moved > 0.1
-    assert found["moved_mm"] == pytest.approx(moved, rel=0.05)
+    assert checked["moved_mm"] == pytest.approx(moved, rel=0.05)
     assert "How much of the errors is mesh" in Path("run/report.html").read_text()
 
 

@@ -8,13 +8,13 @@ import json
 import shutil
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from configured import check, composed, settings
 from main_job import IN_RUN, run
+from segment_run import TRACKED, place_segment
 from sentences import offending
 
 from warp_resphys import pipeline
@@ -43,31 +43,6 @@ from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.stages import EvaluateStage, ReconstructStage, TrainStage
 from warp_resphys.stepping.inputs import Inputs
 
-# A short segment with two chambers of some 70 vertices, on which everything takes seconds.
-SEGMENT = """# @package _global_
-defaults: [sopra, {override /mesh: segment}, _self_]
-name: tiny
-tip: {z: -0.1}
-chambers: {count: 2}
-mesh: {size: 0.03, layers: 0.05, chambers: 2}
-data:
-  {steps: 12, sequences: 5, train: 2, validation: 1, test: 1, horizons: [0.06, 0.12], rest_seconds: 0.01, cutoff: 20.0}
-markers:
-  tracked: null
-  reference: {B1: [0.03, 0.0, 0.0], B2: [0.0, 0.03, 0.0], B3: [-0.03, -0.03, 0.0]}
-  bind: rigid
-  bind_to: {z: -0.1}
-parallel: {processes: 1, batch: 2}
-identify:
-  {trials: 1, seconds: 0.05, max_evaluations: 3, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
-network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
-trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
-laboratory:
-  mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
-    size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
-  sequences: {rest: 0.01, correlation_time: 0.03}
-"""
-TRACKED = "markers.tracked={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 COMMAND = ["experiment=tiny", TRACKED, *QUIET]
 STAGES = [
@@ -83,17 +58,11 @@ STAGES = [
 SCALED = ["laboratory_scaled", "import_scaled"]
 
 
-def place_experiment(folder):
-    place = Path(folder) / "configs" / "experiment" / "tiny.yaml"
-    place.parent.mkdir(parents=True, exist_ok=True)
-    place.write_text(SEGMENT)
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A complete run, in one process, that was tested at a higher pressure later."""
     folder = tmp_path_factory.mktemp("driven")
-    place_experiment(folder)
+    place_segment(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
@@ -109,12 +78,12 @@ def finished(tmp_path_factory):
 
 def motions(folder):
     """Names, markers and pressures of all trials, those at higher pressures last."""
-    found = []
+    results = []
     for name in ("dataset.h5", "dataset_scaled.h5"):
         with read_hdf5(folder / "run" / name, "dataset") as file:
-            names = [str(each) for each in file.attrs["names"]]
-            found.append((names, read_array(file, "observed"), read_array(file, "pressure")))
-    (a, b) = found
+            names = [str(name) for name in file.attrs["names"]]
+            results.append((names, read_array(file, "observed"), read_array(file, "pressure")))
+    (a, b) = results
     return a[0] + b[0], np.concatenate([a[1], b[1]]), np.concatenate([a[2], b[2]])
 
 
@@ -125,21 +94,21 @@ def metrics(folder):
 def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(finished):
     assert sorted(path.stem for path in (finished / "run" / "stages").glob("*.json")) == sorted([*STAGES, *SCALED])
     assert not list((finished / "run").glob("*_parts"))
-    found = metrics(finished)
+    results = metrics(finished)
     names, observed, _ = motions(finished)
     with read_hdf5(finished / "run" / "rollouts.h5", "rollouts") as file:
         tested = [str(name) for name in file.attrs["names"]]
-        markers = {model: read_array(file, f"{model}_observed") for model in found["errors_mm"]}
+        markers = {model: read_array(file, f"{model}_observed") for model in results["errors_mm"]}
     assert names == ["t000", "t001", "t002", "t003", "t003_x1.5"]
     assert tested == names[3:]
     for model, x in markers.items():
         for row, factor in enumerate(("1", "1.5")):
             expected = 1e3 * np.linalg.norm(x[row] - observed[3 + row], axis=-1).mean()
-            assert found["scales"][factor][model]["mean"] == pytest.approx(expected, rel=1e-9)
+            assert results["scales"][factor][model]["mean"] == pytest.approx(expected, rel=1e-9)
         first = 1e3 * np.linalg.norm(x[0, :7] - observed[3, :7], axis=-1).mean()
-        assert found["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-9)
-    growth = found["horizons"]["0.12"]["sysid"]["mean"] / found["horizons"]["0.06"]["sysid"]["mean"] - 1.0
-    assert found["growth"]["sysid"] == pytest.approx(growth)
+        assert results["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-9)
+    growth = results["horizons"]["0.12"]["sysid"]["mean"] / results["horizons"]["0.06"]["sysid"]["mean"] - 1.0
+    assert results["growth"]["sysid"] == pytest.approx(growth)
 
 
 def test_recordings_are_seen_by_cameras_and_registered_back(finished):
@@ -158,27 +127,27 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
 
 
 def test_the_reconstruction_reaches_the_smoothed_markers(finished):
-    found = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
-    assert found["mean_mm"] < 0.2
+    results = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
+    assert results["mean_mm"] < 0.2
     with read_hdf5(finished / "run" / "reconstruction_resphys.h5", "reconstruction") as file:
         assert [str(name) for name in file.attrs["names"]] == ["t000", "t001", "t002"]
         assert read_array(file, "force").shape == (3, 13, read_array(file, "q").shape[2], 3)
 
 
 def test_forces_that_do_not_hold_the_body_are_named(finished, monkeypatch, tmp_path, caplog):
-    """Replayed, the forces lead where they were found; a simulation that goes elsewhere with them is reported."""
+    """Replayed forces lead to the reconstructed states; a replay that diverges from them is reported."""
     summary = json.loads((finished / "run" / "reconstruction.json").read_text())["resphys"]
     with read_hdf5(finished / "run" / "reconstruction_resphys.h5", "reconstruction") as file:
         states = {name: read_array(file, name)[2:] for name in ("q", "v", "force")}
     record = json.loads((finished / "run" / "stages" / "reconstruct_resphys.json").read_text())
     stage = parse(ReconstructStage, record["settings"])
     replay = partial(replayed_errors, stage, finished / "run", ("t002",))
-    found = replay(states)
-    assert found.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
-    assert found.mean() < 0.2
-    assert replay({**states, "force": 0.0 * states["force"]}).mean() > 2.0 * found.mean()
-    begun = {name: values[:, :7] for name, values in states.items()}  # as where a part of each trial is learned from
-    np.testing.assert_array_equal(replay(begun), found[:, :7])
+    results = replay(states)
+    assert results.mean() == pytest.approx(summary["replayed_mm"], rel=1e-3)
+    assert results.mean() < 0.2
+    assert replay({**states, "force": 0.0 * states["force"]}).mean() > 2.0 * results.mean()
+    begun = {name: values[:, :7] for name, values in states.items()}  # as with train_fraction below one
+    np.testing.assert_array_equal(replay(begun), results[:, :7])
     states["force"][0, 6:] = np.nan
     assert np.isfinite(replay(states)).sum() == 6
     for name in ("dataset.h5", "identification.json"):
@@ -209,9 +178,8 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
 
 
-def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch):
+def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(finished, monkeypatch, no_report):
     monkeypatch.chdir(finished)
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     before = {path: path.stat().st_mtime_ns for path in (finished / "run").glob("*.h5")}
     code, _ = run(*COMMAND, "data.input_scales=[1.5]", "data.horizons=[0.05,0.12]")
     assert code == 0
@@ -220,13 +188,14 @@ def test_the_same_command_does_nothing_again_and_other_windows_only_evaluate(fin
     assert "0.05" in metrics(finished)["horizons"]
 
 
-def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(finished, monkeypatch, tmp_path):
+def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(
+    finished, monkeypatch, no_report, tmp_path
+):
     """The same trials from files, in two processes; those at higher pressures are not among them."""
     assert {path.stem for path in (finished / "run" / "recordings").iterdir()} == {"t000", "t001", "t002", "t003"}
     assert [path.stem for path in (finished / "run" / "recordings_scaled").iterdir()] == ["t003_x1.5"]
-    place_experiment(tmp_path)
+    place_segment(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     places = [f"data.folder={finished / 'run' / 'recordings'}", "data.train=[t000,t001]", "data.validation=[t002]"]
     code, err = run(*COMMAND, *places, "data.test=[t003]", "parallel.processes=2", "parallel.batch=1")
     assert code == 0, err
@@ -360,9 +329,8 @@ def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(finished, mo
     assert "t000.h5 ends after 8 of the 12 steps" in caplog.text
 
 
-def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypatch):
+def test_the_number_of_processes_is_no_setting_of_the_results(finished, monkeypatch, no_report):
     monkeypatch.chdir(finished)
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
     written = []
     for processes in (1, 2):
         code, _ = run(*COMMAND, "data.input_scales=[1.5]", f"parallel.processes={processes}")
@@ -436,9 +404,9 @@ def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag
     replay = Replay(tiny_simulator(), read, motions)
     bounds = {"youngs_modulus": Bounds(5e4, 5e5, True), "pressure_rise": Bounds(0.0, 0.1)}
     identifier = Identifier([(replay, at_rest(simulator, motions))], bounds)
-    found = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
-    assert found.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
-    assert found.parameters["pressure_rise"] < 1e-3
+    results = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
+    assert results.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
+    assert results.parameters["pressure_rise"] < 1e-3
     with pytest.raises(InputError, match="no parameter 'colour'"):
         Identifier([(replay, at_rest(simulator, motions))], {"colour": Bounds(0.0, 1.0)})
 
@@ -479,8 +447,8 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     times = np.tile(0.01 * np.arange(5), (2, 1))
     about = (times, observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
-    found = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
-    assert found["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
-    assert found["errors_mm"]["resphys"]["diverged"] == 1
-    assert found["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
-    assert found["growth"]["sysid"] == pytest.approx(0.0)
+    results = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
+    assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
+    assert results["errors_mm"]["resphys"]["diverged"] == 1
+    assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
+    assert results["growth"]["sysid"] == pytest.approx(0.0)

@@ -132,8 +132,8 @@ def test_a_folder_without_a_list_gives_all_its_recordings(tmp_path):
         (tmp_path / name).touch()
     run = parse(RunSettings, changed(composed("experiment=beam_real", f"data.folder={tmp_path}"), "data/trials", {}))
     check_run(run)
-    found = [(trial.name, trial.file) for trial in trials_of(run)]
-    assert found == [("a", str(tmp_path / "a.h5")), ("b", str(tmp_path / "b.c3d"))]
+    results = [(trial.name, trial.file) for trial in trials_of(run)]
+    assert results == [("a", str(tmp_path / "a.h5")), ("b", str(tmp_path / "b.c3d"))]
 
 
 def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():

@@ -48,9 +48,9 @@ def folder(tmp_path_factory):
 
 
 def test_each_silicone_is_identified(folder):
-    found = json.loads((folder / "identification.json").read_text())["sysid"]
-    assert {name: found["parameters"][name] for name in TRUE} == pytest.approx(TRUE, rel=0.08)
-    assert found["first_guess"]["tip_youngs_modulus"] == 150e3
+    results = json.loads((folder / "identification.json").read_text())["sysid"]
+    assert {name: results["parameters"][name] for name in TRUE} == pytest.approx(TRUE, rel=0.08)
+    assert results["first_guess"]["tip_youngs_modulus"] == 150e3
     errors = json.loads((folder / "metrics.json").read_text())["errors_mm"]
     assert errors["sysid"]["mean"] < 0.2 * errors["simulation"]["mean"]
 
@@ -58,8 +58,8 @@ def test_each_silicone_is_identified(folder):
 def test_a_robot_takes_its_regions_along(folder):
     described = describe(folder, "sysid")
     described.write(folder / "robot.safetensors")
-    found = Description.read(folder / "robot.safetensors")
-    assert {name: len(cells) for name, cells in found.mesh.regions.items()} == {"root": 5, "tip": 4, "cap": 1}
+    results = Description.read(folder / "robot.safetensors")
+    assert {name: len(cells) for name, cells in results.mesh.regions.items()} == {"root": 5, "tip": 4, "cap": 1}
     robot = warp_resphys.load(folder / "robot.safetensors")
     body = robot.simulator.body
     cap = np.unique(body.mesh.cells[body.mesh.region("cap")])

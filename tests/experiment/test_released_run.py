@@ -124,29 +124,29 @@ class TestCompleteRun:
             assert (restored.actuation is None) == (model != "simfree")  # in_the_loop.sees_payload is false
 
     def test_identification(self, finished):
-        found = read(finished / "identification.json")
-        assert list(found["sysid"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
-        assert list(found["sysid_elastic"]["parameters"]) == ["youngs_modulus", "poissons_ratio"]
-        for each in (found["sysid"], found["sysid_elastic"]):
-            losses = [record["loss"] for record in each["history"][0]]
-            assert each["loss"] == min(losses) < losses[0]
+        results = read(finished / "identification.json")
+        assert list(results["sysid"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
+        assert list(results["sysid_elastic"]["parameters"]) == ["youngs_modulus", "poissons_ratio"]
+        for search in (results["sysid"], results["sysid_elastic"]):
+            losses = [record["loss"] for record in search["history"][0]]
+            assert search["loss"] == min(losses) < losses[0]
             assert len(losses) <= 6
-        assert np.isfinite(found["landscape"]["loss"]).all()
-        assert np.shape(found["landscape"]["loss"]) == (2, 1)
-        assert np.shape(found["sysid"]["uncertainty"]["correlation"]) == (2, 2)
+        assert np.isfinite(results["landscape"]["loss"]).all()
+        assert np.shape(results["landscape"]["loss"]) == (2, 1)
+        assert np.shape(results["sysid"]["uncertainty"]["correlation"]) == (2, 2)
 
     def test_errors(self, finished):
-        found = read(finished / "metrics.json")
-        errors = {model: summary["mean"] for model, summary in found["errors_mm"].items()}
+        results = read(finished / "metrics.json")
+        errors = {model: summary["mean"] for model, summary in results["errors_mm"].items()}
         assert tuple(errors) == tuple(MODELS)
         assert all(0.01 < error < 50.0 for error in errors.values()), errors
         assert errors["sysid"] < 0.5 * errors["simulation"] < 0.5 * errors["published"]
-        assert [each["name"] for each in found["per_trajectory"]] == ["m50"]
-        assert found["parameters"].keys() == {"sysid", "sysid_elastic"}
-        assert 0.0 < found["sideways_mm"]["m50"] < 0.5  # The simulated beam is held straight.
-        assert found["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
-        for model, each in found["per_marker"].items():
-            assert np.mean(list(each.values())) == pytest.approx(errors[model])
+        assert [trial["name"] for trial in results["per_trajectory"]] == ["m50"]
+        assert results["parameters"].keys() == {"sysid", "sysid_elastic"}
+        assert 0.0 < results["sideways_mm"]["m50"] < 0.5  # The simulated beam is held straight.
+        assert results["noise_mm"] == pytest.approx(0.05 * np.sqrt(8.0 / np.pi), rel=0.05)  # Maxwell's distribution
+        for model, markers in results["per_marker"].items():
+            assert np.mean(list(markers.values())) == pytest.approx(errors[model])
 
     def test_errors_are_those_of_the_stored_markers(self, finished):
         with read_hdf5(finished / "dataset.h5", "dataset") as file:
@@ -196,18 +196,18 @@ class TestCompleteRun:
         assert shown["acquired"] == records(finished)["import"]["fingerprint"]
 
     def test_the_reconstruction_says_how_close_it_came_and_where_its_forces_lead(self, finished):
-        found = read(finished / "reconstruction.json")
-        assert found == read(finished / "metrics.json")["reconstruction"]
-        assert set(found) == {"resphys_uncorrected", "resphys"}
-        for model in found:
-            assert found[model]["mean_mm"] < 0.5
-            assert found[model]["mean_mm"] < found[model]["max_mm"]
+        results = read(finished / "reconstruction.json")
+        assert results == read(finished / "metrics.json")["reconstruction"]
+        assert set(results) == {"resphys_uncorrected", "resphys"}
+        for model in results:
+            assert results[model]["mean_mm"] < 0.5
+            assert results[model]["mean_mm"] < results[model]["max_mm"]
             with read_hdf5(finished / f"reconstruction_{model}.h5", "reconstruction") as file:
                 assert list(file.attrs["names"]) == ["m0", "m80", "m20"]
-                assert np.nanmean(file["error"][()]) == pytest.approx(found[model]["mean_mm"], rel=1e-5)
+                assert np.nanmean(file["error"][()]) == pytest.approx(results[model]["mean_mm"], rel=1e-5)
                 assert np.isfinite(file["force"][()]).all()
                 assert not file["force"][:, 0].any()
-        assert found["resphys"]["replayed_mm"] > 0.0
+        assert results["resphys"]["replayed_mm"] > 0.0
 
     def test_the_second_call_runs_nothing(self, finished):
         before = records(finished)
@@ -234,31 +234,31 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
     monkeypatch.chdir(tmp_path)
     code, err = run(*FOLDS)
     assert code == 0, err
-    found = read(tmp_path / "run" / "metrics.json")
-    assert list(found["folds"]) == ["bare", "load52"]
-    for model, summary in found["errors_mm"].items():
-        means = [fold["errors_mm"][model]["mean"] for fold in found["folds"].values()]
+    results = read(tmp_path / "run" / "metrics.json")
+    assert list(results["folds"]) == ["bare", "load52"]
+    for model, summary in results["errors_mm"].items():
+        means = [fold["errors_mm"][model]["mean"] for fold in results["folds"].values()]
         assert summary["mean"] == pytest.approx(np.mean(means))
         assert (summary["trajectories"], summary["diverged"]) == (2, 0)
-    for trial, fold in found["folds"].items():
+    for trial, fold in results["folds"].items():
         folder = tmp_path / "run" / f"fold_{trial}"
-        assert [each["name"] for each in fold["per_trajectory"]] == [trial]
+        assert [row["name"] for row in fold["per_trajectory"]] == [trial]
         assert read(folder / "metrics.json") == fold
         split = records(folder)["train_resphys"]["settings"]["split"]
         assert trial not in split["train"] + split["validation"]
     assert (tmp_path / "run" / "report.html").is_file()
-    assert pages["run"].pages == {trial: f"fold_{trial}/report.html" for trial in found["folds"]}
+    assert pages["run"].pages == {trial: f"fold_{trial}/report.html" for trial in results["folds"]}
     shown = records(tmp_path / "run")["report"]["settings"]
-    assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in found["folds"].items()}
-    assert {f"fold_{trial}" for trial in found["folds"]} <= set(pages)
-    assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in found["folds"])
+    assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in results["folds"].items()}
+    assert {f"fold_{trial}" for trial in results["folds"]} <= set(pages)
+    assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in results["folds"])
     at_once = tmp_path / "at_once"
     at_once.mkdir()
     shutil.copy(tmp_path / "run" / "dataset.h5", at_once)
     splits = folds_of(settings(*FOLDS))
     folds = {name: Fold(name, at_once / name, partial(_unreported, split)) for name, split in splits.items()}
     run_folds(folds, Workers(2))
-    for trial, fold in found["folds"].items():
+    for trial, fold in results["folds"].items():
         assert read(at_once / trial / "errors.json")["errors_mm"] == fold["errors_mm"]
 
 
@@ -269,7 +269,7 @@ def _unreported(split, processes):
 
 
 def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp_path, monkeypatch):
-    """The descents themselves are left out: each start stays where it is."""
+    """The searches are replaced: they return their starts."""
     shutil.copy(finished / "dataset.h5", tmp_path)
     wanted = settings(*SYNTHETIC, "identify.starts=2")
     (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
@@ -331,10 +331,10 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
     err = capsys.readouterr().err
     assert "identify: 4/24 evaluations at most" in err
     assert "identify: landscape: 10/10 points" in err
-    found = read(tmp_path / "identification.json")
-    assert found["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
+    results = read(tmp_path / "identification.json")
+    assert results["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
     np.testing.assert_allclose(moduli, np.repeat(np.linspace(0.0, 1.0, 5), 2))
-    assert found["sysid_elastic"]["loss"] == 1.0
+    assert results["sysid_elastic"]["loss"] == 1.0
     assert not list(tmp_path.glob("identify_*"))
 
 

@@ -27,9 +27,9 @@ NOT_COMPARED = {"seconds", "seconds_per_test_trajectory", "peak_memory_gib", "ve
 def numbers(data, place=""):
     """Every entry by where it stands."""
     if isinstance(data, dict):
-        return {k: v for key, each in data.items() for k, v in numbers(each, f"{place}/{key}").items()}
+        return {k: v for key, value in data.items() for k, v in numbers(value, f"{place}/{key}").items()}
     if isinstance(data, list):
-        return {k: v for index, each in enumerate(data) for k, v in numbers(each, f"{place}/{index}").items()}
+        return {k: v for index, value in enumerate(data) for k, v in numbers(value, f"{place}/{index}").items()}
     return {place: data}
 
 
@@ -43,8 +43,8 @@ def measured(folder, experiment, threads):
     subprocess.run(
         [*command, "hydra.run.dir=run"], cwd=folder, env=environment, check=True, capture_output=True, timeout=300
     )
-    found = json.loads((folder / "run" / "metrics.json").read_text())
-    return numbers({key: value for key, value in found.items() if key not in NOT_COMPARED})
+    results = json.loads((folder / "run" / "metrics.json").read_text())
+    return numbers({key: value for key, value in results.items() if key not in NOT_COMPARED})
 
 
 @pytest.mark.parametrize("experiment", SMALL)

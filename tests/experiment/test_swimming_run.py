@@ -16,7 +16,7 @@ from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
 
-FACTOR = 1.3  # of the contraction that the winch is told
+FACTOR = 1.3  # true over commanded contraction of the winch
 STEPS = 24
 TINY = [
     "experiment=starfish_limb",
@@ -51,34 +51,34 @@ def tracked(run, trial):
 
 @pytest.fixture(scope="module")
 def swum():
-    """By trial, what the winch is told (T,) and where the markers are in the frame of the body (T, 4, 3), both [m]."""
+    """Commands (T,) of the winch and markers (T, 4, 3) in the frame of the body, by trial, both [m]."""
     run = settings(*TINY, *TRIALS, *SPLIT)
     simulator = build_simulator(run, run.simulation)
     markers = run.markers
-    found = {}
+    motions = {}
     for name, period in PERIODS.items():
         read = bound_markers(markers, simulator.body.mesh, [*tracked(run, name).values()], tuple(tracked(run, name)))
         steps = np.arange(STEPS + 4)
-        told = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
-        pulled = torch.as_tensor(FACTOR * told[1:, None, None])
+        commanded = 0.008 * np.sin(np.pi * np.clip(steps - 3, 0, None) / period) ** 2
+        pulled = torch.as_tensor(FACTOR * commanded[1:, None, None])
         with torch.no_grad():
             motion = simulator.rollout(simulator.rest_state(), len(steps) - 1, Inputs(tendon_contraction=pulled))
-        found[name] = told, read(motion.q[:, 0]).numpy()
-    return found
+        motions[name] = commanded, read(motion.q[:, 0]).numpy()
+    return motions
 
 
-def write(folder, found):
+def write(folder, motions):
     """Tables of a camera: two coordinates in mm of a body that drifts and turns, and a winch that is late to begin."""
     folder.mkdir()
     draw = np.random.default_rng(0)
-    for name, (told, markers) in found.items():
-        frames = np.arange(len(told))
+    for name, (commanded, markers) in motions.items():
+        frames = np.arange(len(commanded))
         angle, drift = 1.0 + 0.02 * frames, np.stack([0.3 - 0.002 * frames, 0.2 + 0.001 * frames], 1)
         x, y = markers[..., 0], -markers[..., 2]  # of the camera
         turned = np.exp(1j * angle)[:, None] * (x + 1j * y)
         turned = np.stack([turned.real, turned.imag], -1)
         seen = 1e3 * (turned + drift[:, None]) + NOISE * draw.normal(size=turned.shape)
-        winch = np.where(frames < 2, np.nan, 1e3 * told[np.clip(frames - LATE[name], 0, None)])
+        winch = np.where(frames < 2, np.nan, 1e3 * commanded[np.clip(frames - LATE[name], 0, None)])
         seen[HIDDEN[name], 1] = np.nan
         table = np.column_stack([1e3 * frames / 60.0, winch, seen.reshape(len(frames), -1)])
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="as the camera has it", fmt="%.9f")
@@ -91,9 +91,9 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     assert (code, err[-500:] if code else "") == (0, "")
     wanted, dataset = settings(*TINY, *TRIALS, *SPLIT), read_dataset(Path("run/dataset.h5"))
     assert dataset.sets == ((4, 5, 6, 7), (0, 1, 2, 3))
-    for name, (told, markers) in swum.items():
+    for name, (commanded, markers) in swum.items():
         pulled = dataset.inputs["tendon_contraction"][dataset.names.index(name), :, 0]
-        np.testing.assert_allclose(pulled, told[1 : STEPS + 1], atol=1e-6)
+        np.testing.assert_allclose(pulled, commanded[1 : STEPS + 1], atol=1e-6)
         view = MarkerView.of([*tracked(wanted, name).values()], ["x", "z"], "own")
         shapes = view.of_arrays(markers[: STEPS + 1])
         columns = [dataset.labels.index(label) for label in tracked(wanted, name)]
@@ -103,7 +103,7 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     factor = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]["tendon_contraction_factor"]
     assert factor == pytest.approx(FACTOR, rel=0.03)
     metrics = json.loads(Path("run/metrics.json").read_text())
-    errors = {name: each["mean"] for name, each in metrics["errors_mm"].items()}
+    errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert {label: value is None for label, value in metrics["per_marker"]["sysid"].items()} == dict.fromkeys(
         tracked(wanted, "fast"), False
     )

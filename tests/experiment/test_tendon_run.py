@@ -31,14 +31,14 @@ def test_a_body_that_tendons_pull_goes_through_every_stage(tmp_path, monkeypatch
     code, err = run(*TINY)
     assert (code, err[-500:] if code else "") == (0, "")
     with read_hdf5(Path("run/dataset.h5"), "dataset") as file:
-        found = read_array(file, "inputs/tendon_tension") if "inputs" in file else read_array(file, "tendon_tension")
+        results = read_array(file, "inputs/tendon_tension") if "inputs" in file else read_array(file, "tendon_tension")
     recorded = read_recording(Path("run/recordings/t000.h5")).actuation
-    assert recorded.shape[1] == found.shape[2] == 3
-    np.testing.assert_allclose(found[0][: len(recorded) - 1], recorded[1:], atol=1e-6)
-    assert found.max() > 0.3  # N
+    assert recorded.shape[1] == results.shape[2] == 3
+    np.testing.assert_allclose(results[0][: len(recorded) - 1], recorded[1:], atol=1e-6)
+    assert results.max() > 0.3  # N
     errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     assert {"simulation", "sysid", "simfree", "resphys"} <= errors.keys()
-    assert all(np.isfinite(each["mean"]) for each in errors.values())
+    assert all(np.isfinite(summary["mean"]) for summary in errors.values())
     page = Path("run/report.html").read_text()
     for said in ("3 tendons under tension", "The body and its tensions", "Tensions of", "the limit of 1.5 N"):
         assert said in page
@@ -58,7 +58,7 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
     code, err = run(*TINY, "tendons=null", MUSCLES, *push)
     assert (code, err[-500:] if code else "") == (0, "")
     errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
-    assert all(np.isfinite(errors[each]["mean"]) for each in ("simulation", "sysid", "simfree", "resphys"))
+    assert all(np.isfinite(errors[model]["mean"]) for model in ("simulation", "sysid", "simfree", "resphys"))
     page = Path("run/report.html").read_text()
     check_robots("run")
     for said in ("2 muscles under stress", "The body and its stresses", "the limit of 30"):

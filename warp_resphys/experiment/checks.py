@@ -36,7 +36,7 @@ from .files import STATIC, payload_inputs
 from .identify import ELASTIC
 from .laboratory import input_sequences, laboratory_settings, substeps_of
 from .reading import standing_enough
-from .trials import folds_of, known_trials, split_of, trials_of
+from .trials import all_trials, folds_of, split_of, trials_of
 
 _LARGEST_STRAIN = 0.3  # rho g L / E above which a wrong unit is assumed
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
@@ -69,10 +69,10 @@ def check_run(run: RunSettings) -> None:
     if run.control is not None:
         _check_control(run, body)
     if run.identify is not None:
-        known = [
+        names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
-        _check_identification(run.identify, known, simulator)
+        _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
 
 
@@ -207,7 +207,7 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
                 f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
                 f"markers.tracked: {listed(tracked)}."
             )
-    everywhere = {number for trial in known_trials(run).values() for number in trial.tracked(tracked)}
+    everywhere = {number for trial in all_trials(run).values() for number in trial.tracked(tracked)}
     if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
         raise InputError(
             f"markers.tracked names {listed(nowhere)}, which no trial has in data.trials.NAME.labels: add it there, "
@@ -222,11 +222,11 @@ def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:
     """Refuses trials that have some but not all markers in common, if markers are seen in their own frame."""
     has = {trial.name: {tracked[number] for number in trial.tracked(tracked)} for trial in trials}
     for one, other in combinations(has, 2):
-        common, own = has[one] & has[other], has[one] ^ has[other]
-        if common and own:
+        common, single = has[one] & has[other], has[one] ^ has[other]
+        if common and single:
             raise InputError(
                 f"the trials '{one}' and '{other}' both have {listed(sorted(common))}, but only one has "
-                f"{listed(sorted(own))}: with markers.frame own they must have the same markers, or none in common."
+                f"{listed(sorted(single))}: with markers.frame own they must have the same markers, or none in common."
             )
 
 
@@ -306,17 +306,17 @@ def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> Non
         )
 
 
-def _check_identification(identify: IdentifySettings, known: Sequence[str], simulator: Simulator) -> None:
-    """Checks the group ``identify``, for the names ``known`` of the parameters that can be identified."""
+def _check_identification(identify: IdentifySettings, identifiable: Sequence[str], simulator: Simulator) -> None:
+    """Checks the group ``identify``, for the names of the identifiable parameters."""
     if not identify.parameters:
-        raise InputError(f"identify.parameters is empty: give a range for at least one of {', '.join(known)}.")
-    elastic = [name for name in ELASTIC if name in known]
+        raise InputError(f"identify.parameters is empty: give a range for at least one of {', '.join(identifiable)}.")
+    elastic = [name for name in ELASTIC if name in identifiable]
     grid = () if identify.grid is None else [name for name, axis in dict(identify.grid).items() if axis is not None]
     for group, names, choice in (
-        ("parameters", identify.parameters, known),
+        ("parameters", identify.parameters, identifiable),
         ("elastic", identify.elastic or (), elastic),
         ("grid", grid, elastic),
-        ("first_guess", identify.first_guess, known),
+        ("first_guess", identify.first_guess, identifiable),
     ):
         for name in names:
             if name not in choice:

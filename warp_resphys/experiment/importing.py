@@ -102,8 +102,8 @@ def _shifts(data: ReadingSettings, observed: Sequence[Observed], mean: FloatArra
     """(R, M, 3) shifts that move the markers of each trial to their mean places [m]; zero if alignment is shared."""
     if data.alignment == "shared":
         return np.zeros_like(offsets)
-    own = np.array([x.shows_places for x in observed])
-    return np.where(own[:, None, None], mean - offsets, 0.0)
+    shows_places = np.array([x.shows_places for x in observed])
+    return np.where(shows_places[:, None, None], mean - offsets, 0.0)
 
 
 def _check_unit(driven: Sequence[FloatArray], data: ReadingSettings, drive: Drive) -> None:

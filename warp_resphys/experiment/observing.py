@@ -116,11 +116,11 @@ class Observer:
         a millimetre, which would rotate a body by a millimetre at its tip compared with the other trials, which are
         registered by all markers.
         """
-        known = [x.registration.positions[len(x.columns) :] for x in observed if x.shows_places]
-        if not known or len(known) == len(observed) or len(self.markers.reference) < self.reader.enough:
+        positions = [x.registration.positions[len(x.columns) :] for x in observed if x.shows_places]
+        if not positions or len(positions) == len(observed) or len(self.markers.reference) < self.reader.enough:
             return observed
-        seen = np.isfinite(np.stack(known)).all(-1).any(0)
-        mean = np.nanmean(np.stack(known)[:, seen], axis=0)
+        seen = np.isfinite(np.stack(positions)).all(-1).any(0)
+        mean = np.nanmean(np.stack(positions)[:, seen], axis=0)
 
         def registered(loaded: Observed) -> Observed:
             expected = self.reader.expected(loaded.settings)

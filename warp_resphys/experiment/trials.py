@@ -44,7 +44,7 @@ VARIATIONS: Final = {
 }
 
 
-def known_trials(run: RunSettings) -> dict[str, Trial]:
+def all_trials(run: RunSettings) -> dict[str, Trial]:
     """All configured or recorded trials, by name.
 
     Raises:
@@ -114,7 +114,7 @@ def split_of(run: RunSettings) -> Split:
 
     Raises:
         InputError: an unknown trial, a trial in two splits, too few trials, or an empty training or test split.
-        DataFileError: see `known_trials`.
+        DataFileError: see `all_trials`.
     """
     data = run.data
     lists = _named(run) if isinstance(data, RecordedData) else _valued(data)
@@ -147,20 +147,20 @@ def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:
 
 def _named(run: RunSettings) -> dict[str, list[str]]:
     """Names of the trials in each split, from the configured lists or numbers."""
-    known, (group, settings) = list(known_trials(run)), _splits(run)
+    names, (group, settings) = list(all_trials(run)), _splits(run)
     wanted = {name: getattr(settings, name) for name in SPLITS}
     asked = sum(members for members in wanted.values() if isinstance(members, int))
-    if asked > len(known):
+    if asked > len(names):
         raise InputError(
-            f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(known)}."
+            f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(names)}."
         )
-    rest, lists = iter(known), dict[str, list[str]]()
+    rest, lists = iter(names), dict[str, list[str]]()
     for name, members in wanted.items():
         lists[name] = [*islice(rest, members)] if isinstance(members, int) else list(members)
-        unknown = [trial for trial in lists[name] if trial not in known]
+        unknown = [trial for trial in lists[name] if trial not in names]
         if unknown:
             raise InputError(
-                f"{group}.{name} names the trial '{unknown[0]}', which is not in {group}.trials: {', '.join(known)}."
+                f"{group}.{name} names the trial '{unknown[0]}', which is not in {group}.trials: {', '.join(names)}."
             )
         if not lists[name] and not (name == "validation" and run.in_the_loop is not None):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
@@ -194,7 +194,7 @@ def folds_of(run: RunSettings) -> dict[str, Split] | None:
     data = run.data
     if data.folds is None or (isinstance(data, RecordedData) and _splits(run)[0] == "laboratory"):
         return None
-    names = list(known_trials(run))
+    names = list(all_trials(run))
     if len(names) < 2:
         raise InputError("data.folds is leave_one_out, which needs at least two trials in data.trials.")
     folds, members = (len(names), len(names)) if data.limit is None else (data.limit.test, data.limit.train)
@@ -204,8 +204,8 @@ def folds_of(run: RunSettings) -> dict[str, Split] | None:
 
 def trials_of(run: RunSettings) -> tuple[Trial, ...]:
     """Trials of an experiment in the order of the files: by split, or as configured if there are folds."""
-    known = known_trials(run)
-    return tuple(known[name] for name in (known if folds_of(run) else split_of(run).names))
+    trials = all_trials(run)
+    return tuple(trials[name] for name in (trials if folds_of(run) else split_of(run).names))
 
 
 def scaled_name(name: str, scale: float) -> str:
@@ -217,8 +217,8 @@ def scaled_trials_of(run: RunSettings) -> tuple[Trial, ...]:
     """Test trials with inputs scaled by ``data.input_scales``, ordered by scale."""
     if not run.input_scales:
         return ()
-    known = known_trials(run)
-    test = [known[name] for name in split_of(run).test]
+    trials = all_trials(run)
+    test = [trials[name] for name in split_of(run).test]
     return tuple(
         trial.model_copy(update={"name": scaled_name(trial.name, scale), "scale": scale})
         for scale in run.input_scales

@@ -183,7 +183,7 @@ class TestCompleteRun:
         shown = pages["run"]
         assert shown.truth["youngs_modulus"] == 250e3
         assert len(shown.notes) == 2
-        assert re.search(r"the markers by 0\.\d mm \(m50\), as the identified simulator has it", shown.notes[0])
+        assert re.search(r"the identified simulator, the markers by 0\.\d mm \(m50\)\.", shown.notes[0])
         assert shown.notes[1] == "The noise of the markers alone is 0.08 mm."
         assert set(shown.training) == set(LEARNED)
         assert shown.models == list(MODELS)

@@ -73,6 +73,7 @@ def check_run(run: RunSettings) -> None:
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
         _check_identification(run.identify, names, simulator)
+        _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
 
 

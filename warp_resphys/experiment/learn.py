@@ -292,10 +292,11 @@ def _motions(experiment: Experiment, model: str, names: Sequence[str]) -> list[R
     simulator = reconstructing_simulator(experiment, model)
     for replay, start in experiment.replays(simulator, experiment.moving(names), model):
         batch, target = replay.trials.names, experiment.targets(replay, start)
-        simulated, device = experiment.dataset.velocity is not None, simulator.rest_positions.device
-        q, v, *_ = (
-            _simulated(experiment, batch, device) if simulated else _reconstructed(experiment, model, batch, device)
-        )
+        device = simulator.rest_positions.device
+        if experiment.dataset.velocity is not None:
+            q, v, *_ = _simulated(experiment, batch, device)
+        else:
+            q, v, *_ = _reconstructed(experiment, model, batch, device)
         q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
         inputs = experiment.conditions(replay, experiment.parameters(model))
         motions.append(RefinementBatch(q, v, target, replay.trials, inputs, experiment.base(batch, simulator)))

@@ -1,15 +1,15 @@
 """L-BFGS directions, backtracking line search and convergence of a batch, decided where the data are.
 
-One block of threads works on one environment. Every environment is in a phase of its own, so that none waits while
-another one's line search goes on:
+One block of threads works on one environment. Every environment has its own phase, so that none waits for the line
+search of another:
 
-=========  ============================================================================================
-BEGINS     its start is evaluated next
-AIMS       it needs a direction: `project`, a solve with the global step's matrix, `aim`
-TRIES      its positions are a trial, which is evaluated next and judged by `accept`
-DONE       it has converged
-STUCK      it has not, and no more is to be tried
-=========  ============================================================================================
+==============  ===============================================================================================
+START           the start is evaluated next
+NEED_DIRECTION  the next direction comes from `project`, a solve with the global step's matrix, and `aim`
+LINE_SEARCH     the positions are a trial, which is evaluated next and accepted or halved by `accept`
+DONE            the environment has converged
+FAILED          the environment has not converged, and is not tried again
+==============  ===============================================================================================
 """
 
 import functools
@@ -23,7 +23,7 @@ from .reductions import block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
 
-BEGINS, AIMS, TRIES, DONE, STUCK = (wp.constant(k) for k in range(5))
+START, NEED_DIRECTION, LINE_SEARCH, DONE, FAILED = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
 NEVER = wp.constant(2**28)  # iterations after which a factor is made anew
 
@@ -34,40 +34,40 @@ LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
 MOST_HALVINGS = wp.constant(25)
 STALLS = wp.constant(3)
 ASKS_AGAIN = wp.constant(16)  # stalls: one nudge may happen to change little
-# Of the squared error: what makes a higher order, that amplifies fast modes, worth it.
+# Factor by which a higher order, which amplifies fast modes, must reduce the squared error.
 BETTER = wp.constant(wp.float64(0.1))
-UNIT = wp.constant(wp.float64(2.0**-52))  # of rounding
-# Of a sum of energies: what rounding leaves of the terms that cancel, per unit of stiffness and of energy.
+UNIT = wp.constant(wp.float64(2.0**-52))  # relative rounding unit
+# Rounding error of a sum of energies whose terms cancel, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
 
 
 @wp.struct
 class SolverProgress:
-    """Where the environments of a batch are, (B) each."""
+    """Progress of the solve in every environment: arrays of shape (B)."""
 
     phase: wp.array[int]
-    wanted: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR, before it goes on
-    factored: wp.array[int]  # 1: it has a factor, of this solve or one before
-    asks: wp.array[int]  # 1: whether its residual is rounding is to be measured
-    iterations: wp.array[int]  # directions so far; at first, those of the solve before
-    since: wp.array[int]  # directions since the solve began, or since a factorisation in it
+    wanted: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR, requested before the next direction
+    factored: wp.array[int]  # 1 if there is a factor, of this solve or an earlier one
+    asks: wp.array[int]  # 1 if the rounding error of the residual is to be measured
+    iterations: wp.array[int]  # directions of this solve; before it begins, of the last one
+    since: wp.array[int]  # directions since the start of the solve or its last factorisation
     made: wp.array[int]  # factorisations in this solve
     halvings: wp.array[int]
-    stalls: wp.array[int]  # evaluations that have not halved the residual
+    stalls: wp.array[int]  # evaluations in a row that have not halved the residual
     step: wp.array[wp.float64]  # length, as a share of the direction
     slope: wp.array[wp.float64]  # of the energy along the direction [J]
     energy: wp.array[wp.float64]  # at the iterate [J]
     scale: wp.array[wp.float64]  # norm of the balancing forces there [N]
     relative: wp.array[wp.float64]  # residual over scale
-    smallest: wp.array[wp.float64]  # norm of a residual so far [N]
-    rounding: wp.array[wp.float64]  # norm that rounding leaves of it, once it was measured [N]
+    smallest: wp.array[wp.float64]  # norm of the residual in this solve [N]
+    rounding: wp.array[wp.float64]  # norm of the residual's rounding error, infinite until measured [N]
     force: wp.array[wp.float64]  # norm of the loads [N]
     stiffness: wp.array[wp.float64]  # sum over all points [J]
 
 
 @wp.struct
 class Evaluation:
-    """What was found of the potential, (B) each but for the residual."""
+    """Values of the potential at the current positions: (B), and (B, N) for the residual."""
 
     energy: wp.array[wp.float64]  # [J]
     size: wp.array[wp.float64]  # sum of the energies' absolute values [J]
@@ -78,11 +78,11 @@ class Evaluation:
 
 @wp.struct
 class History:
-    """By how much the solutions of the last steps were off where they were sought first."""
+    """Corrections of the last steps: their solutions less the starts that inertia alone gives."""
 
-    known: wp.array[int]  # (B) how many there are, 0 to 3
-    newest: wp.array[int]  # (B) place of the last one
-    order: wp.array[int]  # (B) how many of them foretell the next one
+    stored: wp.array[int]  # (B) number of corrections, 0 to 3
+    newest: wp.array[int]  # (B) place of the last correction in the ring
+    order: wp.array[int]  # (B) number of corrections that are extrapolated to the next step
     start: wp.array2d[wp.vec3d]  # (B, N) [m]
     correction: wp.array3d[wp.vec3d]  # (B, 3, N) solution less start, a ring [m]
 
@@ -95,18 +95,18 @@ class Tolerances:
     absolute: wp.float64  # [N]
     epsilon: wp.float64  # of the states' type
     max_iterations: int
-    refactor_after: int  # iterations of a solve, more of which are to be fewer by a new factor
+    refactor_after: int  # iterations of a solve above which the next one gets a new factor
 
 
 @wp.func
 def correction(history: History, b: int, i: int, age: int) -> wp.vec3d:
-    """Of a vertex, 0 for the newest."""
+    """Correction of a vertex; age 0 is the newest [m]."""
     return history.correction[b, (history.newest[b] + 3 - age) % 3, i]
 
 
 @wp.func
-def foretold(history: History, b: int, i: int, order: int) -> wp.vec3d:
-    """The polynomial through the last corrections, one step on: none, the last one, a line, a parabola."""
+def extrapolated(history: History, b: int, i: int, order: int) -> wp.vec3d:
+    """Correction extrapolated to the next step [m]: zero, or a constant, line or parabola through the last ones."""
     guess = wp.vec3d()
     if order == 1:
         guess = correction(history, b, i, 0)
@@ -120,17 +120,17 @@ def foretold(history: History, b: int, i: int, order: int) -> wp.vec3d:
 
 @wp.func
 def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: int):
-    """Adds a solution, and chooses the order that would have foretold it best."""
+    """Adds a solution, and chooses the order whose extrapolation would have been closest to it."""
     lanes = wp.block_dim()
     n = positions.shape[1]
-    known = history.known[b]
+    stored = history.stored[b]
     place = (history.newest[b] + 1) % 3
     best = wp.int32(0)
     least = wp.float64(INFINITE)
-    for order in range(known + 1):
+    for order in range(stored + 1):
         total = wp.float64(0.0)
         for i in range(lane, n, lanes):
-            error = positions[b, i] - history.start[b, i] - foretold(history, b, i, order)
+            error = positions[b, i] - history.start[b, i] - extrapolated(history, b, i, order)
             total += wp.dot(error, error)
         total = block_sum(total)
         if total < BETTER * least:
@@ -140,7 +140,7 @@ def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: in
         history.correction[b, place, i] = positions[b, i] - history.start[b, i]
     if lane == 0:
         history.newest[b] = place
-        history.known[b] = wp.min(known + 1, 3)
+        history.stored[b] = wp.min(stored + 1, 3)
         history.order[b] = best
 
 
@@ -154,24 +154,24 @@ def begin(
     progress: SolverProgress,
     history: History,
 ):
-    """Starts where the last steps foretell, and sums what does not change during this solve."""
+    """Starts at the extrapolation of the last steps, and resets the progress of the solve."""
     b, lane = wp.tid()
     square = wp.float64(0.0)
-    known = history.known[b]
+    stored = history.stored[b]
     if progress.phase[b] != DONE:  # The solve before has failed.
-        known = 0
-    order = wp.min(history.order[b], known)
+        stored = 0
+    order = wp.min(history.order[b], stored)
     for i in range(lane, force.shape[1], wp.block_dim()):
         square += wp.dot(force[b, i], force[b, i])
         start = positions[b, i]
         history.start[b, i] = start
-        start = start + foretold(history, b, i, order)
+        start = start + extrapolated(history, b, i, order)
         positions[b, i] = start
         origin_out[b, i] = start
     square = block_sum(square)
     if lane == 0:
-        history.known[b] = known
-        progress.phase[b] = BEGINS
+        history.stored[b] = stored
+        progress.phase[b] = START
         progress.wanted[b] = 0
         if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
             progress.wanted[b] = FACTOR
@@ -189,10 +189,10 @@ def begin(
 
 @wp.kernel
 def choose(progress: SolverProgress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]):
-    """Which environments are factorised next, and which of these are clamped; forgets the pairs of the old factors."""
+    """Marks the environments to factorise next, and those to clamp; drops the pairs of the old factors."""
     b = wp.tid()
     wanted = progress.wanted[b]
-    chosen = progress.phase[b] == AIMS and wanted > 0
+    chosen = progress.phase[b] == NEED_DIRECTION and wanted > 0
     active_out[b] = int(chosen)
     clamp_out[b] = int(chosen and wanted == CLAMPED_FACTOR)
     if chosen:
@@ -209,7 +209,7 @@ def mark(
     clamp: wp.array[int],  # (B)
     clamped_out: wp.array[wp.bool],  # (B) whether the factor is that of a clamped matrix
 ):
-    """Notes which of the factors to be made are those of clamped matrices."""
+    """Marks the environments whose next factor is of a clamped matrix."""
     b = wp.tid()
     if active[b] != 0:
         clamped_out[b] = clamp[b] != 0
@@ -217,7 +217,7 @@ def mark(
 
 @wp.kernel
 def repeat(active: wp.array[int], clamp: wp.array[int], wanting_out: wp.array[int]):
-    """Which are to be factorised again, clamped: how many there are, by the one block of the launch."""
+    """Marks the environments to factorise again, clamped, and counts them; launched with one block."""
     _, lane = wp.tid()
     wanting = wp.float64(0.0)
     for b in range(lane, active.shape[0], wp.block_dim()):
@@ -232,13 +232,13 @@ def repeat(active: wp.array[int], clamp: wp.array[int], wanting_out: wp.array[in
 @wp.kernel
 def nudge(
     progress: SolverProgress,
-    signs: wp.array2d[wp.vec3d],  # (., N) up or down, at random: several draws
+    signs: wp.array2d[wp.vec3d],  # (draws, N) random signs
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    positions_out: wp.array2d[wp.vec3d],  # (B, N) what they were
+    positions_out: wp.array2d[wp.vec3d],  # (B, N) before the move [m]
 ):
-    """Moves every coordinate of those that ask by one rounding unit of the largest.
+    """Moves the coordinates of environments that measure rounding by one rounding unit of the largest coordinate.
 
-    Not by one of its own: deformation gradients sum over coordinates of all sizes.
+    Not by a unit of each coordinate: deformation gradients sum over coordinates of all sizes.
     """
     b, lane = wp.tid()
     if progress.asks[b] == 0:
@@ -259,10 +259,10 @@ def compare(
     kept: wp.array2d[wp.vec3d],  # (B, N) positions before `nudge` [m]
     gradient: wp.array2d[wp.vec3d],  # (B, N) there [N]
     residual: wp.array2d[wp.vec3d],  # (B, N) after it [N]
-    positions: wp.array2d[wp.vec3d],  # (B, N) are again what they were
+    positions: wp.array2d[wp.vec3d],  # (B, N) restored [m]
     history: History,
 ):
-    """Where a residual that does not fall any more is no more than rounding makes of it, it has converged."""
+    """Measures the rounding error of the residual; an environment whose residual is not larger has converged."""
     b, lane = wp.tid()
     if progress.asks[b] == 0:
         return
@@ -287,17 +287,17 @@ def compare(
 
 @wp.kernel
 def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: wp.array[int]):
-    """What the host has to know, by the one block of the launch, and (B) who needs a further evaluation."""
+    """Counts for the host, see `Summary`, and (B) flags of environments to evaluate again; launched with one block."""
     _, lane = wp.tid()
     active, aiming = wp.float64(0.0), wp.float64(0.0)
     wanting, asking = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         asking += wp.float64(progress.asks[b])
-        # One that asks is evaluated once more, even if nothing else is to be tried.
+        # An environment that measures rounding is evaluated once more, even if it has failed.
         active_out[b] = int(progress.phase[b] < DONE or progress.asks[b] != 0)
         if progress.phase[b] < DONE:
             active += ONE
-        if progress.phase[b] == AIMS:
+        if progress.phase[b] == NEED_DIRECTION:
             aiming += ONE
             if progress.wanted[b] > 0:
                 wanting += ONE
@@ -311,25 +311,25 @@ def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: 
 
 @wp.func
 def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
-    """Whether to measure what rounding makes of a residual that does not fall: once, and again when that went on."""
+    """Returns whether to measure the rounding error of a residual that no longer falls: once, then every 16 stalls."""
     stuck = iterations >= STALLS and stalls >= STALLS
     return stuck and (norm <= progress.rounding[b] or stalls % ASKS_AGAIN == 0)
 
 
 @wp.func
 def give_up(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
-    """Stays where it was: a new factor, and a clamped one, get a try before the environment counts as stuck."""
-    progress.phase[b] = AIMS
+    """Ends a failed line search: tries a new factor, then a clamped one, before the environment fails."""
+    progress.phase[b] = NEED_DIRECTION
     progress.stalls[b] += 1
     norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
     if may_be_rounding(progress, b, norm, progress.iterations[b], progress.stalls[b]):
         progress.asks[b] = 1
     if progress.iterations[b] >= tolerances.max_iterations:
-        progress.phase[b] = STUCK
+        progress.phase[b] = FAILED
     elif progress.made[b] == 0:
         progress.wanted[b] = FACTOR
     elif clamped[b]:
-        progress.phase[b] = STUCK
+        progress.phase[b] = FAILED
     else:
         progress.wanted[b] = CLAMPED_FACTOR
 
@@ -344,7 +344,7 @@ def within_rounding(
     b: int,
     lane: int,
 ) -> bool:
-    """Whether a step, and the forces that balance after it, are those of rounding the state."""
+    """Returns whether a step, and the balancing forces after it, are within the rounding of the state."""
     moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
         for c in range(3):
@@ -372,11 +372,11 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         y: wp.array3d[vector]  # (B, M, N) [N]
         r: wp.array3d[wp.float64]  # (B, M, M) by place [J]
         a: wp.array2d[wp.float64]  # (B, M) by age, oldest first: coefficients of `project`
-        b: wp.array2d[wp.float64]  # (B, M) those of `aim`, and S g for a while
+        b: wp.array2d[wp.float64]  # (B, M) coefficients of `aim`; holds S g in between
 
     @wp.func(module=module)
     def place(pairs: Pairs, b: int, age: int) -> int:
-        """Of the pair of an age, 0 for the oldest."""
+        """Place of a pair in the ring; age 0 is the oldest."""
         m = pairs.s.shape[1]
         return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
 
@@ -388,9 +388,9 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         gradient: wp.array2d[wp.vec3d],  # (B, N) [N]
         right_out: wp.array2d[vector],  # (B, F) g - Y^T a, with a = R^-1 S g
     ):
-        """What comes before the solve in the compact form of L-BFGS; zero where no direction is needed."""
+        """Right-hand side of the solve in the compact form of L-BFGS; zero where no direction is needed."""
         b, lane = wp.tid()
-        if progress.phase[b] != AIMS:
+        if progress.phase[b] != NEED_DIRECTION:
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 right_out[b, p] = vector()
             return
@@ -427,12 +427,12 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         origin_out: wp.array2d[wp.vec3d],
         direction_out: wp.array2d[wp.vec3d],  # (B, N) -(z + S^T b), with b = R^-T (D a - Y z); zero at fixed vertices
     ):
-        """The direction and its slope, and the first trial.
+        """Computes the direction, its slope and the first trial.
 
-        Where the slope is positive or not finite the pairs are forgotten; without pairs a factor is asked for, once.
+        Where the slope is positive or not finite, the pairs are dropped; without pairs a new factor is requested, once.
         """
         b, lane = wp.tid()
-        if progress.phase[b] != AIMS:
+        if progress.phase[b] != NEED_DIRECTION:
             return
         k = pairs.count[b]
         for i in range(k):
@@ -462,7 +462,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                 origin_out[b, v] = positions[b, v]
                 positions[b, v] = positions[b, v] + direction_out[b, v]
             if lane == 0:
-                progress.phase[b] = TRIES
+                progress.phase[b] = LINE_SEARCH
                 progress.iterations[b] += 1
                 progress.since[b] += 1
                 progress.halvings[b] = 0
@@ -474,7 +474,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             elif progress.made[b] == 0:
                 progress.wanted[b] = FACTOR
             else:
-                progress.phase[b] = STUCK
+                progress.phase[b] = FAILED
 
     @wp.func(module=module)
     def add_pair(
@@ -486,7 +486,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         before: wp.array2d[wp.vec3d],
         after: wp.array2d[wp.vec3d],
     ):
-        """Remembers a pair of positive curvature."""
+        """Stores a pair if its curvature is positive."""
         m, lanes = pairs.s.shape[1], wp.block_dim()
         k = pairs.count[b]
         new = (pairs.last[b] + 1) % m
@@ -522,20 +522,20 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def accept(
-        remembers: int,  # 1: pairs are kept
+        remembers: int,  # 1 if pairs are stored
         tolerances: Tolerances,
         inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
-        found: Evaluation,  # at the positions
+        evaluation: Evaluation,  # at the positions
         origin: wp.array2d[wp.vec3d],
         direction: wp.array2d[wp.vec3d],
         clamped: wp.array[wp.bool],  # (B) whether the global step's matrix is positive definite by force
         positions: wp.array2d[wp.vec3d],
-        gradient: wp.array2d[wp.vec3d],  # (B, N) becomes the residual, where the trial is taken
+        gradient: wp.array2d[wp.vec3d],  # (B, N) set to the residual where the trial is accepted
         progress: SolverProgress,
         pairs: Pairs,
         history: History,
     ):
-        """Takes a trial that decreases the energy, or its slope where the energy is down to rounding; or halves it.
+        """Accepts a trial that decreases the energy, or its slope where the energy is down to rounding; else halves it.
 
         The second test is the approximate Wolfe condition of Hager and Zhang (2005).
         """
@@ -543,21 +543,21 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         phase = progress.phase[b]
         lanes = wp.block_dim()
         n = positions.shape[1]
-        if phase != BEGINS and phase != TRIES:
+        if phase != START and phase != LINE_SEARCH:
             return
-        energy = found.energy[b]
-        norm = found.norm[b]
+        energy = evaluation.energy[b]
+        norm = evaluation.norm[b]
         before = progress.energy[b]
-        flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * found.size[b])
+        flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
         iterations = progress.iterations[b]
         stalls = progress.stalls[b]
-        if phase == TRIES:
+        if phase == LINE_SEARCH:
             step = progress.step[b]
             slope = progress.slope[b]
             halvings = progress.halvings[b]
             after = wp.float64(0.0)
             for i in range(lane, n, lanes):
-                after += wp.dot(found.residual[b, i], direction[b, i])
+                after += wp.dot(evaluation.residual[b, i], direction[b, i])
             after = block_sum(after)
             taken = energy <= before + ARMIJO * step * slope
             if not taken:
@@ -578,22 +578,22 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                     progress.halvings[b] = halvings + 1
                     if rests:
                         progress.phase[b] = DONE
-                        history.known[b] = 0
+                        history.stored[b] = 0
                     elif given_up:
                         give_up(progress, tolerances, clamped, b)
                 return
             if remembers == 1:
-                add_pair(pairs, b, lane, step, direction, gradient, found.residual)
+                add_pair(pairs, b, lane, step, direction, gradient, evaluation.residual)
         for i in range(lane, n, lanes):
-            gradient[b, i] = found.residual[b, i]
-        scale = found.balance[b] + progress.force[b]
+            gradient[b, i] = evaluation.residual[b, i]
+        scale = evaluation.balance[b] + progress.force[b]
         smallest = progress.smallest[b]
         stalls += 1
         if norm < HALF * smallest:
             stalls = 0
         done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
         done = done and norm + scale < INFINITE
-        if phase == TRIES and iterations == 1 and progress.force[b] == ZERO:
+        if phase == LINE_SEARCH and iterations == 1 and progress.force[b] == ZERO:
             done = done or within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
         # Before the values of this environment are written, every thread has read them.
         asks = block_max(ZERO)
@@ -609,12 +609,12 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             progress.smallest[b] = wp.min(norm, smallest)
             progress.stalls[b] = stalls
             progress.asks[b] = int(asks)
-            progress.phase[b] = AIMS
+            progress.phase[b] = NEED_DIRECTION
             if progress.since[b] >= 3 * tolerances.refactor_after:
                 progress.wanted[b] = FACTOR
             if done:
                 progress.phase[b] = DONE
             elif not wp.isfinite(relative) or iterations >= tolerances.max_iterations:
-                progress.phase[b] = STUCK
+                progress.phase[b] = FAILED
 
     return SimpleNamespace(project=project, aim=aim, accept=accept, Pairs=Pairs)

@@ -34,12 +34,12 @@ def response(f: wp.mat33d, m: moduli):
 @wp.func
 def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
     """See ``kernels.materials``."""
-    found = moduli(ZERO, ZERO)
+    derivatives = moduli(ZERO, ZERO)
     if carried[0] != ZERO:
-        found[0] = TWO * wp.ddot(f - polar_rotation(f), df)
+        derivatives[0] = TWO * wp.ddot(f - polar_rotation(f), df)
     if carried[1] != ZERO:
-        found[1] = wp.ddot(f - nearest_unimodular(f), df)
-    return found
+        derivatives[1] = wp.ddot(f - nearest_unimodular(f), df)
+    return derivatives
 
 
 @wp.func

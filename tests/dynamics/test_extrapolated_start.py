@@ -1,4 +1,4 @@
-"""Where a step begins: at what the steps before it foretell, if it follows them."""
+"""Start of a step: extrapolated from the steps before, if it follows them."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def iterations(reports):
 
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_forces_that_a_polynomial_describes_are_foretold(name, degree, device):
+def test_polynomial_forces_are_extrapolated(name, degree, device):
     """A free body under its weight and a multiple of it: how far a step is off inertia goes with the force."""
     s = simulator(Body(MESH), device=device, solver={"name": name})
     weight = s.prepare().mass[0, :, None] * torch.tensor([0.0, 0.0, 9.8], dtype=torch.float64, device=device)

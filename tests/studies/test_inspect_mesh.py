@@ -129,9 +129,7 @@ class TestNamedSurfaces:
         inside = mesh.cells[:1, [0, 1, 2, 3]]
         assert not np.any(np.all(np.sort(boundary_faces(mesh), axis=1) == np.sort(inside), axis=1))
         write_mesh(tmp_path / "arm.msh", mesh, {**surfaces, "middle": inside})
-        with pytest.raises(
-            MeshError, match=r"arm\.msh: 1 of 1 faces of the surface 'middle' are no faces of the body's"
-        ):
+        with pytest.raises(MeshError, match=r"arm\.msh: 1 of 1 faces of the surface 'middle' are not on the body's"):
             read_surfaces(tmp_path / "arm.msh")
 
     @pytest.mark.parametrize("kind", ["tetrahedron10", "tetrahedron"])

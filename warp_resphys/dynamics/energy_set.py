@@ -26,7 +26,7 @@ class EnergySet:
     """The energies of a simulator.
 
     Args:
-        placed: the energies, with their points and the prefixes of their names.
+        energies: the energies, with their points and the prefixes of their names.
         body: that they belong to.
         rest_positions: (N, 3) [m], on the simulator's device and of its type.
         method: the integrator.
@@ -43,13 +43,13 @@ class EnergySet:
 
     def __init__(
         self,
-        placed: Sequence[Placed],
+        energies: Sequence[Placed],
         body: Body,
         rest_positions: torch.Tensor,
         method: Integrator,
         time_step: float,
     ) -> None:
-        self.placed = tuple(placed)
+        self.placed = tuple(energies)
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}
@@ -57,14 +57,14 @@ class EnergySet:
         self.counts: dict[str, int] = {}
         self.parts: dict[str, tuple[str, ...]] = {}
         self.memory: dict[str, Memory] = {}
-        for each in placed:
-            energy, named = each.energy, each.named
-            points = each.all_points or each.points
-            place = EnergySite(each.body or body, each.first, points, rest_positions, method, time_step)
+        for placed in energies:
+            energy, named = placed.energy, placed.named
+            points = placed.all_points or placed.points
+            place = EnergySite(placed.body or body, placed.first, points, rest_positions, method, time_step)
             bound = energy.bind(place)
             self._bound.append(bound)
-            own = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.parameters})
-            acting = named({q.name: replace(q, name=f"{each.prefix}{q.name}") for q in energy.inputs})
+            own = named({q.name: replace(q, name=f"{placed.prefix}{q.name}") for q in energy.parameters})
+            acting = named({q.name: replace(q, name=f"{placed.prefix}{q.name}") for q in energy.inputs})
             if twice := {*own, *acting} & {*self.parameters, *self.inputs}:
                 raise InputError(f"two energies depend on {min(twice)}: rename one of their bodies or regions.")
             self.parameters |= own
@@ -72,15 +72,15 @@ class EnergySet:
             self.constants |= named(energy.constants)
             self.counts |= dict.fromkeys([*own, *acting], energy.count)
             self.parts |= dict.fromkeys(own, energy.names) if energy.names else {}
-            self.memory |= named({m.name: replace(m, name=f"{each.prefix}{m.name}") for m in bound.memory})
+            self.memory |= named({m.name: replace(m, name=f"{placed.prefix}{m.name}") for m in bound.memory})
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
         """Returns the values that follow from parameters by name, and the mass of the matter."""
         values: dict[str, torch.Tensor | None] = {}
         masses: list[Mass] = []
-        for each, bound in self._pairs:
-            own = each.own(parameters)
-            values |= each.named(bound.prepare(own))
+        for placed, bound in self._pairs:
+            own = placed.own(parameters)
+            values |= placed.named(bound.prepare(own))
             if (mass := bound.mass(own)) is not None:
                 masses.append(mass)
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
@@ -99,8 +99,8 @@ class EnergySet:
 
     def loads(self, constants: Constants, inputs: Inputs, batch: int, static: bool) -> Iterator[torch.Tensor]:
         """Yields forces (1 or B, N, 3) that do not depend on where the body is [N]."""
-        for each, bound in self._pairs:
-            load = bound.load(each.own_inputs(inputs), each.own_constants(constants), batch, static)
+        for placed, bound in self._pairs:
+            load = bound.load(placed.own_inputs(inputs), placed.own_constants(constants), batch, static)
             if load is not None:
                 yield load
 
@@ -109,13 +109,15 @@ class EnergySet:
     ) -> dict[str, torch.Tensor | None]:
         """Returns the values of the energies' terms that depend on the step."""
         values: dict[str, torch.Tensor | None] = {}
-        for (each, bound), term in zip(self._pairs, terms, strict=True):
-            values |= each.named(bound.begin_step(each.step(state, stage, inputs, constants, term)))
+        for (placed, bound), term in zip(self._pairs, terms, strict=True):
+            values |= placed.named(bound.begin_step(placed.step(state, stage, inputs, constants, term)))
         return values
 
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns those values for an equilibrium."""
-        return {name: value for each, bound in self._pairs for name, value in each.named(bound.at_rest(batch)).items()}
+        """Returns the values of the energies' terms that depend on the step, for an equilibrium."""
+        return {
+            name: value for placed, bound in self._pairs for name, value in placed.named(bound.at_rest(batch)).items()
+        }
 
     def end_step(
         self,
@@ -129,8 +131,8 @@ class EnergySet:
     ) -> dict[str, torch.Tensor]:
         """Returns what the energies remember after a step with the solution x (B, N, 3) that leads to positions q."""
         memory: dict[str, torch.Tensor] = {}
-        for (each, bound), term in zip(self._pairs, terms, strict=True):
-            memory |= each.named(bound.end_step(each.step(state, stage, inputs, constants, term), x, q))
+        for (placed, bound), term in zip(self._pairs, terms, strict=True):
+            memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, term), x, q))
         return memory
 
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:

@@ -141,7 +141,7 @@ def equilibrium(
     names, main = tuple(values), (terms.target, terms.inertia, terms.force)
     tensors = (start, fixed_positions, *main, *values.values())
     # What differentiates forward is to be told that it cannot.
-    graded = torch.is_grad_enabled() and any(each is not None and each.requires_grad for each in tensors[1:])
+    graded = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors[1:])
     if graded or forward_ad._current_level >= 0:
         reports: list[SolveReport] = []
         x: torch.Tensor = _Equilibrium.apply(workspace, purpose, settings, follows, reports, names, *tensors)
@@ -224,12 +224,12 @@ class _Equilibrium(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
-        x, saved = x.detach(), [None if each is None else each.detach() for each in saved]
+        x, saved = x.detach(), [None if tensor is None else tensor.detach() for tensor in saved]
         needed = ctx.needs_input_grad[7:]
 
         types = (torch.float32, torch.float64) if ctx.settings.factors == "single" else (torch.float64,)
         parts = [
-            (rows, own, [own.hessian(ctx.settings.linear_solver, each) for each in types])
+            (rows, own, [own.hessian(ctx.settings.linear_solver, dtype) for dtype in types])
             for rows, own in ctx.workspace.parts
         ]
         for _, own, _ in parts:
@@ -237,14 +237,16 @@ class _Equilibrium(torch.autograd.Function):
 
         def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
             rows, own, hessians = part
-            return _adjoint(own, hessians, ctx.names, needed, *(_rows(each, rows) for each in (gradient, x, *saved)))
+            return _adjoint(
+                own, hessians, ctx.names, needed, *(_rows(tensor, rows) for tensor in (gradient, x, *saved))
+            )
 
         try:
             with threads_for(gradient[0].numel(), len(parts)):
-                found = in_threads(differentiate, parts)
+                gradients = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
-        return (*([None] * 7), *map(_joined, (None, *saved), zip(*found, strict=True)))
+        return (*([None] * 7), *map(_joined, (None, *saved), zip(*gradients, strict=True)))
 
 
 def _solve_shards(
@@ -256,20 +258,20 @@ def _solve_shards(
     given: Sequence[torch.Tensor | None],
 ) -> tuple[torch.Tensor, SolveReport]:
     """The minimiser and the report of a batch, whose shards go to as many threads."""
-    tensors = [None if each is None else each.detach() for each in given]
+    tensors = [None if tensor is None else tensor.detach() for tensor in given]
     # Made here, not in the threads: Warp captures graphs for the whole process.
     parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
 
     def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
         rows, own, solver = part
         mine = None if follows is None else follows[rows]
-        return _solve(own, solver, mine, names, *(_rows(each, rows) for each in tensors))
+        return _solve(own, solver, mine, names, *(_rows(tensor, rows) for tensor in tensors))
 
     assert tensors[0] is not None
     with threads_for(tensors[0][0].numel(), len(parts)):
-        found = in_threads(solve, parts)
-    x = found[0][0] if len(found) == 1 else torch.cat([each for each, _ in found])
-    return x, SolveReport.of([report for _, report in found])
+        results = in_threads(solve, parts)
+    x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
+    return x, SolveReport.of([report for _, report in results])
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
@@ -279,10 +281,10 @@ def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
 
 def _joined(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:
     """The slopes by a value from those of its shards: their sum, if these share it."""
-    found = [slope for slope in slopes if slope is not None]
-    if len(found) < 2:
-        return found[0] if found else None
-    return torch.stack(found).sum(0) if value is not None and len(value) == 1 else torch.cat(found)
+    present = [slope for slope in slopes if slope is not None]
+    if len(present) < 2:
+        return present[0] if present else None
+    return torch.stack(present).sum(0) if value is not None and len(value) == 1 else torch.cat(present)
 
 
 def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:

@@ -29,11 +29,11 @@ class VertexFrames:
 
     def __init__(self, body: Body, time_step: float, like: torch.Tensor) -> None:
         self._ahead = time_step
-        found = body.discretisation
-        points = found.point_sets[0]
+        discretisation = body.discretisation
+        points = discretisation.point_sets[0]
         volumes = np.asarray(points.shape_volume.sum(axis=1)).reshape(-1, points.points_per_cell)
         mean = np.einsum("cq,cqki->cki", volumes, points.gradients) / volumes.sum(axis=1)[:, None, None]
-        nodes, operator = mean_gradients(points.nodes, mean, found.lumped_volume)
+        nodes, operator = mean_gradients(points.nodes, mean, discretisation.lumped_volume)
         self._nodes = torch.as_tensor(nodes, device=like.device)
         self._operator = torch.as_tensor(operator).to(like)
 

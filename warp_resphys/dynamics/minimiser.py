@@ -71,7 +71,7 @@ class Minimiser:
         own = kernels.minimisation_kernels(wp.float64 if double else wp.float32)
         vector = wp.vec3d if double else wp.vec3f
         progress, pairs = kernels.SolverProgress(), own.Pairs()
-        found, tolerances = kernels.Evaluation(), kernels.Tolerances()
+        evaluation, tolerances = kernels.Evaluation(), kernels.Tolerances()
         for name, values in self._counts.items():
             setattr(progress, name, warp_view(values, wp.int32))
         for name, values in self._sums.items():
@@ -87,15 +87,15 @@ class Minimiser:
         )
         pairs.r = warp_view(p.zeros(places, places), wp.float64)
         pairs.a, pairs.b = (warp_view(p.zeros(places), wp.float64) for _ in range(2))
-        found.energy, found.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
-        found.balance, found.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
-        found.residual = warp_view(p.residual, wp.vec3d)
+        evaluation.energy, evaluation.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
+        evaluation.balance, evaluation.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
+        evaluation.residual = warp_view(p.residual, wp.vec3d)
         tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
         tolerances.epsilon, tolerances.max_iterations = wp.float64(epsilon), max_iterations
         tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
         history = kernels.History()
-        history.known, history.newest, history.order = (warp_view(each, wp.int32) for each in self._recent)
+        history.stored, history.newest, history.order = (warp_view(values, wp.int32) for values in self._recent)
         history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
@@ -104,13 +104,13 @@ class Minimiser:
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         beginning = [*loads, positions, tolerances, origin_view, progress, history]
         begin = p.record_blocks(kernels.begin, b, beginning, [])
-        chosen = [warp_view(each, wp.int32) for each in (p.tangent_active, p.clamp)]
+        chosen = [warp_view(flags, wp.int32) for flags in (p.tangent_active, p.clamp)]
         self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
         aiming = [progress, pairs, vertex_at, gradient]
         self._project = p.record_blocks(own.project, b, aiming, [right])
         aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
         clamped = warp_view(hessian.clamped, wp.bool)
-        judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), found, origin_view, direction]
+        judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation, origin_view, direction]
         judging += [clamped, positions, gradient, progress, pairs, history]
         accept = p.record_blocks(own.accept, b, judging, [])
         seen = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
@@ -120,7 +120,9 @@ class Minimiser:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUDGES, n, 3))
         kept = warp_view(p.zeros(n, 3), wp.vec3d)
         nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
-        compare = p.record_blocks(kernels.compare, b, [progress, kept, gradient, found.residual], [positions, history])
+        compare = p.record_blocks(
+            kernels.compare, b, [progress, kept, gradient, evaluation.residual], [positions, history]
+        )
         self._compare = p.capture(nudge, *p.evaluation, compare, summarise)
         self._parts = SimpleNamespace(begin=begin, aim=aim, judge=judge)
         self._loop: Launches | None = None
@@ -174,11 +176,11 @@ class Minimiser:
                 all, without pairs.
         """
         p = self._potential
-        for each in self._recent[0], self._pair_counts, *((self._counts["factored"],) if self._renews else ()):
+        for values in self._recent[0], self._pair_counts, *((self._counts["factored"],) if self._renews else ()):
             if follows is None:
-                each.zero_()
+                values.zero_()
             else:
-                each.mul_(follows)
+                values.mul_(follows)
         if not self._renews:  # The tail of a long solve tells the next one little.
             self._pair_counts.zero_()
         if self._loop is not None:

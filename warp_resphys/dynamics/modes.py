@@ -112,10 +112,10 @@ def _about_rest(
     simulator = replace(simulator, dtype=torch.float64)  # The slowest vibrations are below the rounding of float32.
     rest = simulator.rest_state()
     elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith("stiffness_damping")})
-    found = simulator.linearise(rest, parameters=elastic)
-    hessian, _ = found.matrix(rest.q)
-    inertia = found.inertia_matrix(rest.q)
-    return scipy.sparse.csc_array(hessian - inertia), inertia, found.free.cpu().numpy()
+    linearisation = simulator.linearise(rest, parameters=elastic)
+    hessian, _ = linearisation.matrix(rest.q)
+    inertia = linearisation.inertia_matrix(rest.q)
+    return scipy.sparse.csc_array(hessian - inertia), inertia, linearisation.free.cpu().numpy()
 
 
 class RestStiffness:

@@ -87,7 +87,7 @@ class SolveReport:
         """The report of a batch from those of its shards."""
         if len(shards) == 1:
             return shards[0]
-        names = [each.name for each in fields(SolveReport)]
+        names = [field.name for field in fields(SolveReport)]
         return SolveReport(*(torch.cat([getattr(report, name) for report in shards]) for name in names))
 
 

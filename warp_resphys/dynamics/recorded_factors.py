@@ -35,7 +35,7 @@ class RecordedFactors:
     ) -> None:
         p, b = potential, potential.batch
         self._again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
-        asked = [warp_view(each, wp.int32) for each in (p.tangent_active, p.clamp)]
+        asked = [warp_view(flags, wp.int32) for flags in (p.tangent_active, p.clamp)]
         mark = p.record(minimisation.mark, (b,), asked, [warp_view(clamped, wp.bool)])
         made = linear.record_factor(assembly.values, p.tangent_active, clamped)
         self._factorise = [mark, p.tangent_launches, made.clear, assembly.launches, made.factor, made.check]

@@ -252,16 +252,18 @@ class Simulator:
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
-        placed = self._place_energies()
-        self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
+        energies = self._place_energies()
+        self._set = EnergySet(energies, body, self.rest_positions, self.method, self.time_step)
         own = self._set
         self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # what is no unknown of a solve
-        self._pattern = BlockPattern(body.vertices, self._held, [points for each in placed for points in each.points])
+        self._pattern = BlockPattern(
+            body.vertices, self._held, [points for placed in energies for points in placed.points]
+        )
         self.parameters: dict[str, Quantity] = {**own.parameters, "gravity": _GRAVITY}
         self.constants: dict[str, Any] = {**own.constants, "gravity": [list(self.gravity)]}
         self.counts = {**own.counts, "gravity": 3}
         self.inputs, self.parts = own.inputs, own.parts
-        followers = [name for each in placed if each.energy.implicit_only for name in each.input_names]
+        followers = [name for placed in energies if placed.energy.implicit_only for name in placed.input_names]
         if self.coupling == "explicit" and followers:
             raise InputError(
                 f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
@@ -343,7 +345,7 @@ class Simulator:
         if batch not in self._workspaces:
             workspace = self._make_workspace(batch)
             rows = shards_of(batch, workspace.potential.device)
-            workspace.shards += [(each, self._make_workspace(each.stop - each.start)) for each in rows]
+            workspace.shards += [(shard, self._make_workspace(shard.stop - shard.start)) for shard in rows]
             self._workspaces[batch] = workspace
         return self._workspaces[batch]
 
@@ -360,7 +362,7 @@ class Simulator:
             InputError: no energy of the body has that input.
         """
         if (batch, name) not in self._held_energies:
-            acting = [each for each in self._set.placed if name in each.input_names]
+            acting = [placed for placed in self._set.placed if name in placed.input_names]
             if not acting:
                 known = ", ".join(self.inputs) or "none"
                 raise InputError(f"Unknown input {name}. The energies of this body accept {known}.")
@@ -513,7 +515,7 @@ class Simulator:
         values = self._set.acting(constants, inputs, batch)
         values |= self._set.begin_step(state, stage, inputs, constants, energies)
         if self.coupling == "explicit":
-            for name in (name for each in self._set.placed if each.energy.is_load for name in each.input_names):
+            for name in (name for placed in self._set.placed if placed.energy.is_load for name in placed.input_names):
                 value = values[name]
                 assert value is not None
                 force = force + self.held_energy(name, batch).force(state.q, value)
@@ -660,7 +662,7 @@ class Simulator:
         if state.previous is not None:
             if not (isinstance(state.previous, tuple) and len(state.previous) == 2):
                 raise InputError("state.previous must be the pair (q, v) of the step before, or None.")
-            fields |= {f"state.previous[{i}]": each for i, each in enumerate(state.previous)}
+            fields |= {f"state.previous[{i}]": values for i, values in enumerate(state.previous)}
         for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
             check_tensor(name, values, (batch, n, 3), unit, "vertex", like)
         self._check_inputs(inputs, batch)

@@ -3,8 +3,8 @@
 =================  =========  ===============================================================================
 class              lives      what it does
 =================  =========  ===============================================================================
-`Energy`           host       declares parameters (constants that may be identified) and inputs (what acts
-                              through it over time), and makes the other two
+`Energy`           host       declares parameters (constants that may be identified) and inputs (loads and
+                              actuation over time), and makes the other two
 `BoundEnergy`      simulator  turns parameters into values, begins and ends a step, declares its memory
 `Term`             batch      kernels on the points, and their arguments
 =================  =========  ===============================================================================
@@ -49,15 +49,15 @@ class Memory:
     per: str  # what its first axis counts, such as ``string``
 
     def check(self, values: Any, batch: int, like: torch.Tensor) -> None:
-        """Refuses values of another shape, type or device, or that are not finite.
+        """Checks shape, type, device and finiteness of values.
 
         Args:
-            values: of the memory.
+            values: values of the memory.
             batch: environments B.
             like: a tensor on the device and of the type of the simulator.
 
         Raises:
-            InputError: in one sentence that names the memory.
+            InputError: values that do not fit.
         """
         shape = (batch, *self.shape)
         if isinstance(values, torch.Tensor) and tuple(values.shape) != shape:
@@ -70,31 +70,31 @@ class Memory:
 
 @dataclass(frozen=True)
 class PartPoints(Points):
-    """Points that each belong to a part of an energy, such as a chamber or a tendon, and have a weight there."""
+    """Points with a weight, each of which belongs to one part of an energy, such as a chamber or a tendon."""
 
     part: NDArray[np.int64]  # (P,) number of the part
-    weights: NDArray[np.float64]  # (P,) by which the point's energy counts: a volume, an area, a length, or one
+    weights: NDArray[np.float64]  # (P,) factor of the point's energy: a volume, an area, a length, or one
 
 
 @dataclass(frozen=True)
 class EnergySite:
-    """What an energy needs of the simulator that it is bound to, whose vertices may be those of several bodies."""
+    """Data of the simulator that an energy is bound to, whose vertices may belong to several bodies."""
 
-    body: Body  # that the energy belongs to
+    body: Body  # body of the energy
     first: int  # number of that body's first vertex
-    points: tuple[Points, ...]  # of the energy, by the simulator's vertices
+    points: tuple[Points, ...]  # points of the energy, by the simulator's vertices
     rest_positions: torch.Tensor  # (N, 3) of all bodies [m], on the simulator's device and of its type
     method: Integrator
     time_step: float  # h [s]
 
     @property
     def mass_volume(self) -> scipy.sparse.csc_array:
-        """(N, M) volume of each of the body's elements that each vertex carries as mass [m^3]."""
+        """Volume (N, M) of the body's elements that the vertices carry as mass [m^3]."""
         return self._padded(self.body.mass_volume)
 
     @property
     def load_volume(self) -> scipy.sparse.csc_array:
-        """(N, M) volume of each of the body's elements whose weight acts on each vertex [m^3]."""
+        """Volume (N, M) of the body's elements whose weight acts on the vertices [m^3]."""
         return self._padded(self.body.load_volume)
 
     def _padded(self, matrix: scipy.sparse.csr_array) -> scipy.sparse.csc_array:
@@ -112,11 +112,11 @@ class EnergySite:
 class EnergyStep:
     """One time step, as an energy sees it."""
 
-    state: State  # where it starts
-    stage: ImplicitStage  # the implicit solve that the integrator makes of it
+    state: State  # start of the step
+    stage: ImplicitStage  # implicit solve of the integrator
     inputs: Inputs
     constants: Constants
-    term: "Term"  # of the energy and the state's batch
+    term: "Term"  # term of the energy in the state's batch
 
 
 class PointSet:
@@ -124,8 +124,8 @@ class PointSet:
 
     Attributes:
         source: the points on the host.
-        part: where they lie among the points of all energies.
-        own: where they lie among those of their own energy.
+        part: slice of the points of all energies.
+        own: slice of the points of their own energy.
         cells: C.
         points_per_cell: Q.
         nodes_per_cell: K.
@@ -134,7 +134,7 @@ class PointSet:
         nodes: (C, K).
         width: components of an operator: 3, or 1 where the energy is a function of a vector, see ``kernels.points``.
         gradients: (P, K) operators.
-        start: (N + 1) where a vertex's entries of ``incident`` begin.
+        start: (N + 1) first entry of each vertex in ``incident``.
         incident: cell K + local node of every cell that a vertex belongs to.
     """
 
@@ -167,9 +167,9 @@ class Energy(ABC):
     """One energy of a body.
 
     Attributes:
-        inputs: what acts through it, one value for each of `count`.
-        is_load: whether it is a load, which enters the forces that a step's residual is compared with.
-        implicit_only: whether it acts on the body at the end of a step whatever the simulator's coupling of loads.
+        inputs: loads and actuation over time, with `count` values.
+        is_load: whether its forces count as loads in the scale of a step's residual.
+        implicit_only: whether it acts at the end of a step for every coupling of the simulator's loads.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = ()
@@ -178,22 +178,22 @@ class Energy(ABC):
 
     @property
     def parameters(self) -> tuple[Quantity, ...]:
-        """Constants that it depends on."""
+        """Constants of the energy."""
         return ()
 
     @property
     def count(self) -> int:
-        """Parts (chambers, tendons) with an input or a parameter of their own."""
+        """Number of parts (chambers, tendons) with an input or a parameter value of their own."""
         return 1
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its parts."""
+        """Names of the parts."""
         return tuple(str(number + 1) for number in range(self.count))
 
     @property
     def constants(self) -> Mapping[str, Parameter]:
-        """The values of its parameters, where a simulation is given no others."""
+        """Default values of the parameters."""
         return {}
 
     @abstractmethod
@@ -205,17 +205,17 @@ class Energy(ABC):
         """Returns the energy's kernels for a batch."""
 
     def bind(self, placement: EnergySite) -> "BoundEnergy":
-        """Returns the energy on a simulator's device; an energy that depends on where a step starts has its own."""
+        """Returns the energy in a simulator; an energy that depends on the start of a step has a class of its own."""
         return BoundEnergy(self, placement)
 
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """What its terms need of the constants, computed once a roll-out.
+        """Returns the values for the energy's terms, computed once a roll-out from the constants.
 
         Args:
-            constants: (1 or B, 1 or n) tensors by name, those of other energies too.
+            constants: (1 or B, 1 or n) tensors of all energies, by name.
 
         Raises:
-            InputError: another number of values than its `count`.
+            InputError: a number of values other than `count`.
         """
         return {quantity.name: self.per_part(quantity, constants[quantity.name]) for quantity in self.parameters}
 
@@ -223,7 +223,7 @@ class Energy(ABC):
         """Returns (1 or B, `count`) values of a parameter, or an array (1 or B, *shape) as it is.
 
         Raises:
-            InputError: another number of them.
+            InputError: a number of values other than one or `count`.
         """
         if quantity.shape:
             return values
@@ -236,14 +236,14 @@ class Energy(ABC):
 
 
 class BoundEnergy:
-    """An energy over the steps of a simulator. This one has no memory, and acts by its parameters and inputs alone.
+    """An energy over the steps of a simulator; the base class is an energy without memory.
 
     Args:
-        energy: that it is of.
-        placement: in the simulator.
+        energy: the energy to bind.
+        placement: its points in the simulator.
 
     Attributes:
-        memory: what it carries from step to step.
+        memory: quantities carried from step to step.
     """
 
     memory: tuple[Memory, ...] = ()
@@ -252,11 +252,11 @@ class BoundEnergy:
         self.energy, self.placement = energy, placement
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
-        """Returns the values that follow from the parameters, computed once a roll-out; see `Energy.prepare`."""
+        """Returns the values that follow from the parameters, computed once a roll-out."""
         return dict(self.energy.prepare(parameters))
 
     def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass | None:
-        """Returns the mass that the energy's matter has, if it has any."""
+        """Returns the mass of the energy's matter, or None."""
         del parameters
         return None
 
@@ -266,18 +266,18 @@ class BoundEnergy:
         return {}
 
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns those values for an equilibrium, where nothing moves."""
+        """Returns the values of `begin_step` for an equilibrium, where nothing moves."""
         del batch
         return {}
 
     def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
-        """Returns a force (1 or B, N, 3) that does not depend on where the body is [N].
+        """Returns a force (1 or B, N, 3) that does not depend on the positions [N].
 
         Args:
             inputs: of the step.
             constants: of the roll-out.
             batch: environments B.
-            static: whether it is for an equilibrium, not for a step.
+            static: whether the force is for an equilibrium instead of a step.
         """
         del inputs, constants, batch, static
         return None
@@ -286,9 +286,9 @@ class BoundEnergy:
         """Returns the memory (B, ...) after a step, by name.
 
         Args:
-            step: that ends.
+            step: the step.
             x: (B, N, 3) solution of its implicit stage [m].
-            q: (B, N, 3) positions that it leads to [m].
+            q: (B, N, 3) positions at its end [m].
         """
         del step, x, q
         return {}
@@ -297,7 +297,7 @@ class BoundEnergy:
 class Term(ABC):
     """An energy's kernels on the points of a batch.
 
-    The step's values are tensors by name, each (B, *shape): buffers that recorded launches read.
+    The step's values are tensors (B, *shape) by name: buffers that recorded launches read.
 
     Args:
         launcher: of the potential.
@@ -316,20 +316,20 @@ class Term(ABC):
     @property
     @abstractmethod
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shape, without the batch, of every value that a step has for it."""
+        """Shapes of the step's values by name, without the batch."""
 
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        """Returns the sum (B,) of a solid's moduli times volumes [J], by which rounding of its energy is judged."""
+        """Returns the sum (B,) of a solid's moduli times volumes [J], the scale of its energy's rounding error."""
         del values
         return None
 
     def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
-        """Returns launches that the kernels of `step` and `tangent` need to have been made at the positions."""
+        """Returns launches that must run before the kernels of `step` and `tangent`."""
         del values, positions, active
         return []
 
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        """(B, 3 N, r) columns C of what the tangent leaves out: C C^T couples vertices of many cells."""
+        """Returns columns C (B, 3 N, r) of the tangent's low-rank part C C^T, which couples vertices of many cells."""
         del values, positions
         return None
 
@@ -343,13 +343,13 @@ class Term(ABC):
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:
-        """(1 or B, P) an upper bound of the tangent's eigenvalues for small strains, times the volume [J]."""
+        """Returns an upper bound (1 or B, P) of the tangent's eigenvalues for small strains, times the volume [J]."""
 
     @abstractmethod
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """What computes -z . d residual / d value, by name, at the positions x for z = direction, when it is called.
+        """Returns a function that computes -z . d residual / d value, by name, at the positions x for z = direction.
 
         Args:
             values: the buffers.
@@ -359,13 +359,13 @@ class Term(ABC):
 
 
 class PartTerm(Term):
-    """A term on `PartPoints`, of which one value is given for every part.
+    """A term on `PartPoints` with one value for every part.
 
     Args:
         launcher: of the potential.
         sets: one set of points.
         value: the name of the step's value, (B, count).
-        count: of the parts.
+        count: number of parts.
     """
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], value: str, count: int) -> None:
@@ -386,12 +386,12 @@ class PartTerm(Term):
         return {self.value: (self.count,)}
 
     def views(self, values: Values) -> list[Any]:
-        """The step's values, as kernels take them, in the order of `shapes`."""
-        found = [values[name] for name in self.shapes]
-        return [warp_view(each, wp.float64) for each in found if each is not None]
+        """Returns the step's values as Warp arrays, in the order of `shapes`."""
+        own = [values[name] for name in self.shapes]
+        return [warp_view(value, wp.float64) for value in own if value is not None]
 
     def sum_parts(self, values: torch.Tensor) -> torch.Tensor:
-        """(B, count) sums of (B, P) values over the points of each part, in a fixed order."""
+        """Returns sums (B, count) of values (B, P) over the points of each part, in a fixed order."""
         return values @ self._own
 
 
@@ -402,10 +402,10 @@ class ReadingTerm(Term):
         launcher: of the potential.
         sets: one set of points.
         kernels: ``local_step``, ``tangent`` and ``adjoint``, and the vector type ``values``.
-        shapes: of the values, in the order of the vector: (count,) or (count, n) for one, or n, a part; or (P,) of
-            values that are a point's own.
-        count: of the parts.
-        own: names of the values that are a point's own.
+        shapes: of the values, in the order of the vector: (count,) or (count, n) for values by part, (P,) for values by
+            point.
+        count: number of parts.
+        own: names of the values by point.
         arrays: names of arrays, of any shape, that every point reads as a whole.
         extra: arguments of the kernels after the values.
     """
@@ -436,7 +436,7 @@ class ReadingTerm(Term):
         self._sizes = launcher.upload(np.array(sizes, dtype=np.int32), int)
 
     def _places_of(self, name: str, part: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n, P) where in a row of its array the values of each point are."""
+        """Returns the columns (n, P) of every point's values in its array."""
         if name in self._arrays:
             return np.tile(np.arange(int(np.prod(self._shapes[name])))[:, None], len(part))
         columns = int(np.prod(self._shapes[name][1:]))
@@ -474,15 +474,15 @@ class ReadingTerm(Term):
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(command)
-            found, first = {}, 0
+            slopes, first = {}, 0
             for name, shape in self._shapes.items():
                 slope = out[..., first : first + len(self._places[name])]
                 if name in self._arrays:
                     slope = slope.sum(1)
                 elif name not in self._point_values:
                     slope = torch.einsum("bpn,pc->bcn", slope, self._own)
-                found[name] = slope.reshape(own.batch, *shape).clone()
+                slopes[name] = slope.reshape(own.batch, *shape).clone()
                 first += len(self._places[name])
-            return found
+            return slopes
 
         return differentiate

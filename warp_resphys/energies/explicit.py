@@ -1,7 +1,7 @@
-"""An energy by itself in a given state: its value and its force, which may be held while the body moves on.
+"""Value and force of one energy in a given state, for explicit coupling: the force is held during a step.
 
-An energy's implicit coupling is part of the incremental potential; this is the explicit one, and a gauge: the
-derivative of an energy by an input is what that input works on, as the volume of a chamber is for its pressure.
+The implicit coupling of an energy is part of the incremental potential. The derivative of an energy by an input is the
+input's conjugate quantity, such as the volume of a chamber for its pressure.
 """
 
 from typing import Any
@@ -35,17 +35,17 @@ class HeldEnergy(Launcher):
         self.term = term
 
     def force(self, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) force [N] at positions (B, N, 3) [m] for (B, count) values."""
+        """Returns the force (B, N, 3) [N] at positions (B, N, 3) [m] for values (B, count)."""
         force: torch.Tensor = _Force.apply(self, positions, values)
         return force
 
     def conjugates(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, count) less the derivatives of the energy by the values: volumes [m^3] of chambers under pressure."""
-        found: torch.Tensor = _Conjugates.apply(self, positions)
-        return found
+        """Returns minus the derivatives (B, count) of the energy by the values: volumes [m^3] for pressures."""
+        conjugates: torch.Tensor = _Conjugates.apply(self, positions)
+        return conjugates
 
     def evaluate(self, positions: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Energy of each part (B, count) [J] and force (B, N, 3) [N], without gradients."""
+        """Returns the energy of every part (B, count) [J] and the force (B, N, 3) [N], without gradients."""
         positions, values = positions.double(), values.double()
         s = self._set
         stress, energy = self.zeros(s.n_points, 3, s.width), self.zeros(s.n_points)
@@ -64,7 +64,7 @@ class HeldEnergy(Launcher):
         s, held = self._set, {self.term.value: values.contiguous()}
         view = s.stress_view(self.zeros(s.n_points, 3, s.width))
         tangent = warp_view(self.zeros(s.n_points, s.blocks, 3, 3), wp.mat33d)
-        masks = [warp_view(each, wp.int32) for each in (self.active, torch.zeros_like(self.active))]
+        masks = [warp_view(flags, wp.int32) for flags in (self.active, torch.zeros_like(self.active))]
         kernel, inputs = self.term.tangent(s, held, self._view(positions))
         out = torch.zeros_like(positions)
         self.launch(
@@ -81,7 +81,7 @@ class HeldEnergy(Launcher):
 
 
 class _Conjugates(torch.autograd.Function):
-    """-dE/dp of an energy that is linear in p: a loss with derivatives w by it has the force of p = w as gradient."""
+    """-dE/dp of an energy that is linear in p: for a loss with gradient w, the gradient by x is the force at p = w."""
 
     @override
     @staticmethod

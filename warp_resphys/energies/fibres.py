@@ -30,7 +30,7 @@ _LARGEST_ANGLE = 85.0  # degrees
 
 @dataclass(frozen=True)
 class Fibres(Energy):
-    """Inextensible thread wound around every chamber, in its surface: it holds a chamber from growing wide.
+    """Inextensible thread wound around every chamber, in its surface, which keeps the chamber from widening.
 
     The energy of an area of the surface is ``k s(lambda - 1)`` for each family of windings, lambda being the stretch
     along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s(x) is
@@ -39,13 +39,13 @@ class Fibres(Energy):
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)
 
-    chambers: Sequence[Chamber]  # that it is wound around
-    # (A,) of each family of windings from the direction around the chamber, in degrees; two opposite ones make a
-    # double helix
+    chambers: Sequence[Chamber]  # wound with thread
+    # (A,) angle of each family of windings to the direction around the chamber [degrees]; two opposite angles make
+    # a double helix
     angles: Sequence[float] = (0.0,)
     toe: float = 1e-3  # strain over which a thread tightens
-    # about along the chambers, which are wound around the one of their principal directions that is nearest to
-    # it; None for that in which each reaches furthest
+    # approximate direction of the chambers, which are wound around their principal direction nearest to it; None for
+    # the principal direction of their largest extent
     axis: Sequence[float] | None = None
     # k [N/m], the parameter ``fibre_stiffness``: a number, (C,) values with one for each chamber, (B, 1), or (B,
     # C)
@@ -82,7 +82,7 @@ class Fibres(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """The points at which the energy is integrated; the ends of chambers have none.
+        """Returns the quadrature points of the energy; the ends of chambers have none.
 
         Raises:
             MeshError: a chamber that has no direction near that of the fibres.
@@ -111,8 +111,8 @@ class Fibres(Energy):
                 areas.append(np.where(wound, area * weights, 0.0))
         families = len(self.angles)
         nodes = np.concatenate([np.tile(chamber.faces, (families, 1)) for chamber in self.chambers])
-        each = [families * len(c.faces) * len(weights) for c in self.chambers]
-        numbers = np.repeat(np.arange(len(self.chambers)), each)
+        counts = [families * len(c.faces) * len(weights) for c in self.chambers]
+        numbers = np.repeat(np.arange(len(self.chambers)), counts)
         return (PartPoints(nodes, np.concatenate(operators)[..., None], numbers, np.concatenate(areas).ravel()),)
 
     @override
@@ -132,7 +132,7 @@ class FibreTerm(ReadingTerm):
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:
-    """(3,) the principal direction of a chamber that is nearest to one, or in which it reaches furthest."""
+    """Returns the principal direction (3,) of a chamber nearest to a given one, or of its largest extent."""
     vertices = mesh.vertices[chamber.vertices]
     directions: NDArray[np.float64] = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     if near is None:

@@ -30,7 +30,7 @@ from ..stepping.quantity import Parameter, Quantity
 
 
 def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: Any) -> Any:
-    """A field of a material: its default, and the quantity that it is; `density`, say, is a common keyword."""
+    """Returns a dataclass field for a constant of a material; common constants, such as `density`, are keywords."""
     common = more.pop("common", False)
     quantity = Quantity(name, unit, lower, **{"per": "element", **more})
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
@@ -61,13 +61,13 @@ class Material(ABC):
     mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
     # Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
-    # generalised Maxwell (Prony) branches, each of the ratio of its shear modulus to mu, which is what is left after a
-    # long time, and its relaxation time [s]; see `energies.viscosity`
+    # generalised Maxwell (Prony) branches (ratio, time): shear modulus over the long-term mu, and relaxation time
+    # [s]; see `energies.viscosity`
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Checks every constant; raises InputError for a constant outside its physical range."""
-        if not all(isinstance(each, Sequence) and len(each) == 2 for each in self.prony):
+        if not all(isinstance(branch, Sequence) and len(branch) == 2 for branch in self.prony):
             raise InputError(f"prony is {self.prony!r}: give a (ratio, time) for each branch, - and s.")
         constants = self.constants
         for name, quantity in self.quantities.items():
@@ -75,16 +75,16 @@ class Material(ABC):
 
     @classmethod
     def own_quantities(cls) -> dict[str, Quantity]:
-        """Its constants by name, those of the law first, without those of any branches."""
-        found = {each.name: each.metadata["quantity"] for each in fields(cls) if each.metadata}
-        common = [each.name for each in fields(cls) if each.kw_only]
-        return {name: found[name] for name in sorted(found, key=common.__contains__)}
+        """Returns the material's constants by name, those of the law first, without Prony branches."""
+        quantities = {field.name: field.metadata["quantity"] for field in fields(cls) if field.metadata}
+        common = [field.name for field in fields(cls) if field.kw_only]
+        return {name: quantities[name] for name in sorted(quantities, key=common.__contains__)}
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Its constants by name: those of the law first, and ``prony_ratio_1``, ``prony_time_1``, ... last."""
+        """The material's constants by name: those of the law first, ``prony_ratio_1``, ``prony_time_1``, ... last."""
         branches = [replace(q, name=name) for name, q in self._branches]
-        return {**self.own_quantities(), **{each.name: each for each in branches}}
+        return {**self.own_quantities(), **{quantity.name: quantity for quantity in branches}}
 
     @property
     def _branches(self) -> list[tuple[str, Quantity]]:
@@ -93,14 +93,14 @@ class Material(ABC):
 
     @property
     def constants(self) -> dict[str, Parameter]:
-        """Their values."""
+        """Values of the constants, by name."""
         branches = zip(self._branches, chain.from_iterable(self.prony), strict=True)
         own = {name: getattr(self, name) for name in self.own_quantities()}
         return {**own, **{name: value for (name, _), value in branches}}
 
     @abstractmethod
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """The law's moduli [Pa], each (1 or B, 1 or M), of constants of that shape."""
+        """Returns the law's moduli [Pa], of shape (1 or B, 1 or M), from constants of that shape."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class _Hookean(Material):
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """The Lame constants mu and lambda."""
+        """Returns the Lame constants mu and lambda."""
         e, nu = constants["youngs_modulus"], constants["poissons_ratio"]
         return e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
@@ -151,7 +151,7 @@ class MooneyRivlin(Material):
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """c10, c01 and lambda = K - 2/3 mu."""
+        """Returns c10, c01 and lambda = K - 2/3 mu."""
         c10, c01 = constants["c10"], constants["c01"]
         return c10, c01, constants["bulk_modulus"] - 4.0 / 3.0 * (c10 + c01)
 
@@ -160,12 +160,12 @@ class MooneyRivlin(Material):
 class DensityMaterial(Material):
     """A material whose energy is a Warp function of F and of the material's own constants, in their order [J/m^3].
 
-    The function may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking: what
-    makes a material nearly incompressible belongs there.
+    The function may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking:
+    terms that make a material nearly incompressible belong there.
 
     Attributes:
         energy_density: W(F: mat33d, p: a vector of float64).
-        volume_energy: U, of the same kind; None for none.
+        volume_energy: U, with the same arguments; None for none.
     """
 
     energy_density: ClassVar[Any]
@@ -186,7 +186,7 @@ class DensityMaterial(Material):
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns one for both volumes, the Lame constants, and the constants of the functions."""
-        own = [constants[each.name] for each in fields(self) if each.metadata and not each.kw_only]
+        own = [constants[field.name] for field in fields(self) if field.metadata and not field.kw_only]
         volume = torch.ones_like(own[0])
         under_integrated = volume if self.volume_energy else torch.zeros_like(volume)
         return volume, under_integrated, *self.lame(constants), *own
@@ -194,10 +194,10 @@ class DensityMaterial(Material):
 
 @dataclass(frozen=True)
 class Gent(DensityMaterial):
-    """Rubber that stiffens without bound as its chains come to their full length (Gent 1996).
+    """Rubber that stiffens without bound as its chains reach their full length (Gent 1996).
 
-    With a large limit J_m it is `StableNeoHookean`. Past 95 % of the limit the energy goes on as its own parabola, so
-    that a search may pass through what a real specimen would not survive.
+    With a large limit J_m it is `StableNeoHookean`. Past 95 % of the limit the energy continues as a parabola, so
+    that a line search may pass through strains that a real specimen would not survive.
     """
 
     energy_density: ClassVar[Any] = gent.energy_density
@@ -223,14 +223,14 @@ MATERIALS: dict[str, type[Material]] = {
 
 
 def make_material(model: str = "corotated", **constants: Any) -> Material:
-    """The named material.
+    """Returns the named material.
 
     Raises:
         InputError: an unknown name, a constant that the material does not have, or one out of range.
     """
     if model not in MATERIALS:
         raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    known = MATERIALS[model].own_quantities()
+    quantities = MATERIALS[model].own_quantities()
     branches = {name: value for name, value in constants.items() if re.fullmatch(r"prony_(ratio|time)_[1-9]\d*", name)}
     count = len(branches) // 2
     names = [(f"{PRONY_RATIO.name}_{k}", f"{PRONY_TIME.name}_{k}") for k in range(1, 1 + count)]
@@ -240,8 +240,8 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
             "its prony_time_."
         )
     for name in constants:
-        if name not in known and name not in branches:
-            some = ", ".join((*known, "prony_ratio_1, prony_time_1, ..."))
+        if name not in quantities and name not in branches:
+            some = ", ".join((*quantities, "prony_ratio_1, prony_time_1, ..."))
             raise InputError(f"{model} has no constant {name!r}: it has {some}")
-    own = {name: value for name, value in constants.items() if name in known}
+    own = {name: value for name, value in constants.items() if name in quantities}
     return MATERIALS[model](**own, prony=[(branches[ratio], branches[time]) for ratio, time in names])

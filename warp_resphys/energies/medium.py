@@ -166,7 +166,7 @@ class MediumTerm(Term):
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         *places, coefficients = (values[name] for name in self.shapes)
-        views = [warp_view(each, wp.vec3d) for each in places if each is not None]
+        views = [warp_view(place, wp.vec3d) for place in places if place is not None]
         assert coefficients is not None
         return [s.nodes, s.gradients, *views, warp_view(coefficients, wp.vec4d), s.points_per_cell, positions]
 
@@ -200,12 +200,12 @@ class MediumTerm(Term):
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
                 given = {name: values[name] for name in self.shapes}
-                leaves = {name: each.detach().requires_grad_() for name, each in given.items() if each is not None}
+                leaves = {name: value.detach().requires_grad_() for name, value in given.items() if value is not None}
                 x = at_points(positions).requires_grad_()
                 (slope,) = torch.autograd.grad(_energy(x, *leaves.values()), x, create_graph=True)
                 loss = -(slope * at_points(direction)).sum()
-                found = torch.autograd.grad(loss, list(leaves.values()))
-            return dict(zip(leaves, found, strict=True))
+                gradients = torch.autograd.grad(loss, list(leaves.values()))
+            return dict(zip(leaves, gradients, strict=True))
 
         return differentiate
 

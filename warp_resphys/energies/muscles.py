@@ -111,7 +111,7 @@ class Muscles(Energy):
     @property
     @override
     def names(self) -> tuple[str, ...]:
-        return tuple(each.name or f"muscle_{number}" for number, each in enumerate(self.muscles, 1))
+        return tuple(muscle.name or f"muscle_{number}" for number, muscle in enumerate(self.muscles, 1))
 
     @property
     @override
@@ -145,15 +145,15 @@ class Muscles(Energy):
 
     def lines(self, mesh: Mesh) -> dict[str, NDArray[np.float64]]:
         """(2, 3) a line through the middle of each muscle, as far as its cells reach along it [m], by name."""
-        found = {}
+        lines = {}
         for name, muscle in zip(self.names, self.muscles, strict=True):
             corners = mesh.vertices[np.unique(mesh.cells[np.asarray(muscle.cells)])]
             along = np.atleast_2d(np.asarray(muscle.direction, dtype=np.float64)).mean(axis=0)
             size, middle = np.linalg.norm(along), corners.mean(axis=0)
             unit = along / size if size > 0.0 else along  # Directions that cancel have no line.
             reach = (corners - middle) @ unit
-            found[name] = middle + np.outer([reach.min(), reach.max()], unit)
-        return found
+            lines[name] = middle + np.outer([reach.min(), reach.max()], unit)
+        return lines
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MuscleTerm":

@@ -1,4 +1,4 @@
-"""An energy in a simulator: its points there, and what its names begin with."""
+"""An energy in a simulator: its points, and the prefix of its names."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,11 +21,11 @@ class Placed:
     """An energy, its points in the simulator, and the prefix of its names there, such as ``tip_``."""
 
     energy: Energy
-    points: tuple[Points, ...]  # whose operators act on control vertices, see `fem.coordinates`
+    points: tuple[Points, ...]  # with operators on control vertices, see `fem.coordinates`
     prefix: str = ""
-    # the same with operators on all vertices, where the two differ
+    # points with operators on all vertices, if different
     all_points: tuple[Points, ...] | None = None
-    body: Body | None = None  # that the energy belongs to
+    body: Body | None = None  # body of the energy
     first: int = 0  # number of that body's first vertex in the simulator
 
     @classmethod
@@ -38,7 +38,7 @@ class Placed:
             whole: the simulator's body or scene.
             body: the body.
             first: number of its first vertex in the simulator.
-            energy: to be placed.
+            energy: the energy to place.
             points: of the energy, by the body's own vertices.
             prefix: of the energy's names.
         """
@@ -55,7 +55,7 @@ class Placed:
         return {f"{self.prefix}{name}": value for name, value in values.items()}
 
     def own(self, values: Mapping[str, T]) -> Mapping[str, T]:
-        """Returns values by name in the simulator under the energy's names; those of others have no such name."""
+        """Returns the energy's values under its own names, from values by name in the simulator."""
         if not self.prefix:
             return values
         return {name.removeprefix(self.prefix): x for name, x in values.items() if name.startswith(self.prefix)}
@@ -74,5 +74,5 @@ class Placed:
         return EnergyStep(seen, stage, self.own_inputs(inputs), self.own_constants(constants), term)
 
     def own_values(self, values: Mapping[str, torch.Tensor | None], term: Term) -> dict[str, torch.Tensor | None]:
-        """Returns the values that the energy's term has, under the energy's names."""
+        """Returns the values of the energy's term, under the energy's names."""
         return {name: values[f"{self.prefix}{name}"] for name in term.shapes}

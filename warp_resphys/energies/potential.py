@@ -4,9 +4,8 @@ One time step of every integrator, and a static equilibrium too, is the minimum 
 
     sum_i k_i / 2 |x_i - y_i|^2 - f . x + sum_e E_e(x)
 
-with k the inertia over the square of the effective time step, y where inertia alone would go, f the loads, and E_e the
-energies: the solid's, elastic and dissipative, and those of the body's other energies, such as -p V of chambers under
-pressure.
+with k the mass over the square of the effective time step, y the positions to which inertia alone would lead, f the
+loads, and E_e the energies: elastic and dissipative energy of the solids, and others such as -p V of chambers.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,13 +24,13 @@ from .placed import Placed
 
 @dataclass(frozen=True)
 class StepTerms:
-    """What distinguishes one step's potential from the next; see the equation of `potential`."""
+    """Terms of a step's potential, as in the equation of the module."""
 
     target: torch.Tensor  # (B, N, 3) y [m]
     inertia: torch.Tensor  # (B, N) k [N/m]
     force: torch.Tensor  # (B, N, 3) f [N]
-    # what the energies' terms need, by name; see their `Term.shapes`. The first axis is 1 or B. None leaves out
-    # what another value makes needless
+    # values of the energies' terms by name, (1 or B, *shape) as of `Term.shapes`; None where another value makes one
+    # unnecessary
     values: dict[str, torch.Tensor | None] = field(default_factory=dict)
 
 
@@ -48,22 +47,22 @@ class IncrementalPotential(Launcher):
         device: of every buffer.
 
     Attributes:
-        energies: their terms.
-        own_values: the buffers of the current values of each of them, by the energy's own names.
-        stiffness: (B,) sum of the solids' moduli times volumes [J], by which rounding of the energy is judged.
-        sets: the sets of points of all of them.
+        energies: terms of the energies.
+        own_values: buffers of the values of every term, by the energy's own names.
+        stiffness: (B,) sum of the solids' moduli times volumes [J], the scale of the energy's rounding error.
+        sets: point sets of all terms.
         free_mask: (N,) one at free vertices, zero at fixed ones.
-        evaluation: launches that set ``residual``, and the sums of it and of the energy, at ``positions``:
+        evaluation: launches that set ``residual`` and the following sums at ``positions``.
         energy: (B,) of the last evaluation [J].
-        energy_size: (B,) sum of the absolute values of what it is the sum of [J].
-        balance: (B,) norm of inertia less all loads there [N].
-        residual_norm: (B,) norm of the residual there [N].
-        low_rank: (B, 3 N, r) columns C of the last `update_tangent`: what the Hessian has beside `tangent` is C C^T.
-            None for nothing.
+        energy_size: (B,) sum of the absolute values of the energy's terms [J].
+        balance: (B,) norm of inertia less all loads [N].
+        residual_norm: (B,) norm of the residual [N].
+        low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian is `tangents` plus C C^T. None for
+            none.
         tangent_active: (B,) zero for environments whose tangent stays as it is.
         clamp: (B,) not zero for environments whose tangent has its eigenvalues clamped at zero.
         all_active: whether the last `update_tangent` was for all environments.
-        tangent_launches: launches that set `tangents`; made with them.
+        tangent_launches: launches that set `tangents`.
     """
 
     tangent_launches: Launches
@@ -83,9 +82,9 @@ class IncrementalPotential(Launcher):
         self._loads: list[bool] = []
         first = 0
         self._placed = tuple(energies)
-        for each in energies:
-            energy, start, mine = each.energy, first, list[PointSet]()
-            for points in each.points:
+        for placed in energies:
+            energy, start, mine = placed.energy, first, list[PointSet]()
+            for points in placed.points:
                 part = slice(first, first + points.n_points)
                 own = slice(part.start - start, part.stop - start)
                 mine.append(PointSet(self, points, n_vertices, part, own))
@@ -97,9 +96,9 @@ class IncrementalPotential(Launcher):
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
         self.free_mask[fixed] = 0.0
         pairs = list(zip(energies, self.energies, strict=True))
-        shapes = {name: shape for each, term in pairs for name, shape in each.named(term.shapes).items()}
+        shapes = {name: shape for placed, term in pairs for name, shape in placed.named(term.shapes).items()}
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
-        self.own_values = [each.own_values(values, term) for each, term in pairs]
+        self.own_values = [placed.own_values(values, term) for placed, term in pairs]
         self.terms = StepTerms(self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3), values)
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
@@ -148,8 +147,8 @@ class IncrementalPotential(Launcher):
         self._load_commands.append(
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
         )
-        energies = [warp_view(each, wp.float64) for each in (self._vertex_energy, self._point_energy)]
-        sums = [warp_view(each, wp.float64) for each in (self.energy, self.energy_size, self.residual_norm)]
+        energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
+        sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
         self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)
@@ -180,7 +179,7 @@ class IncrementalPotential(Launcher):
         return self.terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Energy (B,) [J] and norm of inertia less all loads (B,) [N] at ``positions``; sets ``residual`` [N].
+        """Returns energy (B,) [J] and norm of inertia less loads (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
@@ -200,8 +199,8 @@ class IncrementalPotential(Launcher):
         self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
         pairs = zip(self.energies, self.own_values, strict=True)
-        found = [term.low_rank(values, self._position_view) for term, values in pairs]
-        columns = [each for each in found if each is not None]
+        blocks = [term.low_rank(values, self._position_view) for term, values in pairs]
+        columns = [block for block in blocks if block is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
 
     @property
@@ -211,11 +210,11 @@ class IncrementalPotential(Launcher):
 
     @property
     def tangents(self) -> list[torch.Tensor]:
-        """For each of `sets`, (B, P, blocks, 3, 3) of dP/dF [J] from the last `update_tangent`; see ``kernels``."""
+        """Tangents dP/dF (B, P, blocks, 3, 3) of `sets` [J] from the last `update_tangent`; see ``kernels``."""
         return self._prepare_tangents()
 
     def _prepare_tangents(self) -> list[torch.Tensor]:
-        """Buffers and launches of second derivatives, made at their first use."""
+        """Makes buffers and launches of second derivatives at their first use, and returns the buffers."""
         if not self._tangents:
             self._tangents = [self.zeros(s.n_points, s.blocks, 3, 3) for s in self.sets]
             self._record_tangents(iter(self._tangents))
@@ -240,7 +239,7 @@ class IncrementalPotential(Launcher):
         self.tangent_launches, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) product of the internal forces' stiffness with a displacement, all vertices included [N].
+        """Returns the product (B, N, 3) of the stiffness with a displacement, fixed vertices included [N].
 
         Uses the last `update_tangent`.
         """
@@ -254,7 +253,7 @@ class IncrementalPotential(Launcher):
         return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:
-        """-z . d residual / d value at ``positions`` for every value of the last `set_terms`, by name, (B, *shape).
+        """Returns -z . d residual / d value (B, *shape) at ``positions`` for the values of `set_terms`, by name.
 
         Args:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
@@ -262,12 +261,12 @@ class IncrementalPotential(Launcher):
         self.prepare_adjoint()
         self._direction.copy_(adjoint)
         slopes: dict[str, torch.Tensor] = {}
-        for each, differentiate in zip(self._placed, self._adjoints, strict=True):
-            slopes |= each.named(differentiate())
+        for placed, differentiate in zip(self._placed, self._adjoints, strict=True):
+            slopes |= placed.named(differentiate())
         return slopes
 
     def prepare_adjoint(self) -> None:
-        """Buffers and launches of `value_adjoint`, made at their first use."""
+        """Makes buffers and launches of `value_adjoint` at their first use."""
         if not self._adjoints:
             pairs = zip(self.energies, self.own_values, strict=True)
             self._adjoints = [t.adjoint(values, self.positions, self._direction) for t, values in pairs]

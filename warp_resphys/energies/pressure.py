@@ -100,7 +100,7 @@ class PressureTerm(PartTerm):
         del values
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points)
-        views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
+        views = [warp_view(vectors, wp.vec3d) for vectors in (positions, direction)]
         inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, *views]
         command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
 

@@ -153,7 +153,7 @@ class BoundSolid(BoundEnergy):
         like, sets = placement.rest_positions, solid.discretisation.point_sets
         shares = [_shares(s) for s in sets]
         self._shares = {
-            rule: device_matrix(scipy.sparse.vstack([each[rule] for each in shares]), like.device, like.dtype)
+            rule: device_matrix(scipy.sparse.vstack([share[rule] for share in shares]), like.device, like.dtype)
             for rule in set(solid.material.rules)
         }
         cells = slice(None) if solid.cells is None else solid.cells
@@ -295,7 +295,7 @@ class SolidTerm(Term):
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(*commands)
-            return {name: each.sum(1) if name == "viscosity" else each.clone() for name, each in out.items()}
+            return {name: values.sum(1) if name == "viscosity" else values.clone() for name, values in out.items()}
 
         return differentiate
 

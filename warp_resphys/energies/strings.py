@@ -97,10 +97,12 @@ class Strings(Energy):
             if not (np.min(vertices) >= 0 and np.max(vertices) < count):
                 raise InputError(f"string {number} is tied to a vertex that is not among the {count} of the mesh.")
         # What pads a list repeats its first vertex with a zero share, which contributes nothing.
-        nodes = np.array([np.pad(each, (0, most - len(each)), constant_values=each[0]) for each in self.tied_to])
+        nodes = np.array(
+            [np.pad(vertices, (0, most - len(vertices)), constant_values=vertices[0]) for vertices in self.tied_to]
+        )
         operator = np.zeros((self.count, 1, most, 1))
-        for row, each in zip(operator, self.tied_to, strict=True):
-            row[0, : len(each)] = 1.0 / len(each)
+        for row, vertices in zip(operator, self.tied_to, strict=True):
+            row[0, : len(vertices)] = 1.0 / len(vertices)
         return (PartPoints(nodes, operator, np.arange(self.count), np.ones(self.count)),)
 
     @override

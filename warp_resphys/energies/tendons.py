@@ -103,11 +103,11 @@ class Tendons(Energy):
             return
         if len(self.directions) != self.count:
             raise InputError(f"{len(self.directions)} tendons have directions of offsets, but there are {self.count}.")
-        counts = [len(each) for each in self.directions]
+        counts = [len(directions) for directions in self.directions]
         if set(counts) not in ({1}, {2}):
             raise InputError(f"the tendons have {counts} directions of offsets: give each one, or each two.")
-        for number, (route, each) in enumerate(zip(self.guides, self.directions, strict=True), 1):
-            for given in each:
+        for number, (route, own_directions) in enumerate(zip(self.guides, self.directions, strict=True), 1):
+            for given in own_directions:
                 try:
                     direction = np.asarray(given, dtype=np.float64)
                 except (TypeError, ValueError):
@@ -128,8 +128,8 @@ class Tendons(Energy):
         """
         along = np.asarray(offsets, dtype=np.float64)
         routes = [
-            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, each, strict=True))
-            for route, own, each in zip(self.guides, along, self.directions, strict=True)
+            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, own_directions, strict=True))
+            for route, own, own_directions in zip(self.guides, along, self.directions, strict=True)
         ]
         return replace(self, routes=routes, directions=())
 
@@ -161,14 +161,14 @@ class Tendons(Energy):
     @property
     @override
     def constants(self) -> Mapping[str, Parameter]:
-        return {"tendon_stiffness": self.stiffness} | {each.name: 0.0 for each in OFFSETS[: self.offset_count]}
+        return {"tendon_stiffness": self.stiffness} | {offset.name: 0.0 for offset in OFFSETS[: self.offset_count]}
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """See `Energy.prepare`; offsets without a direction are zero."""
-        found = super().prepare(constants)
-        zero = torch.zeros_like(found["tendon_stiffness"])
-        return found | {each.name: zero for each in OFFSETS[self.offset_count :]}
+        values = super().prepare(constants)
+        zero = torch.zeros_like(values["tendon_stiffness"])
+        return values | {offset.name: zero for offset in OFFSETS[self.offset_count :]}
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
@@ -179,33 +179,35 @@ class Tendons(Energy):
         """
         nodes, operators, tendon, rest = [], [], [], []
         for number, route in enumerate(self.guides):
-            found = locate(mesh, route)
-            worst = int(np.argmax(found.outside))
-            if found.outside[worst] > self.reach:
+            places = locate(mesh, route)
+            worst = int(np.argmax(places.outside))
+            if places.outside[worst] > self.reach:
                 raise InputError(
                     f"guide {worst + 1} of tendon {number + 1}, at {route[worst].tolist()} m, lies "
-                    f"{1e3 * found.outside[worst]:.3g} mm outside of the body: move it, or raise the reach of "
+                    f"{1e3 * places.outside[worst]:.3g} mm outside of the body: move it, or raise the reach of "
                     f"{1e3 * self.reach:g} mm."
                 )
-            weights = np.zeros((*found.weights.shape, 3))  # (G, K, 3): place, and its derivatives by the offsets
+            weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): place, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))
-            weights[..., 0], shape[..., 0] = found.weights, route
+            weights[..., 0], shape[..., 0] = places.weights, route
             for k in range(self.offset_count):
                 step = kernels.OFFSET_UNIT * np.broadcast_to(self.directions[number][k], route.shape)
-                weights[..., 1 + k] = np.einsum("gki,gi->gk", found.gradients, step)
+                weights[..., 1 + k] = np.einsum("gki,gi->gk", places.gradients, step)
                 shape[..., 1 + k] = step
             for first in range(len(route) - 1):
-                piece = _difference(mesh, found.cells[first : first + 2], weights[first : first + 2])
+                piece = _difference(mesh, places.cells[first : first + 2], weights[first : first + 2])
                 nodes.append(piece[0])
                 operators.append(piece[1])
             tendon += [number] * (len(route) - 1)
             rest.append(np.diff(shape, axis=0))
         most = max(map(len, nodes))
         # What pads a list repeats its first vertex with a zero weight, which contributes nothing.
-        padded = np.array([np.pad(each, (0, most - len(each)), constant_values=each[0]) for each in nodes])
+        padded = np.array(
+            [np.pad(vertices, (0, most - len(vertices)), constant_values=vertices[0]) for vertices in nodes]
+        )
         operator = np.zeros((len(nodes), 1, most, 3))
-        for row, each in enumerate(operators):
-            operator[row, 0, : len(each)] = each
+        for row, weights in enumerate(operators):
+            operator[row, 0, : len(weights)] = weights
         return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), np.concatenate(rest)),)
 
     @override
@@ -257,7 +259,7 @@ class TendonTerm(PartTerm):
     @property
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(each.name for each in OFFSETS))
+        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(offset.name for offset in OFFSETS))
         return dict.fromkeys(names, (self.count,))
 
     @property
@@ -310,7 +312,7 @@ class TendonTerm(PartTerm):
         assert tension is not None
         assert stiffness is not None
         # |F c|^2 is at most |c|^2 |F|^2, and the square of a sum of n lengths at most n times the sum of their squares.
-        columns = 1.0 + sum((values[each.name] / kernels.OFFSET_UNIT).square() for each in OFFSETS)
+        columns = 1.0 + sum((values[offset.name] / kernels.OFFSET_UNIT).square() for offset in OFFSETS)
         stretching = (tension * columns)[:, self.part_of] / self._piece_length
         return stretching + (stiffness * columns * self._own.sum(0))[:, self.part_of]
 
@@ -320,7 +322,7 @@ class TendonTerm(PartTerm):
     ) -> Callable[[], dict[str, torch.Tensor]]:
         """See `Term.adjoint`."""
         own, (s,) = self.launcher, self.sets
-        views = [warp_view(each, wp.vec3d) for each in (positions, direction)]
+        views = [warp_view(vectors, wp.vec3d) for vectors in (positions, direction)]
         shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
         inputs = [s.nodes, s.gradients, self.part, self._rest, *self._found, *views]
         outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]

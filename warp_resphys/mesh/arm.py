@@ -72,7 +72,11 @@ def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
         "tip": np.all(heights[faces] < heights.min() + tolerance, axis=1),
     }
     chambers = {chamber.name: chamber.faces for chamber in find_chambers(mesh)}
-    inner = np.concatenate([np.unique(each) for each in chambers.values()]) if chambers else np.empty(0, dtype=np.int64)
+    inner = (
+        np.concatenate([np.unique(vertices) for vertices in chambers.values()])
+        if chambers
+        else np.empty(0, dtype=np.int64)
+    )
     outside = ~(surfaces["base"] | surfaces["tip"] | np.isin(faces[:, 0], inner))
     return {**{name: faces[chosen] for name, chosen in surfaces.items()}, "outside": faces[outside], **chambers}
 
@@ -93,7 +97,7 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
         )
     grids, chamber = section_grids(middle, divisions)
     place, quads = section_quadrilaterals(grids)
-    solid = np.concatenate([each for each, number in zip(quads, chamber, strict=True) if number == SOLID])
+    solid = np.concatenate([quad for quad, number in zip(quads, chamber, strict=True) if number == SOLID])
     full = np.concatenate(quads)
     turn = np.exp(1j * pi / 180.0 * (geometry.rotations[0] if geometry.rotations else 0.0))
     heights = np.concatenate(

@@ -54,9 +54,9 @@ class ArmGeometry:
                 raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {number}.")
         for name in ("wall", "web", "core"):
             numbers(name, (getattr(self, name),) if getattr(self, name) is not None else ())
-        for name, known in (("profile", _PROFILES), ("outline", _OUTLINES)):
-            if getattr(self, name) not in known:
-                raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(known)}.")
+        for name, choices in (("profile", _PROFILES), ("outline", _OUTLINES)):
+            if getattr(self, name) not in choices:
+                raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(choices)}.")
         if type(self.chambers) is not int or not 2 <= self.chambers <= _MOST_CHAMBERS:
             raise MeshError(
                 f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {_MOST_CHAMBERS}."

@@ -254,7 +254,7 @@ class Section:
                 strips.append(sorted({*sides, *(edge for strip in joined for edge in strip)}))
         numbers = {}
         for strip in strips:
-            pieces = [self.piece(*edge) for edge in [each for each in strip if each in solid] or strip]
+            pieces = [self.piece(*edge) for edge in [edge for edge in strip if edge in solid] or strip]
             least = ceil(max(abs(piece.turn) for piece in pieces) / _LARGEST_TURN)
             length = float(np.mean([abs(piece.end - piece.start) for piece in pieces]))
             numbers.update(dict.fromkeys(strip, max(1, least, round(length / size))))
@@ -294,7 +294,7 @@ class Section:
             area += piece.area
             start.append(piece.points(t))
             move.append(piece.moves(t, self.motion(first), self.motion(last)))
-        p, w = (np.concatenate([each[0][:1], *(part[1:] for part in each)]) for each in (start, move))
+        p, w = (np.concatenate([parts[0][:1], *(part[1:] for part in parts)]) for parts in (start, move))
         a0, a2 = _fan(p, p), _fan(w, w)
         a1 = _fan(p, w) + _fan(w, p)
         lack = area - a0
@@ -316,7 +316,9 @@ class Section:
     def line(self, first: Corner, last: Corner, t: NDArray[np.float64], growth: Growth) -> ComplexArray:
         """Points at fractions (T,) of the line between two neighbouring corners, moved with their curves."""
         start, end = (self._placed(self.points[corner[0]], corner) for corner in (first, last))
-        by_start, by_end = (self._placed(growth.of(each[0]) * self.motion(each[0]), each) for each in (first, last))
+        by_start, by_end = (
+            self._placed(growth.of(corner[0]) * self.motion(corner[0]), corner) for corner in (first, last)
+        )
         centre = self.piece(first[0], last[0]).centre
         piece = Piece(start, end, None if centre is None else self._placed(centre, first))
         return piece.points(t) + piece.moves(t, by_start, by_end, growth.of(first[0]))

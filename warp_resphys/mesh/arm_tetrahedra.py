@@ -35,12 +35,14 @@ def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
     body, chambers = [], []
     for part, (top, bottom) in enumerate(pairwise(heights)):
         ends = [(sections[part], top), (sections[part + 1], bottom)]
-        body.append(_loft(occ, [(each.body_polygon(divisions), height, 0.0) for each, height in ends]))
+        body.append(_loft(occ, [(section.body_polygon(divisions), height, 0.0) for section, height in ends]))
         if part % 2 == 1:
             rotation = math.radians(geometry.rotations[part // 2]) if geometry.rotations else 0.0
             for number in range(geometry.chambers):
                 angle = rotation + 2.0 * math.pi * number / geometry.chambers
-                chambers.append(_loft(occ, [(each.chamber_polygon(divisions), height, angle) for each, height in ends]))
+                chambers.append(
+                    _loft(occ, [(section.chamber_polygon(divisions), height, angle) for section, height in ends])
+                )
     fused, _ = occ.fuse(body[:1], body[1:])
     occ.cut(fused, chambers)
     occ.synchronize()
@@ -52,5 +54,7 @@ def _loft(occ: Any, ends: Sequence[tuple[ComplexArray, float, float]]) -> tuple[
     for polygon, height, angle in ends:
         tags = [occ.addPoint(point.real, point.imag, height) for point in polygon * cmath.exp(1j * angle)]
         wires.append(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
-    ((dimension, tag),) = (each for each in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if each[0] == 3)
+    ((dimension, tag),) = (
+        entity for entity in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if entity[0] == 3
+    )
     return dimension, tag

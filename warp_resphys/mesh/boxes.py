@@ -36,7 +36,7 @@ def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, n
         if not (np.isfinite([low, high]).all() and (high - low > _APART).all()):
             raise MeshError(f"box {number} reaches from {low.tolist()} to {high.tolist()} m: it has no volume")
     lines = [_lines(corners[:, :, axis], size) for axis in range(3)]
-    grid = box_hexahedra((1.0, 1.0, 1.0), [len(each) - 1 for each in lines])
+    grid = box_hexahedra((1.0, 1.0, 1.0), [len(line) - 1 for line in lines])
     places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     centres = places[grid.cells].mean(axis=1)[:, None]
     inside = ((centres > corners[:, 0]) & (centres < corners[:, 1])).all(axis=2).any(axis=1)

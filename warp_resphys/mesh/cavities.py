@@ -51,7 +51,7 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
     for own in (hidden[parts == part] for part in np.unique(parts)):
         if areas[own].sum() >= _LEAST_AREA * areas.sum():
             cavities.append(OpenCavity(np.average(centres[own], axis=0, weights=areas[own]), float(areas[own].sum())))
-    return sorted(cavities, key=lambda each: -each.area)
+    return sorted(cavities, key=lambda cavity: -cavity.area)
 
 
 def _half_sphere(normals: FloatArray) -> FloatArray:

@@ -151,10 +151,10 @@ def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
     for size in dict.fromkeys(map(len, element.parents)):
         corners = np.array([parents for parents in element.parents if len(parents) == size])
         groups = np.sort(mesh.cells[:, corners].reshape(-1, size), axis=1)
-        found, member = np.unique(groups, axis=0, return_inverse=True)
-        vertices.append(mesh.vertices[found].mean(axis=1))
+        pairs, member = np.unique(groups, axis=0, return_inverse=True)
+        vertices.append(mesh.vertices[pairs].mean(axis=1))
         cells.append(count + member.reshape(-1, len(corners)))
-        count += len(found)
+        count += len(pairs)
     return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1), mesh.regions)
 
 

@@ -73,14 +73,14 @@ def read_surfaces(
     surfaces = {}
     for name in (key.removeprefix("surface/") for key in content if key.startswith("surface/")):
         nodes = content[f"surface/{name}"]
-        found = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
-        missing = found.count(None)
+        numbers = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
+        missing = numbers.count(None)
         if missing:
             raise MeshError(
-                f"{path}: {missing} of {len(found)} faces of the surface {name!r} are no faces of the body's boundary; "
+                f"{path}: {missing} of {len(numbers)} faces of the surface {name!r} are not on the body's boundary; "
                 "name surfaces that bound the volume, and mesh them with it"
             )
-        surfaces[name] = faces[np.unique(np.array(found, dtype=np.int64))]
+        surfaces[name] = faces[np.unique(np.array(numbers, dtype=np.int64))]
     return surfaces
 
 
@@ -159,8 +159,8 @@ def _read_file(path: Path) -> Arrays:
     try:
         if path.parent.resolve() == Path(str(resources.files("warp_resphys") / "meshes")).resolve():
             return mesh_arrays(str(path))
-        known = path.stat()
-        return _decoded(path.absolute(), known.st_ino, known.st_size, known.st_mtime_ns)
+        status = path.stat()
+        return _decoded(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns)
     except DecodingError as error:
         raise MeshError(
             f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"

@@ -70,16 +70,16 @@ def rod(
         raise MeshError(f"the grading of a rod is {grading:g}: it must be from 0, for layers of one length, to 1.")
     along = _levels(float(length[-1]), profile, layers, order, grading)
     places, frames = _transported(axis, length, along)
-    radius = np.stack([np.interp(along, profile[:, 0], each) for each in profile[:, 1:].T], axis=1)
+    radius = np.stack([np.interp(along, profile[:, 0], radii) for radii in profile[:, 1:].T], axis=1)
     vertices = places[:, None] + np.einsum("sj,nj,sji->sni", radius, section, frames)
     first = np.arange(layers) * order
     levels = first[:, None] + np.arange(order + 1)
     cells = levels[:, None, None, None, :] * len(section) + squares[None, ..., None]  # (L, S, p + 1, p + 1, p + 1)
     element = BY_NODES[nodes]
     place = np.round((element.shape.nodes + 1.0) / 2.0 * order).astype(np.int64)
-    found = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
-    used, numbers = np.unique(found, return_inverse=True)
-    mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(found.shape))
+    corners = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
+    used, numbers = np.unique(corners, return_inverse=True)
+    mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(corners.shape))
     slopes = element.shape(element.rule[0])[1]
     if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
         raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")

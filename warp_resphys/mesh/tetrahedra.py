@@ -112,16 +112,16 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
     enclosed, reason = 2.0 * max(volumes) - sum(volumes), ""
     for angle in _ANGLES:
         try:
-            found = tetrahedra_by_gmsh(_Remeshed(vertices, shells, angle), size, str(path))
+            mesh = tetrahedra_by_gmsh(_Remeshed(vertices, shells, angle), size, str(path))
         except MeshError as error:
             if isinstance(error, _NoGmshError):
                 raise
             reason = str(error)
             continue
-        made = float(cell_volumes(found).sum())
-        reached, meant = (np.array([each.min(axis=0), each.max(axis=0)]) for each in (found.vertices, vertices))
+        made = float(cell_volumes(mesh).sum())
+        reached, meant = (np.array([corners.min(axis=0), corners.max(axis=0)]) for corners in (mesh.vertices, vertices))
         if abs(made - enclosed) <= _VOLUME * enclosed and np.abs(reached - meant).max() <= _REACH * size:
-            return quadratic(found) if order == 2 else found
+            return quadratic(mesh) if order == 2 else mesh
         reason = (
             f"{path}: tetrahedra of {size:g} m fill {1e6 * made:.3g} of the {1e6 * enclosed:.3g} cm^3 that the surface "
             "encloses: take a smaller size."
@@ -152,7 +152,7 @@ def _read_shells(path: Path) -> tuple[FloatArray, list[IntArray]]:
         )
     labels = trimesh.graph.connected_component_labels(read.face_adjacency, node_count=len(read.faces))
     faces = np.asarray(read.faces, dtype=np.int64)
-    return np.asarray(read.vertices, dtype=np.float64), [faces[labels == each] for each in range(labels.max() + 1)]
+    return np.asarray(read.vertices, dtype=np.float64), [faces[labels == label] for label in range(labels.max() + 1)]
 
 
 def _volume(vertices: FloatArray, faces: IntArray) -> float:
@@ -184,13 +184,15 @@ def _loops(model: Any) -> list[list[int]]:
     """The patches of each closed surface of a model, that around the others first."""
     patches = [tag for _, tag in model.getEntities(2)]
     curves = [[abs(tag) for _, tag in model.getBoundary([(2, patch)], oriented=False)] for patch in patches]
-    width = max((tag for each in curves for tag in each), default=0) + 1
-    rows = np.repeat(np.arange(len(patches)), [len(each) for each in curves])
+    width = max((tag for boundary in curves for tag in boundary), default=0) + 1
+    rows = np.repeat(np.arange(len(patches)), [len(boundary) for boundary in curves])
     has = scipy.sparse.coo_matrix(
-        (np.ones(len(rows)), (rows, [tag for each in curves for tag in each])), (len(patches), width)
+        (np.ones(len(rows)), (rows, [tag for boundary in curves for tag in boundary])), (len(patches), width)
     )
     count, labels = scipy.sparse.csgraph.connected_components(has @ has.T, directed=False)
-    loops = [[patch for patch, label in zip(patches, labels, strict=True) if label == each] for each in range(count)]
+    loops = [
+        [patch for patch, label in zip(patches, labels, strict=True) if label == number] for number in range(count)
+    ]
 
     def across(loop: list[int]) -> float:
         boxes = np.array([model.getBoundingBox(2, tag) for tag in loop])

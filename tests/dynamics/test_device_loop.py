@@ -43,7 +43,7 @@ def host(monkeypatch):
 
     def run(function):
         with monkeypatch.context() as patch:
-            patch.setattr(Minimiser, "_decides_by_itself", False)
+            patch.setattr(Minimiser, "_runs_on_device", False)
             return function()
 
     return run

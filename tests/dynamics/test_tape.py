@@ -250,7 +250,7 @@ def wrong_shape(simulator: Simulator, q: wp.array, v: wp.array) -> None:
     ("call", "sentence"),
     [
         (wrong_type, "q must be a Warp array of vec3d"),
-        (wrong_name, "'stiffness' is no parameter"),
+        (wrong_name, "'stiffness' is not a parameter"),
         (wrong_shape, "state.v has shape"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The Hessian: which vertices it couples, and its assembly in the layout of a linear solver."""
+"""Sparsity pattern of the Hessian, and its assembly in the layout of a linear solver."""
 
 from collections.abc import Sequence
 
@@ -15,23 +15,23 @@ from ..linalg.linear_solver import LinearSolver
 
 
 class BlockPattern:
-    """Which pairs of vertices the Hessian couples, and which cell blocks make up each pair.
+    """Pairs of vertices that the Hessian couples, and the cell blocks that each pair sums.
 
     Args:
         vertices: (N, 3) at rest [m].
-        fixed: (D,) fixed vertices.
+        fixed: (D,) vertices that are not unknowns.
         sets: every set of points that carries energy.
 
     Attributes:
         free: (F,) vertices that are not fixed.
-        positions: (F, 3) of these at rest [m].
+        positions: (F, 3) of the free vertices at rest [m].
         rows: (E,) row of each block, an index into ``free``.
-        cols: (E,) its column; ``rows >= cols``.
-        start: (E + 1,) where a block's entries of ``contribution`` begin.
-        contribution: cell block, or -1 - cell block where it enters transposed.
+        cols: (E,) column of each block; ``rows >= cols``.
+        start: (E + 1,) first entry of each block in ``contribution``.
+        contribution: index of the cell block, or -1 - index where it enters transposed.
         diagonal_vertex: (E,) the vertex of a diagonal block, else -1.
         offsets: first cell block of each point set.
-        n_cell_blocks: of all point sets.
+        n_cell_blocks: number of cell blocks of all point sets.
     """
 
     def __init__(self, vertices: NDArray[np.float64], fixed: NDArray[np.int64], sets: Sequence[Points]) -> None:
@@ -57,7 +57,7 @@ class BlockPattern:
         self._collect(np.concatenate(sources), np.concatenate(pairs))
 
     def unknowns(self, device: torch.device) -> torch.Tensor:
-        """(3 F,) the free coordinates among those of all vertices."""
+        """Returns the indices (3 F,) of the free coordinates among all coordinates."""
         free = torch.as_tensor(self.free, device=device)
         return (3 * free[:, None] + torch.arange(3, device=device)).reshape(-1)
 
@@ -79,8 +79,8 @@ class HessianAssembly:
     """Recorded launches from the tangent of a potential to the value array of a linear solver.
 
     Attributes:
-        launches: they set the entries in ``values`` of the environments that the potential's tangent was made for.
-        values: (B, n_values).
+        launches: set ``values`` in the environments of the potential's last tangent.
+        values: (B, n_values) entries of the matrix.
     """
 
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
@@ -116,7 +116,7 @@ class HessianAssembly:
         self.launches = p.capture(*commands)
 
     def __call__(self) -> torch.Tensor:
-        """Returns (B, n_values) from the potential's last `update_tangent`; overwritten by the next call."""
+        """Returns (B, n_values) entries for the potential's last `update_tangent`; the next call overwrites them."""
         p = self._potential
         if self._overwritten and p.all_active:
             self.values.zero_()

@@ -1,8 +1,8 @@
-"""All energies of a simulator as one: their quantities, their values over a step, and what they remember.
+"""All energies of a simulator: their quantities, their values over a step, and their memory.
 
 An energy knows its own names (``youngs_modulus``). Where a simulator has several of a kind, such as the solids of two
-regions, the names in the simulator begin with a prefix (``tip_youngs_modulus``); this is the only place that adds it
-and takes it away.
+regions, the names in the simulator begin with a prefix (``tip_youngs_modulus``); only this module adds and
+removes it.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,18 +27,18 @@ class EnergySet:
 
     Args:
         energies: the energies, with their points and the prefixes of their names.
-        body: that they belong to.
+        body: the body of the energies.
         rest_positions: (N, 3) [m], on the simulator's device and of its type.
         method: the integrator.
         time_step: h [s].
 
     Attributes:
         parameters: quantities of the energies by name in the simulator.
-        inputs: what acts through the energies over time, by name.
-        constants: values of the parameters.
-        counts: how many values a parameter may have, and an input has, beside the environments, by name.
-        parts: names of the parts that have a value each, such as tendons, by the name of the parameter.
-        memory: what the energies remember, by name.
+        inputs: quantities that act through the energies over time, by name.
+        constants: default values of the parameters.
+        counts: number of values of an input or parameter, without the environments, by name.
+        parts: names of the parts, such as tendons, that a parameter has values for, by the parameter's name.
+        memory: quantities that the energies carry from step to step, by name.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class EnergySet:
             self.memory |= named({m.name: replace(m, name=f"{placed.prefix}{m.name}") for m in bound.memory})
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
-        """Returns the values that follow from parameters by name, and the mass of the matter."""
+        """Returns the values of the energies' terms that follow from parameters, by name, and the mass."""
         values: dict[str, torch.Tensor | None] = {}
         masses: list[Mass] = []
         for placed, bound in self._pairs:
@@ -98,7 +98,7 @@ class EnergySet:
         return values
 
     def loads(self, constants: Constants, inputs: Inputs, batch: int, static: bool) -> Iterator[torch.Tensor]:
-        """Yields forces (1 or B, N, 3) that do not depend on where the body is [N]."""
+        """Yields forces (1 or B, N, 3) that do not depend on the positions [N]."""
         for placed, bound in self._pairs:
             load = bound.load(placed.own_inputs(inputs), placed.own_constants(constants), batch, static)
             if load is not None:
@@ -129,22 +129,23 @@ class EnergySet:
         x: torch.Tensor,
         q: torch.Tensor,
     ) -> dict[str, torch.Tensor]:
-        """Returns what the energies remember after a step with the solution x (B, N, 3) that leads to positions q."""
+        """Returns the energies' memory after a step with the solution x (B, N, 3) and the new positions q."""
         memory: dict[str, torch.Tensor] = {}
         for (placed, bound), term in zip(self._pairs, terms, strict=True):
             memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, term), x, q))
         return memory
 
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
-        """Refuses memory that the energies do not have.
+        """Checks the memory of a state.
 
         Raises:
             InputError: an unknown name, another shape or type, or values that are not finite.
         """
         for name, values in memory.items():
             if name not in self.memory:
-                known = ", ".join(self.memory) or "nothing"
+                expected = ", ".join(self.memory) or "nothing"
                 raise InputError(
-                    f"Unknown memory {name!r} of the state. The energies of this body remember {known}; leave it out."
+                    f"Unknown memory {name!r} of the state. The energies of this body remember {expected}; leave it "
+                    "out."
                 )
             self.memory[name].check(values, batch, like)

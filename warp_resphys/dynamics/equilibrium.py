@@ -22,9 +22,9 @@ from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings, chec
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
-_LEAST_SHARE = 1.0 / 64.0  # of the loads, by which they grow where all of them at once lead nowhere
-_REFINEMENTS = 8  # of an adjoint by a factor in float32, after which one in float64 takes its place
-_REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: aimed at, and good enough where rounding leaves more
+_LEAST_SHARE = 1.0 / 64.0  # smallest load increment of `ramped`
+_REFINEMENTS = 8  # iterations with a float32 factor, after which a float64 factor is used
+_REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: the target, and the largest accepted
 
 
 class Workspace:
@@ -34,14 +34,14 @@ class Workspace:
         energies: of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
-        held: (H,) vertices that are no unknowns: the fixed ones, and those that others determine.
+        held: (H,) vertices that are not unknowns: fixed ones, and those that others determine.
         pattern: block structure of the Hessian.
         batch: environments.
         device: of every buffer.
         dtype: of states and factors; the potential is evaluated in float64.
 
     Attributes:
-        shards: rows of the batch and a workspace for each, if several threads share it; empty if not.
+        shards: rows of the batch with their workspaces, if several threads share it; else empty.
     """
 
     def __init__(
@@ -69,15 +69,15 @@ class Workspace:
         return self.shards or [(slice(None), self)]
 
     def reached(self, q: torch.Tensor) -> None:
-        """Remembers the positions (B, N, 3) that the last step of the dynamics has led to."""
+        """Stores the positions (B, N, 3) at the end of the last step of the dynamics."""
         self._last = q.detach()
 
     def follows(self, q: torch.Tensor) -> torch.Tensor | None:
-        """(B,) environments whose step from these positions goes on where the last one has led; None for no one."""
+        """Returns (B,) flags of environments whose step from positions q continues the last one; None for none."""
         return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
 
     def gather(self) -> IncrementalPotential:
-        """The potential of the whole batch, with the terms and positions that the shards have last had."""
+        """Returns the potential of the whole batch, with the shards' latest terms and positions."""
         for rows, own in self.shards:
             mine, theirs = self.potential, own.potential
             pairs: list[tuple[Any, Any]] = [(mine.positions, theirs.positions)]
@@ -89,27 +89,27 @@ class Workspace:
         return self.potential
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What belongs to this batch, made at its first use."""
+        """Returns the object of a key, made at its first use."""
         if key not in self._made:
             self._made[key] = make()
         made: T = self._made[key]
         return made
 
     def solver(self, purpose: str, settings: SolverSettings) -> NonlinearSolver:
-        """The solver for a purpose (dynamics, statics); each keeps its own factor."""
+        """Returns the solver for a purpose (dynamics, statics), which keeps its own factor."""
         return self.once(
             (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
         )
 
     def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:
-        """The exact Hessian, for adjoint solves."""
+        """Returns the exact Hessian, for adjoint solves."""
         return self.once(
             (linear_solver, dtype),
             lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver, dtype)),
         )
 
     def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:
-        """A new solver of the named kind for the Hessian's structure."""
+        """Returns a new linear solver of the named kind for the Hessian's structure."""
         p, k = self.potential, self.pattern
         return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype, k.positions)
 
@@ -123,14 +123,14 @@ def equilibrium(
     fixed_positions: torch.Tensor,
     follows: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, SolveReport]:
-    """x* (B, N, 3), the minimiser of a step's potential, differentiable in its terms and the fixed positions.
+    """Returns the minimiser x* (B, N, 3) of a step's potential, differentiable in its terms and the fixed positions.
 
     Args:
         workspace: of the batch.
         purpose: which of the workspace's solvers; see `Workspace.solver`.
         settings: of the solver.
         terms: of the step.
-        start: (B, N, 3) where the solver begins [m]; of influence within its tolerance alone, and without a gradient.
+        start: (B, N, 3) first guess [m], without a gradient; changes the result within the tolerance only.
         fixed_positions: (B, D, 3) of the fixed vertices [m].
         follows: see `NonlinearSolver.solve`.
 
@@ -140,7 +140,7 @@ def equilibrium(
     values = {name: terms.values[name] for name in workspace.potential.terms.values}
     names, main = tuple(values), (terms.target, terms.inertia, terms.force)
     tensors = (start, fixed_positions, *main, *values.values())
-    # What differentiates forward is to be told that it cannot.
+    # Forward-mode differentiation goes through the Function too, which refuses it.
     graded = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors[1:])
     if graded or forward_ad._current_level >= 0:
         reports: list[SolveReport] = []
@@ -155,15 +155,15 @@ def equilibrium(
 def ramped(
     solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
 ) -> torch.Tensor:
-    """Where equilibria under more and more of the loads lead to, from rest.
+    """Returns the equilibrium (B, N, 3) under all loads, reached from rest by increasing them [m].
 
     Args:
-        solve: the equilibrium under a share of the loads, from a start.
-        rest: (B, N, 3) without any [m].
-        limited: the error of all loads at once, where a configured limit of the iterations may be its cause.
+        solve: returns the equilibrium under a share of the loads, from a start.
+        rest: (B, N, 3) positions without loads [m].
+        limited: error of the solve with all loads, if a configured iteration limit may be its cause.
 
     Raises:
-        ConvergenceError: shares do not lead there either.
+        ConvergenceError: no equilibrium was found.
     """
     done, step, x = 0.0, 0.5, rest
     while done < 1.0:
@@ -257,7 +257,7 @@ def _solve_shards(
     names: tuple[str, ...],
     given: Sequence[torch.Tensor | None],
 ) -> tuple[torch.Tensor, SolveReport]:
-    """The minimiser and the report of a batch, whose shards go to as many threads."""
+    """Returns the minimiser and the report of a batch; each shard is solved by its own thread."""
     tensors = [None if tensor is None else tensor.detach() for tensor in given]
     # Made here, not in the threads: Warp captures graphs for the whole process.
     parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
@@ -275,12 +275,12 @@ def _solve_shards(
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
-    """Those of some environments; what they share stays."""
+    """Returns the rows of some environments; values shared by all are returned as they are."""
     return values if values is None or len(values) == 1 else values[rows]
 
 
 def _joined(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:
-    """The slopes by a value from those of its shards: their sum, if these share it."""
+    """Returns the gradient of a value from the gradients of the shards: their sum, if the shards share the value."""
     present = [slope for slope in slopes if slope is not None]
     if len(present) < 2:
         return present[0] if present else None
@@ -301,7 +301,7 @@ def _solve(
     fixed_positions: Any,
     *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport]:
-    """See `_solve_shards`."""
+    """Returns the minimiser and the report of one shard."""
     workspace.potential.set_terms(_terms(names, terms))
     if len(workspace.fixed):
         start = start.clone()
@@ -319,7 +319,7 @@ def _adjoint(
     x: Any,
     *saved: Any,
 ) -> tuple[torch.Tensor | None, ...]:
-    """Gradients of the fixed positions and terms; the equations are in the docstring of `_Equilibrium`."""
+    """Returns gradients of the fixed positions and terms, by the equations of `_Equilibrium`."""
     terms = _terms(names, saved)
     potential = workspace.potential
     potential.set_terms(terms)
@@ -347,11 +347,11 @@ def _adjoint(
 def _adjoint_solution(
     potential: IncrementalPotential, hessians: Sequence[ExactHessian], gradient: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(B, N, 3) the adjoint z at the potential's positions [m], and its product with the stiffness [N].
+    """Returns the adjoint z (B, N, 3) at the potential's positions [m], and its product with the stiffness [N].
 
     Args:
-        potential: with the terms and positions of the solution.
-        hessians: to be tried in turn; what is solved with a factor in float32 is refined until it is accurate.
+        potential: set to the terms and positions of the solution.
+        hessians: tried in turn; a solution by a float32 factor is refined until it is accurate.
         gradient: (B, N, 3) of the loss by the positions.
 
     Raises:

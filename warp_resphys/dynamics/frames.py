@@ -1,7 +1,7 @@
-"""How a body is turned around each of its vertices, and forces that turn with it.
+"""Rotation of a body around every vertex, forces that turn with it, and the frame of a moving base.
 
-A force that keeps its direction while the body turns under it does work that no material does: forces that press a
-slender body together from both sides wring it, as dead loads buckle a column. Those that turn with the body do not.
+Forces of fixed direction on a turning body can do work that no material does: forces that press a slender body from
+both sides twist it, as dead loads buckle a column. Forces that turn with the body do not.
 """
 
 import numpy as np
@@ -10,16 +10,15 @@ import torch
 from ..fem.body import Body
 from ..fem.elements import mean_gradients
 
-_ITERATIONS = 8  # of the polar decomposition: stretches from a tenth to ten times
-_AT_ONCE = 100  # states
+_ITERATIONS = 8  # of the polar decomposition, enough for stretches from 0.1 to 10
+_AT_ONCE = 100  # states in a batch of `to_rest`
 
 
 class VertexFrames:
     """The rotations R of the mean deformation gradients F = R S of the cells around each vertex.
 
-    Forces of a step are turned as the body will be at its end, if it goes on as it does: those that turn a step later
-    than the body feed its swings where they would have buckled it. Where the mean gradient is turned inside out, R is a
-    reflection.
+    The forces of a step turn with the predicted positions at its end, q + h v: forces that lag the body by a step feed
+    energy into its oscillation. Where the mean gradient is inverted, R is a reflection.
 
     Args:
         body: with N vertices.
@@ -38,7 +37,7 @@ class VertexFrames:
         self._operator = torch.as_tensor(operator).to(like)
 
     def rotations(self, q: torch.Tensor) -> torch.Tensor:
-        """(S, N, 3, 3) of positions (S, N, 3) [m], by Newton's iteration for the polar decomposition (Higham 1986)."""
+        """Rotations (S, N, 3, 3) at positions (S, N, 3) [m], by Newton's polar decomposition (Higham 1986)."""
         matrix = torch.einsum("snwi,nwj->snij", q[:, self._nodes.to(q.device)], self._operator.to(q))
         for _ in range(_ITERATIONS):
             a, b, c = matrix.unbind(-1)
@@ -50,11 +49,11 @@ class VertexFrames:
         return matrix
 
     def to_world(self, q: torch.Tensor, v: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-        """(S, N, 3) forces of the rest shape [N], turned with a body that is at q [m] with the velocities v [m/s]."""
+        """Turns forces (S, N, 3) of the rest shape [N] with a body at positions q [m] with velocities v [m/s]."""
         return torch.einsum("snij,snj->sni", self.rotations(q + self._ahead * v), force)
 
     def to_rest(self, q: torch.Tensor, v: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-        """(S, N, 3) forces as they would be in the rest shape [N]: the opposite of `to_world`, for any number S."""
+        """Turns forces (S, N, 3) back to the rest shape [N]: the inverse of `to_world`, for any number S."""
         parts = zip(*(field.split(_AT_ONCE) for field in (q, v, force)), strict=True)
         turned = [torch.einsum("snji,snj->sni", self.rotations(x + self._ahead * w), f) for x, w, f in parts]
         return torch.cat(turned)
@@ -63,14 +62,14 @@ class VertexFrames:
 class BaseFrame:
     """States and forces in the frame of the base that a body is fixed to: x = R x_b + t at the steps 0, h, ..., K h.
 
-    Velocities are (x_b - x_b') / h, with x_b' the place of x - h v a step before: a body that goes with its base is at
-    rest. A force during a step is turned as the base is at its end.
+    Velocities are (x_b - x_b') / h, with x_b' the position x - h v in the base's frame one step earlier: a body that
+    moves with its base is at rest. A force during a step turns with the base at the step's end.
 
     Args:
-        poses: (K + 1, B, 6) translations t [m] and rotation vectors of R; past the end the last, before time zero the
-            first.
+        poses: (K + 1, B, 6) translations t [m] and rotation vectors of R; the last pose holds after the
+            end, the first before time zero.
         time_step: h [s].
-        first: the number of the pose that counts as step zero.
+        first: index of the pose at step zero.
     """
 
     def __init__(self, poses: torch.Tensor, time_step: float, first: int = 0) -> None:
@@ -78,58 +77,58 @@ class BaseFrame:
         self._rotation = rotations(poses[..., 3:])
 
     def during(self, environments: torch.Tensor, first: torch.Tensor, steps: int) -> "BaseFrame":
-        """That of windows of some environments: each begins at a step of its own, which counts as step zero.
+        """Returns the base frame of windows of some environments, whose first steps count as step zero.
 
         Args:
-            environments: (W,) numbers.
-            first: (W,) steps that the windows begin with.
-            steps: how long they are.
+            environments: (W,) indices.
+            first: (W,) first step of each window.
+            steps: length of the windows.
         """
         at = (first + torch.arange(-1, steps + 1)[:, None]).clamp(0, len(self._poses) - 1)
         poses = self._poses[at.to(self._poses.device), environments.to(self._poses.device)]
         return BaseFrame(poses, self._step, first=1)
 
     def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, 3, 3) R and (B, 1, 3) t."""
+        """Returns R (B, 3, 3) and t (B, 1, 3) before a step."""
         at = min(max(self._first + step, 0), len(self._poses) - 1)
         return self._rotation[at], self._poses[at][:, None, :3]
 
     def enter(self, q: torch.Tensor, v: torch.Tensor, step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions (B, N, 3) [m] and velocities [m/s] in the frame of the base, before a step."""
+        """Returns positions (B, N, 3) [m] and velocities [m/s] in the frame of the base, before a step."""
         (now, at), (before, was) = self._at(step), self._at(step - 1)
         inside = (q - at) @ now
         return inside, (inside - (q - self._step * v - was) @ before) / self._step
 
     def leave(self, q: torch.Tensor, v: torch.Tensor, step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """The opposite of `enter`."""
+        """Returns positions and velocities in the world: the inverse of `enter`."""
         (now, at), (before, was) = self._at(step), self._at(step - 1)
         outside = q @ now.mT + at
         return outside, (outside - (q - self._step * v) @ before.mT - was) / self._step
 
     def force_inside(self, force: torch.Tensor, step: int) -> torch.Tensor:
-        """(B, N, 3) forces during a step, in the frame of the base [N]."""
+        """Returns forces (B, N, 3) during a step in the frame of the base [N]."""
         return force @ self._at(step + 1)[0]
 
     def force_outside(self, force: torch.Tensor, step: int) -> torch.Tensor:
-        """The opposite of `force_inside`."""
+        """Returns forces in the world: the inverse of `force_inside`."""
         return force @ self._at(step + 1)[0].mT
 
 
 def rotations(vectors: torch.Tensor) -> torch.Tensor:
-    """(..., 3, 3) rotations of rotation vectors (..., 3) [rad], differentiable at zero too."""
+    """Returns rotations (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable at zero too."""
     zero, (x, y, z) = torch.zeros_like(vectors[..., 0]), vectors.unbind(-1)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     return torch.linalg.matrix_exp(skew)
 
 
 def base_movement(poses: torch.Tensor, time_step: float, gravity: torch.Tensor) -> torch.Tensor:
-    """(K, B, 15) what networks are told of the motion of a base during each step, as the base has it.
+    """Returns the motion of a base (K, B, 15) as an input of networks, in the frame of the base.
 
-    Velocity [m/s] and rate of rotation [rad/s] during the step and during the one before, whose difference is what a
-    body feels, and the direction of gravity [-].
+    Velocity [m/s] and angular velocity [rad/s] during the step and during the one before, whose difference accelerates
+    the body, and the direction of gravity [-].
 
     Args:
-        poses: (K + 1, B, 6), see `BaseFrame`.
+        poses: (K + 1, B, 6) as of `BaseFrame`.
         time_step: h [s].
         gravity: (3,) [m/s^2].
     """

@@ -17,9 +17,9 @@ class HessianApproximation(ABC):
     """A factorised approximation of the potential's Hessian.
 
     Attributes:
-        clamped: (B,) environments whose matrix is positive definite by force or by construction: a line search that
-            fails with it gets no further try.
-        vertex_at: (F,) the free vertex at each place of right-hand sides `in place <solve_in_place>`.
+        clamped: (B,) environments whose matrix is clamped or positive definite by construction; if a line search fails
+            with it, the solve has failed.
+        vertex_at: (F,) free vertices in the order of the right-hand sides of `solve_in_place`.
     """
 
     clamped: torch.Tensor
@@ -27,35 +27,34 @@ class HessianApproximation(ABC):
 
     @abstractmethod
     def ready(self) -> bool:
-        """Whether there is a factor that may serve the current terms."""
+        """Returns whether there is a factor that suits the current terms."""
 
     @abstractmethod
     def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
         """Factorises at the potential's positions.
 
         Args:
-            clamp: (B,) environments whose matrix is to be positive definite by force.
-            active: (B,) environments that get a new factor; the others keep theirs, if they have one. All where left
-                out.
+            clamp: (B,) environments whose matrix is clamped to be positive definite.
+            active: (B,) environments that get a new factor; the others keep their factor. All by default.
         """
 
     @abstractmethod
     def solve_in_place(self, right: torch.Tensor) -> None:
-        """Overwrites residuals (B, F, 3) [N] at the free vertices, see `vertex_at`, by displacements [m]."""
+        """Overwrites residuals (B, F, 3) [N] at free vertices, in the order of `vertex_at`, by displacements [m]."""
 
 
 class ExactHessian(HessianApproximation):
-    """The exact Hessian; its positive-definite clamp in environments whose Hessian is indefinite.
+    """The exact Hessian, clamped to be positive definite in environments where it is indefinite.
 
     Args:
-        potential: whose Hessian it is.
-        pattern: its block structure.
-        linear: solver built for that pattern with blocks of 3.
+        potential: gives the Hessian.
+        pattern: block structure of the Hessian.
+        linear: solver for that pattern with blocks of 3.
 
     Attributes:
         linear: the solver.
-        assembly: in its layout.
-        exact: whether solutions are as accurate as float64 makes them.
+        assembly: assembly of the Hessian in the solver's layout.
+        exact: whether factors are float64.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -90,13 +89,13 @@ class ExactHessian(HessianApproximation):
         self._factor = self._factor_of(self.assembly(), active=active)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
-        """Of assembled values, and what couples vertices beside them."""
+        """Returns the factor of assembled values and the low-rank correction."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
         return self.linear.factor(values, definite, columns, None if active is None else ~active, self._factor)
 
     def refactor_exact(self) -> None:
-        """Factorises the Hessian as it is, indefinite or not: for adjoints."""
+        """Factorises the Hessian without clamping, for adjoints."""
         self.clamped.zero_()
         self._potential.update_tangent()
         self._factor = self._factor_of(self.assembly())
@@ -110,7 +109,7 @@ class ExactHessian(HessianApproximation):
         self._factor.solve_in_place(right.flatten(1))
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N, m) solutions for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
+        """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m); zero at fixed vertices."""
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
@@ -121,10 +120,10 @@ class ExactHessian(HessianApproximation):
 class ProjectiveHessian(HessianApproximation):
     """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
 
-    Fibres and tendons enter with their stiffness, pressure not at all.
+    Fibres and tendons enter with their stiffness, pressure does not.
 
     This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
-    the positions: one factor serves until inertia or stiffness change, and the whole batch where these are shared.
+    the positions: one factor is used until inertia or stiffness change, and for the whole batch where these are shared.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -137,7 +136,7 @@ class ProjectiveHessian(HessianApproximation):
         self._factor: Factor | None = None
 
     def _gradient_products(self, points: PointSet) -> torch.Tensor:
-        """(C, Q, pairs) scalar products of the gradients of every node pair a >= c of a cell."""
+        """Returns scalar products (C, Q, pairs) of the gradients of the node pairs a >= c of every cell."""
         gradients = points.source.gradients
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
@@ -156,7 +155,7 @@ class ProjectiveHessian(HessianApproximation):
 
     @override
     def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
-        del clamp, active  # The matrix is positive definite as it is, and serves later steps.
+        del clamp, active  # The matrix is always positive definite, and is used by later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
         batch = max(len(t) for t in (inertia, *weights))

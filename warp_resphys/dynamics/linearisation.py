@@ -1,4 +1,4 @@
-"""A step's residual and its exact derivative at any positions, for methods that solve it in their own way."""
+"""Residual of a step and its exact derivative at any positions, for methods with solvers of their own."""
 
 import math
 from collections.abc import Callable
@@ -21,21 +21,21 @@ from .equilibrium import Workspace
 class Linearisation:
     """The residual g(x) of a step and its Hessian H = dg/dx.
 
-    It works on the buffers of a batch, and holds until the simulator is asked for something else for that batch.
+    It uses the buffers of a batch, and is valid until the simulator is used for that batch again.
 
     Args:
         workspace: of the batch.
         terms: of the step.
         stage: of the integrator.
         fixed_positions: (B, D, 3) where the fixed vertices are at the stage [m].
-        coordinates: of the body; forces on vertices that others determine act on these, and displacements follow.
-        finish: the state that a solution x leads to.
-        linear_solver: which one factorises H.
+        coordinates: of the body; forces on dependent vertices act on their control vertices.
+        finish: returns the new state of a solution x.
+        linear_solver: name of the solver that factorises H.
 
     Attributes:
-        stage: how x belongs to the step.
-        start: (B, N, 3) where inertia alone takes the free vertices, and where the fixed ones are [m].
-        finish: see above.
+        stage: implicit stage of the integrator that x solves.
+        start: (B, N, 3) positions to which inertia alone takes the free vertices, and positions of the fixed ones [m].
+        finish: returns the new state of a solution x.
         free: (F,) free vertices.
     """
 
@@ -57,38 +57,38 @@ class Linearisation:
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns x with the fixed vertices where they are, and those that others determine where these put them."""
+        """Returns x with fixed vertices at their positions and dependent ones placed by their control vertices."""
         return self._coordinates.expand(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) g at x [N], zero at fixed vertices: the force that the step lacks to end there."""
+        """Returns g (B, N, 3) at x [N], zero at fixed vertices: the extra force by which the step would end at x."""
         self._potential.positions.copy_(x)
         self._potential.evaluate()
         return self._potential.residual.clone()
 
     def factorise(self, x: torch.Tensor) -> None:
-        """Makes H ready for `solve` and `product` at x (B, N, 3) [m]."""
+        """Computes H and its factor at x (B, N, 3) [m], for `solve` and `product`."""
         self._potential.positions.copy_(x)
         self._workspace.hessian(self._name).refactor_exact()
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """(B, 3 N, m) solutions of H y = r for (B, 3 N, m) right-hand sides; zero at fixed vertices."""
+        """Returns solutions (B, 3 N, m) of H y = r for right-hand sides (B, 3 N, m); zero at fixed vertices."""
         fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
         solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
         return self._coordinates.expand(solution.unflatten(1, (-1, 3))).flatten(1, 2)
 
     def update(self, x: torch.Tensor) -> None:
-        """Makes H ready for `product` and `shifted` at x, without a factor."""
+        """Computes H at x without a factor, for `product` and `shifted`."""
         self._potential.positions.copy_(x)
         self._potential.update_tangent()
 
     def product(self, direction: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) H d on the free vertices [N]."""
+        """Returns H d (B, N, 3) on the free vertices [N]."""
         p = self._potential
         return (p.stiffness_product(direction) + p.inertia[..., None] * direction) * p.free_mask[:, None]
 
     def shifted(self, scale: float) -> Factor:
-        """A factor of I + scale H on the free vertices; H is clamped where that is not positive definite."""
+        """Returns a factor of I + scale H on the free vertices, with H clamped where that is not positive definite."""
         w, name = self._workspace, self._name
         shift = w.once(("shifted", name), lambda: _ShiftedHessian(w, name))
         factor = shift(scale)
@@ -99,7 +99,7 @@ class Linearisation:
         return factor
 
     def matrix(self, x: torch.Tensor) -> tuple[scipy.sparse.csc_array, NDArray[np.float64]]:
-        """(3 F, 3 F) H of the first environment on the free vertices, and (3 F,) the inertia in its diagonal [N/m]."""
+        """Returns H (3 F, 3 F) of the first environment on free vertices, and the diagonal inertia (3 F,) [N/m]."""
         p, pattern = self._potential, self._workspace.pattern
         self.update(x)
         solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, torch.float64)
@@ -112,7 +112,7 @@ class Linearisation:
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
     def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:
-        """Returns the part (3 F, 3 F) of H that is inertia [N/m], that of rigid parts and glued vertices included."""
+        """Returns the inertia (3 F, 3 F) in H [N/m], including rigid parts and glued vertices."""
         whole, diagonal = self.matrix(x)
         if not len(self._coordinates.dependent):
             return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))
@@ -128,7 +128,7 @@ class _ShiftedHessian:
 
     Args:
         workspace: of the batch.
-        linear_solver: which one factorises.
+        linear_solver: name of the solver that factorises.
     """
 
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:
@@ -140,7 +140,7 @@ class _ShiftedHessian:
         self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
 
     def __call__(self, scale: float) -> Factor:
-        """The factor at the potential's last tangent."""
+        """Returns the factor for the potential's last tangent."""
         values = scale * self._assemble()
         values[:, self._diagonal] += 1.0
         columns = self._potential.low_rank

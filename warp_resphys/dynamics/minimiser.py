@@ -1,4 +1,4 @@
-"""The state of a minimisation on its device, and the launches that advance it; see ``kernels.minimisation``."""
+"""State of a minimisation on its device, and the launches that advance it; the kernels are ``kernels.minimisation``."""
 
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -16,32 +16,32 @@ from .recorded_factors import RecordedFactors
 
 _COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
 _SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
-_NUDGES = 7  # by rounding units that are drawn
+_NUDGES = 7  # random draws of rounding units
 
 
 class Summary(NamedTuple):
-    """What the host has to know of a batch."""
+    """Counts of environments that the host acts on."""
 
-    active: int  # environments that go on
-    aiming: int  # those that need a direction
-    wanting: int  # those that need a factor first
-    asking: int  # those whose residual may be rounding
+    active: int  # neither converged nor failed
+    aiming: int  # need a direction
+    wanting: int  # need a factor before the direction
+    asking: int  # measure the rounding of their residual
 
 
 class Minimiser:
     """Buffers and launches of one batch.
 
     Args:
-        potential: what is minimised, with the positions.
-        hessian: whose factor the directions come from.
+        potential: minimised at its positions.
+        hessian: gives the factor for the directions.
         dtype: of pairs and right-hand sides.
         memory: pairs that L-BFGS keeps; 0 for Newton's method.
         relative_tolerance: residual over balancing forces at which an environment has converged.
-        absolute_tolerance: residual at which it has in any case [N].
+        absolute_tolerance: residual at which an environment has converged in any case [N].
         epsilon: of the states' type.
-        max_iterations: directions after which it is stuck.
-        refactor_after: directions of a solve, more of which ask for a new factor before the next one, and three times
-            as many at once; 0 asks always, None never.
+        max_iterations: directions after which an environment fails.
+        refactor_after: directions of a solve above which the next solve gets a new factor; three times as many give a
+            new factor at once. 0 for a new factor at every iterate, None for never.
     """
 
     def __init__(
@@ -126,12 +126,12 @@ class Minimiser:
         self._compare = p.capture(nudge, *p.evaluation, compare, summarise)
         self._parts = SimpleNamespace(begin=begin, aim=aim, judge=judge)
         self._loop: Launches | None = None
-        if self._decides_by_itself:
+        if self._runs_on_device:
             self._record_loop()
 
     @property
-    def _decides_by_itself(self) -> bool:
-        """Whether launches alone make the factors, and a graph may have a loop in it (CUDA 12.4 and later)."""
+    def _runs_on_device(self) -> bool:
+        """Whether factors need no host code and a graph may contain a loop (CUDA 12.4 and later)."""
         h, p = self._hessian, self._potential
         able = p.device.type == "cpu" or bool(wp.is_conditional_graph_supported())
         return isinstance(h, ExactHessian) and isinstance(h.linear, TiledSolver) and not p.couples_cells and able
@@ -167,13 +167,13 @@ class Minimiser:
         self._loop = p.capture_calls(solve, [*commands, *factors.commands])
 
     def minimise(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> None:
-        """Minimises; on a GPU, with tiled factors, without waiting for it.
+        """Minimises the potential; on a GPU with tiled factors, without waiting for the end.
 
         Args:
-            start: (B, N, 3) where inertia alone would lead [m].
-            follows: (B,) environments that go on where the last step ended: its solution and those before then foretell
-                where to begin, and factor and pairs are kept. None for no one. A factor that is never renewed serves
-                all, without pairs.
+            start: (B, N, 3) positions to which inertia alone would lead [m].
+            follows: (B,) environments that continue the last step: their start is extrapolated from the last solutions,
+                and factor and pairs are kept. None for none. A factor that is never renewed is kept for all, without
+                pairs.
         """
         p = self._potential
         for values in self._recent[0], self._pair_counts, *((self._counts["factored"],) if self._renews else ()):
@@ -181,7 +181,7 @@ class Minimiser:
                 values.zero_()
             else:
                 values.mul_(follows)
-        if not self._renews:  # The tail of a long solve tells the next one little.
+        if not self._renews:  # Pairs from the end of a long solve do not help the next one.
             self._pair_counts.zero_()
         if self._loop is not None:
             p.positions.copy_(start)
@@ -207,7 +207,7 @@ class Minimiser:
         return self._look()
 
     def advance(self, state: Summary) -> Summary:
-        """One evaluation: of the first trial of those that need a direction, and of the next of the others."""
+        """Evaluates one trial of every environment: the first along a new direction, or the next of a line search."""
         p = self._potential
         if state.aiming:
             p.launch(self._project)
@@ -225,7 +225,7 @@ class Minimiser:
         self._hessian.refactor(p.clamp.bool(), None if everyone else p.tangent_active.bool())
 
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """(B,) directions, last residual over balancing forces, whether it has converged, and factorisations."""
+        """Returns (B,) iterations, last residual over balancing forces, convergence flags and factorisations."""
         counts = self._counts
         converged = counts["phase"] == kernels.DONE
         return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["made"].long()

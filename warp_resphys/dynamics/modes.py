@@ -14,22 +14,22 @@ from .simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
-_DENSE = 600  # unknowns, beyond which all eigenvalues of a dense matrix take too long to find a few of them
-_MORE = 6  # looked for beyond the count, so that no cluster is cut: a body that nothing holds has six motions at rest
-_AXES = np.array([1.0, 2.0, 4.0])  # weights of x, y and z: they differ, and so do the means of any two
-_SAME = 1e-4  # relative difference of eigenvalues that rounding may make
-_ZERO = 1e-12  # the same where nothing holds a body, in units of the largest entry
+_DENSE = 600  # unknowns above which Lanczos is faster than a dense eigenvalue solver
+_MORE = 6  # extra modes, so that no cluster is cut: a free body has six rigid modes
+_AXES = np.array([1.0, 2.0, 4.0])  # distinct weights of x, y and z, whose pairwise means are distinct too
+_SAME = 1e-4  # relative difference of equal eigenvalues after rounding
+_ZERO = 1e-12  # absolute difference of equal eigenvalues, in units of the largest diagonal entry, for free bodies
 
 
 def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
-    """(3 N, count) orthonormal columns that span the inertial forces M phi of the slowest vibrations about rest.
+    """Returns orthonormal columns (3 N, count) that span the inertial forces M phi of the slowest vibration modes.
 
     The modes phi solve K phi = omega^2 M phi with K the stiffness of the rest shape. They do not depend on rounding:
-    vibrations of one frequency, such as those of a square beam across its two sides, are told apart by the axes (see
-    `resolved`), and of a set that the count cuts, the first ones are taken.
+    modes of one frequency, such as the two bending modes of a square beam, are aligned with the axes (`resolved`), and
+    if the count cuts such a set, its first modes are taken.
 
     Raises:
-        InputError: no mode, or more modes than there are free coordinates.
+        InputError: count is below one or above the number of free coordinates.
     """
     stiffness, inertia, free = _about_rest(simulator)
     unknowns = inertia.shape[0]
@@ -42,7 +42,7 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     if unknowns <= max(_DENSE, number):
         values, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, number - 1])
     else:
-        # Lanczos about a little less than zero, where a body that nothing holds is regular too, always from one start.
+        # Lanczos about a shift just below zero, where the matrix of a free body is regular too; fixed start vector.
         below = -1e-8 * float(scaled.diagonal().max())
         values, shapes = scipy.sparse.linalg.eigsh(scaled, number, sigma=below, v0=np.ones(unknowns))
         order = np.argsort(values)
@@ -56,17 +56,17 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
 
 
 def resolved(values: FloatArray, shapes: FloatArray, positions: FloatArray, same: FloatArray | float) -> FloatArray:
-    """(3 F, m) orthonormal shapes, those that share a value turned among each other so that they lie along the axes.
+    """Returns orthonormal shapes (3 F, m) in which shapes of equal value are aligned with the axes.
 
-    Any orthonormal basis of such shapes is as good, and rounding chooses one. This one diagonalises a weighted sum of
-    squares. Its weights differ by axis, which tells a beam's bending to one side from that to the other, and grow along
-    the axes, which tells apart shapes whose axes weigh the same.
+    Shapes of equal value have no unique basis, and rounding would choose one. This basis diagonalises a weighted sum of
+    squares. The weights differ by axis, which separates a beam's bending to one side from bending to the other, and
+    grow along the axes, which separates shapes that have equal sums by axis.
 
     Args:
-        values: (m,) that the shapes belong to, in order.
+        values: (m,) eigenvalues of the shapes, in order.
         shapes: (3 F, m) orthonormal.
         positions: (F, 3) of the vertices at rest [m].
-        same: up to which difference from the one before a value is the same.
+        same: largest difference between neighbouring values that count as equal.
     """
     place = (positions - positions.min(0)) / np.ptp(positions, axis=0).max()
     weights = (np.exp(2.0 * place) @ _AXES)[:, None] * _AXES
@@ -76,19 +76,19 @@ def resolved(values: FloatArray, shapes: FloatArray, positions: FloatArray, same
 
 
 def with_signs(shapes: FloatArray) -> FloatArray:
-    """(n, m) columns with the first of their entries that are about the largest positive."""
+    """Returns columns (n, m) with signs such that the first entry of nearly the largest size is positive."""
     size = np.abs(shapes)
     first = (size > 0.99 * size.max(0)).argmax(0)
     return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
 
 
 def _blocks(inertia: scipy.sparse.csc_array) -> NDArray[np.int64]:
-    """Returns the coordinates that an inertia matrix couples with others, (m,)."""
+    """Returns the coordinates (m,) that an inertia matrix couples to others."""
     return np.flatnonzero(np.diff(inertia.indptr) > 1)
 
 
 def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
-    """Returns the triangular R with R^T R = M, whose coupled coordinates, those of rigid parts and glue, are few."""
+    """Returns the triangular R with R^T R = M; few coordinates are coupled, by rigid parts and glue."""
     coupled, root = _blocks(inertia), scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
     if len(coupled):
         block = inertia[coupled][:, coupled].toarray()
@@ -119,13 +119,13 @@ def _about_rest(
 
 
 class RestStiffness:
-    """The stiffness K of a body at rest: what forces displace it by, and which forces a displacement takes.
+    """Stiffness K of a clamped body at rest: displacements of forces, and forces of displacements.
 
     Args:
         simulator: of a body that is clamped.
 
     Raises:
-        InputError: nothing holds the body.
+        InputError: the body has no fixed vertices.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -140,13 +140,13 @@ class RestStiffness:
         self._size = 3 * n
 
     def displacements(self, forces: FloatArray) -> FloatArray:
-        """(3 N, m) K^-1 f of (3 N, m) [m]; zero at fixed vertices."""
+        """Returns K^-1 f (3 N, m) [m] of forces (3 N, m) [N]; zero at fixed vertices."""
         out = np.zeros((self._size, forces.shape[1]))
         out[self._dofs] = self._factor.solve((self._map.T @ forces)[self._dofs])
         return np.asarray(self._map @ out)
 
     def forces(self, displacements: FloatArray) -> FloatArray:
-        """(3 N, m) K u of (3 N, m) [N]; zero at fixed vertices."""
+        """Returns K u (3 N, m) [N] of displacements (3 N, m) [m]; zero at fixed vertices."""
         out = np.zeros((self._size, displacements.shape[1]))
         out[self._dofs] = self._matrix @ displacements[self._dofs]
         return out

@@ -1,4 +1,4 @@
-"""Minimises an incremental potential: local steps on the points, global steps with a factorised matrix.
+"""Solver of an incremental potential: local steps on the points, global steps with a factorised matrix.
 
 Three solvers differ in the matrix of the global step and share everything else:
 
@@ -10,14 +10,14 @@ Three solvers differ in the matrix of the global step and share everything else:
 =======================  ====================================================================================
 
 An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
-forces that balance: inertia and loads. Rounding may leave more than that. An environment whose residual has not halved
-in three iterations has converged too if it is less than what moving every coordinate by one unit of rounding makes of
-it, which is measured; and one on which nothing acts, if its first step is within the rounding of its state.
+balancing forces, inertia and loads. Rounding may leave a larger residual: an environment whose residual has not halved
+in three iterations has also converged if the residual is below its measured change when every coordinate moves by one
+rounding unit. An environment without loads has also converged if its first step is within the rounding of its state.
 
-Residuals and positions are float64. Factors and pairs may be float32: they decide how many iterations it takes.
+Residuals and positions are float64. Factors and pairs may be float32: they change the number of iterations only.
 
-What is decided for an environment is decided by kernels (`minimiser`); the host makes their launches and factorises, or
-launches one graph that does both.
+Kernels make the decisions for every environment (`minimiser`); the host launches them and factorises, or launches one
+graph that does both.
 """
 
 from collections.abc import Sequence
@@ -40,18 +40,17 @@ FACTORS = ("double", "single")
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """How to solve a step."""
+    """Settings of the solver of a step."""
 
     name: str = "quasi_newton"  # one of `SOLVERS`
-    # residual over balancing forces at which a solve has converged; where states are float32, less than 1e-5
-    # gains nothing
+    # residual over balancing forces at which a solve has converged; below 1e-5, float32 states do not get better
     relative_tolerance: float = 1e-8
-    absolute_tolerance: float = 1e-12  # residual below which it has converged in any case [N]
-    max_iterations: int = 2000  # after which it has failed
+    absolute_tolerance: float = 1e-12  # residual below which a solve has converged in any case [N]
+    max_iterations: int = 2000  # after which a solve has failed
     memory: int = 12  # pairs that L-BFGS keeps
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` factorises anew
     linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``multigrid``
-    factors: str = "double"  # or ``single``: factors and pairs in float32, residuals and states as they are
+    factors: str = "double"  # or ``single``: factors and pairs in float32; residuals and states keep their types
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
 
     def __post_init__(self) -> None:
@@ -75,16 +74,16 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class SolveReport:
-    """Outcome of a solve."""
+    """Outcome of a solve, by environment."""
 
-    iterations: torch.Tensor  # (B,) global steps of each environment
+    iterations: torch.Tensor  # (B,) global steps
     relative_residual: torch.Tensor  # (B,) last residual over balancing forces
     converged: torch.Tensor  # (B,) bool
-    factorisations: torch.Tensor  # (B,) of the matrix of each environment
+    factorisations: torch.Tensor  # (B,) factorisations of the matrix
 
     @staticmethod
     def of(shards: "Sequence[SolveReport]") -> "SolveReport":
-        """The report of a batch from those of its shards."""
+        """Returns the report of a batch from the reports of its shards."""
         if len(shards) == 1:
             return shards[0]
         names = [field.name for field in fields(SolveReport)]
@@ -92,12 +91,12 @@ class SolveReport:
 
 
 def check_converged(settings: SolverSettings, report: SolveReport, positions: torch.Tensor) -> None:
-    """Refuses a solve that failed, if failures are not merely counted.
+    """Raises an error for a failed solve, unless failures are only counted.
 
     Args:
         settings: of the solver.
         report: of the solve.
-        positions: (B, N, 3) where it ended [m].
+        positions: (B, N, 3) at the end of the solve [m].
 
     Raises:
         ConvergenceError: an environment did not converge.
@@ -115,7 +114,7 @@ def check_converged(settings: SolverSettings, report: SolveReport, positions: to
 
 
 class NonlinearSolver:
-    """Minimises a potential again and again; keeps factor and buffers between solves.
+    """Minimises a potential repeatedly; keeps factor and buffers between solves.
 
     Args:
         potential: evaluated at its current terms.
@@ -138,7 +137,7 @@ class NonlinearSolver:
         else:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
-        # Directions by iterations cost most of a solve, and no more with the Hessian where they begin.
+        # An iterative linear solver spends most of a solve on directions, so that a new Hessian costs little.
         quasi = 0 if linear.iterates else settings.refactor_after
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
         self._minimiser = Minimiser(
@@ -154,13 +153,12 @@ class NonlinearSolver:
         )
 
     def solve(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> SolveReport:
-        """Minimises; what it ends at is left in ``potential.positions``.
+        """Minimises the potential; the solution is in ``potential.positions``.
 
         Args:
-            start: (B, N, 3) where inertia alone would lead, or any guess [m].
-            follows: (B,) environments for which this is the step after the one that was solved last: they may begin
-                where that foretells, with its factor. None for no one. What the others find does not depend on what was
-                solved before.
+            start: (B, N, 3) positions to which inertia alone would lead, or any guess [m].
+            follows: (B,) environments that continue the step solved last: they start from its extrapolation, with its
+                factor. None for none. Results of the others do not depend on earlier solves.
         """
         self._minimiser.minimise(start, follows)
         return SolveReport(*self._minimiser.outcome())

@@ -1,4 +1,4 @@
-"""Factors of the Hessian that launches alone make and use: for a solve without a word from the host."""
+"""Factors of the Hessian that recorded launches make and use, for a solve without the host."""
 
 import torch
 import warp as wp
@@ -11,14 +11,14 @@ from .assembly import HessianAssembly
 
 
 class RecordedFactors:
-    """What `hessian.ExactHessian` does for the host, clamped where the Hessian is indefinite, as launches.
+    """Recorded launches that factorise the exact Hessian and solve with it, clamped where it is indefinite.
 
     Args:
-        potential: whose Hessian it is, without `low rank <IncrementalPotential.low_rank>`. `factorise` works on the
-            environments of its ``tangent_active``, and leaves in it none but those whose factor is not finite.
-        assembly: of the Hessian in the solver's layout.
+        potential: gives the Hessian, without `low rank <IncrementalPotential.low_rank>`. `factorise` works on the
+            environments of its ``tangent_active``, and then leaves marked those whose factor is not finite.
+        assembly: assembly of the Hessian in the solver's layout.
         linear: the solver.
-        clamped: (B,) those whose factor is that of such a matrix.
+        clamped: (B,) environments whose factor is of a clamped matrix.
         right: (B, F, 3) residuals [N] that `solve` overwrites by displacements [m], in the order of the solver.
 
     Attributes:
@@ -35,22 +35,22 @@ class RecordedFactors:
     ) -> None:
         p, b = potential, potential.batch
         self._again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
-        asked = [warp_view(flags, wp.int32) for flags in (p.tangent_active, p.clamp)]
-        mark = p.record(minimisation.mark, (b,), asked, [warp_view(clamped, wp.bool)])
+        marks = [warp_view(flags, wp.int32) for flags in (p.tangent_active, p.clamp)]
+        mark = p.record(minimisation.mark, (b,), marks, [warp_view(clamped, wp.bool)])
         made = linear.record_factor(assembly.values, p.tangent_active, clamped)
         self._factorise = [mark, p.tangent_launches, made.clear, assembly.launches, made.factor, made.check]
-        self._repeat = p.record_blocks(minimisation.repeat, 1, asked, [self._again])
+        self._repeat = p.record_blocks(minimisation.repeat, 1, marks, [self._again])
         self._solve = linear.record_solve(assembly.values, right.flatten(1))
         self.commands = [*self._factorise, self._repeat, self._solve]
 
     def factorise(self) -> None:
-        """Makes the launches of a factorisation at the potential's positions, and of a clamped one where it failed.
+        """Factorises at the potential's positions, and again with a clamped Hessian where that failed.
 
-        Factors of what is not positive definite even so are not finite.
+        Factors of a matrix that is not positive definite even when clamped are not finite.
         """
         issue(*self._factorise, self._repeat)
         wp.capture_if(self._again, lambda: issue(*self._factorise))
 
     def solve(self) -> None:
-        """Makes the launches of a solve."""
+        """Overwrites the residuals by displacements."""
         issue(self._solve)

@@ -39,11 +39,11 @@ from .nonlinear_solver import SolveReport, SolverSettings
 log = logging.getLogger(__name__)
 
 GRAVITY = (0.0, 0.0, -9.80709)
-_MOST_LENGTHS = 100.0  # that a body at rest may be away from its rest shape
+_MOST_LENGTHS = 100.0  # largest displacement of an equilibrium, in lengths of the body
 COUPLINGS = ("implicit", "explicit")
-_MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough where it is near
+_MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough from a good start
 _NOTHING = Inputs()
-_DEPENDENT = "dependent_"  # begins the names of the inertia of vertices that others determine
+_DEPENDENT = "dependent_"  # prefix of the values of vertices that others determine
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
@@ -57,13 +57,13 @@ class Trajectory:
     q: torch.Tensor  # (T + 1, B, N, 3) positions, the start included [m]
     v: torch.Tensor  # (T + 1, B, N, 3) velocities [m/s]
     reports: list[SolveReport]  # T outcomes of the solver
-    final: State  # the last state, from which a further roll-out goes on
-    body: Body  # that moved
+    final: State  # last state, the start of a further roll-out
+    body: Body  # the simulated body
     time_step: float  # [s]
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """(T + 1,) [s], from zero."""
+        """Times (T + 1,) of the states, from zero [s]."""
         return self.time_step * np.arange(len(self.q), dtype=np.float64)
 
     def save(self, path: str | Path) -> Path:
@@ -73,10 +73,10 @@ class Trajectory:
         attribute ``units``.
 
         Args:
-            path: of the file; missing folders are made.
+            path: the file to write; missing folders are made.
 
         Raises:
-            DataFileError: it cannot be written.
+            DataFileError: the file cannot be written.
         """
         with atomic_hdf5(path, "trajectory") as file:
             create(file, "times", self.times, "s")
@@ -91,8 +91,8 @@ class Trajectory:
         Args:
             vertices: numbers of the vertices, such as those of `select_vertices`; or one number.
             axis: ``x``, ``y`` or ``z``.
-            environment: which of the B.
-            ax: axes of matplotlib to draw in; those of a new figure where left out.
+            environment: index of the environment, 0 to B - 1.
+            ax: matplotlib axes to draw in; a new figure by default.
 
         Returns:
             The axes.
@@ -120,12 +120,12 @@ class Trajectory:
         The vertices have ``displacement`` and ``velocity``.
 
         Args:
-            path: of the ``.pvd`` file.
-            environment: which of the B.
+            path: the ``.pvd`` file to write.
+            environment: index of the environment, 0 to B - 1.
 
         Raises:
             InputError: no such environment, or another extension.
-            DataFileError: it cannot be written.
+            DataFileError: the file cannot be written.
         """
         self._check(environment)
         q, v = (_array(values[:, environment]) for values in (self.q, self.v))
@@ -146,7 +146,7 @@ def _check_count(name: str, value: object) -> None:
 
 
 def _device(name: str | torch.device) -> torch.device:
-    """A device that the kernels run on.
+    """Returns a device that the kernels run on.
 
     Raises:
         InputError: an unknown device, or CUDA without a CUDA device.
@@ -190,33 +190,32 @@ class Simulator:
     """Steps a body through time.
 
     Args:
-        body: what is simulated; a `fem.scene.Scene` of several bodies is one, too.
-        material: of the body, or of each of its mesh's regions by name, or of each body of a scene by name; every
-            method takes other values of its constants by name (``parameters``), those of a region or body with its name
-            and an underscore in front, as in ``tip_youngs_modulus``.
+        body: the body to simulate, or a `fem.scene.Scene` of several bodies.
+        material: one material, or one for each region of the mesh or body of a scene, by name. Every method accepts
+            other values of its constants (``parameters``); the constants of a region or body have its name in front, as
+            in ``tip_youngs_modulus``.
         time_step: h [s].
         gravity: acceleration (3,) [m/s^2].
         integrator: ``implicit_euler``, ``bdf2`` or ``midpoint``.
         solver: a name, or `SolverSettings`.
         relative_tolerance: shorthand for that field of the settings.
         device: a torch device.
-        dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are evaluated in float64 in
-            both: single precision leaves a nearly incompressible solid no digit of them. A float32 step is as good as
-            its positions then, 4e-9 m on a beam of 0.1 m, from a relative tolerance of 1e-5 on.
-        coupling: of the energies that are loads, such as pressure: ``implicit``, they act on the body as it is at the
-            end of a step (in its middle, for ``midpoint``); or ``explicit``, as it is at its start, as published.
+        dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are always evaluated in
+            float64: single precision leaves no correct digit of them in a nearly incompressible solid. From a relative
+            tolerance of 1e-5 on, a float32 step is as accurate as its positions, 4e-9 m on a beam of 0.1 m.
+        coupling: when loads such as pressure are evaluated: ``implicit``, at the end of a step (in its middle for
+            ``midpoint``); or ``explicit``, at its start, as published.
 
     Raises:
-        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a CUDA device that
-            is not there.
+        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or no CUDA device.
 
     Attributes:
-        parameters: quantities that every method takes other values of, by name: the material's constants, those of the
-            body's energies, and ``gravity`` (B, 3).
-        inputs: what acts through the body's energies, by name.
-        counts: how many values an input has, and a parameter may have beside the environments, by name.
-        parts: what the parts are called that a parameter may have values for, such as tendons, by its name.
-        constants: the values of the parameters.
+        parameters: quantities whose values every method accepts, by name: constants of the materials and energies, and
+            ``gravity`` (B, 3).
+        inputs: quantities that act through the body's energies over time, by name.
+        counts: number of values of an input or parameter, without the environments, by name.
+        parts: names of the parts, such as tendons, that a parameter may have values for, by the parameter's name.
+        constants: default values of the parameters.
     """
 
     body: Body
@@ -231,7 +230,7 @@ class Simulator:
     coupling: str = "implicit"
 
     def __post_init__(self) -> None:
-        """Uploads what is constant."""
+        """Checks the arguments and uploads constant data."""
         if not (np.isfinite(self.time_step) and self.time_step > 0.0):
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
@@ -255,7 +254,7 @@ class Simulator:
         energies = self._place_energies()
         self._set = EnergySet(energies, body, self.rest_positions, self.method, self.time_step)
         own = self._set
-        self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # what is no unknown of a solve
+        self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # not unknowns of a solve
         self._pattern = BlockPattern(
             body.vertices, self._held, [points for placed in energies for points in placed.points]
         )
@@ -276,11 +275,11 @@ class Simulator:
 
     @property
     def materials(self) -> dict[str, Material]:
-        """Materials by the name of their region or body; of an empty name where there is one for all."""
+        """Materials by the name of their region or body; an empty name for one material of the whole body."""
         return {"": self.material} if isinstance(self.material, Material) else _flat(self.material)
 
     def _place_energies(self) -> list[Placed]:
-        """Returns the energies of all bodies: their solids, their rigid parts, and what acts in or on them."""
+        """Returns the energies of all bodies: solids, rigid parts, actuators and loads."""
         whole, placed = self.body, list[Placed]()
         for name, body, first in whole.members:
             begin = f"{name}_" if name else ""
@@ -299,7 +298,7 @@ class Simulator:
         return placed
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Refuses changes: what was uploaded would not follow them.
+        """Refuses changes, because uploaded data would not follow them.
 
         Raises:
             AttributeError: always, once the simulator is built.
@@ -309,25 +308,24 @@ class Simulator:
         object.__setattr__(self, name, value)
 
     def tensor(self, values: object) -> torch.Tensor:
-        """Values on the simulator's device, in its type."""
+        """Returns values on the simulator's device, in its type."""
         return torch.as_tensor(values, device=self.device, dtype=self.dtype)
 
     def prepare(self, parameters: Parameters | Constants | None = None) -> Constants:
         """Turns parameters into stiffness, mass and weight; pass the result to `step` when stepping one by one.
 
         Args:
-            parameters: values in place of the simulator's own, by a name of ``parameters``: numbers, (M,) tensors with
-                a value for each element (or chamber), (B, 1) with one for each environment, or (B, M). What is prepared
-                already is returned as it is.
+            parameters: values that replace the simulator's own, by a name of ``parameters``: numbers, tensors (M,) by
+                element (or chamber), (B, 1) by environment, or (B, M). Prepared constants are returned as they are.
 
         Raises:
-            InputError: an unknown name, a value out of range, or another number of values than there are elements.
+            InputError: an unknown name, a value out of range, or a number of values other than the number of elements.
         """
         if isinstance(parameters, Constants):
             return parameters
         for name, value in (parameters or {}).items():
             if name not in self.parameters:
-                raise InputError(f"{name!r} is no parameter of this simulator: it has {', '.join(self.parameters)}.")
+                raise InputError(f"{name!r} is not a parameter of this simulator: it has {', '.join(self.parameters)}.")
             self.parameters[name].check(value)
         given = {**self.constants, **(parameters or {})}
         tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
@@ -341,7 +339,7 @@ class Simulator:
         )
 
     def workspace(self, batch: int) -> Workspace:
-        """Buffers for a batch size, made at their first use."""
+        """Returns the buffers of a batch size, made at their first use."""
         if batch not in self._workspaces:
             workspace = self._make_workspace(batch)
             rows = shards_of(batch, workspace.potential.device)
@@ -356,7 +354,7 @@ class Simulator:
         )
 
     def held_energy(self, name: str, batch: int) -> HeldEnergy:
-        """The energy with an input of that name, by itself in a given state.
+        """Returns the energy with an input of that name, to be evaluated by itself in a given state.
 
         Raises:
             InputError: no energy of the body has that input.
@@ -364,8 +362,8 @@ class Simulator:
         if (batch, name) not in self._held_energies:
             acting = [placed for placed in self._set.placed if name in placed.input_names]
             if not acting:
-                known = ", ".join(self.inputs) or "none"
-                raise InputError(f"Unknown input {name}. The energies of this body accept {known}.")
+                accepted = ", ".join(self.inputs) or "none"
+                raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
             energy, (points,) = acting[0].energy, acting[0].all_points or acting[0].points
             if energy.implicit_only:
                 raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
@@ -374,17 +372,17 @@ class Simulator:
         return self._held_energies[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
-        """The undeformed body at rest.
+        """Returns the undeformed body at rest.
 
         Raises:
-            InputError: the batch is no whole number, one or more.
+            InputError: the batch is not a whole number of at least one.
         """
         _check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
 
     def state(self, q: object, v: object = None) -> State:
-        """Builds a state, with nothing remembered, of arrays or tensors.
+        """Returns a state without memory from arrays or tensors.
 
         Args:
             q: (B, N, 3) positions, or (N, 3) of a batch of one [m].
@@ -405,13 +403,13 @@ class Simulator:
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
-        From the positions that the last step has led to, the solver begins at what the steps before it foretell; from
-        others it begins anew, and finds what a new simulator would.
+        Where the state continues the last step, the solver starts from an extrapolation of the steps before it. From
+        other positions the solution is that of a new simulator.
 
         Args:
-            state: where it is.
-            inputs: what acts on it during the step.
-            parameters: values in place of the simulator's own (see `prepare`), or prepared ones.
+            state: start of the step.
+            inputs: loads and actuation during the step.
+            parameters: values that replace the simulator's own (see `prepare`), or prepared constants.
 
         Returns:
             The new state, differentiable, and the solver's report.
@@ -426,7 +424,7 @@ class Simulator:
         return self._advance(state, inputs, constants)
 
     def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport]:
-        """`step` with arguments that have been checked."""
+        """Advances a batch by one time step; the arguments have been checked."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
@@ -439,14 +437,14 @@ class Simulator:
         return new, report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
-        """(B, D, 3) where the fixed vertices are at the stage [m]."""
+        """Positions (B, D, 3) of the fixed vertices at the stage [m]."""
         now = state.q[:, self.fixed]
         return now if inputs.fixed_positions is None else now + stage.end * (inputs.fixed_positions - now)
 
     def _finish(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor
     ) -> State:
-        """The state that the stage's solution leads to."""
+        """Returns the new state from the stage's solution x (B, N, 3)."""
         new = self.method.finish(state, x, self.time_step)
         memory = self._end_step(state, stage, inputs, constants, x, new.q)
         new = replace(new, memory=memory)
@@ -460,16 +458,16 @@ class Simulator:
     def _end_step(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor, q: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """Returns what the energies remember after a step with the solution x that leads to positions q."""
+        """Returns the energies' memory after a step with the solution x and the new positions q."""
         terms = self.workspace(state.batch).potential.energies
         return self._set.end_step(state, stage, inputs, constants, terms, x, q)
 
     def remember(self, state: State, q: torch.Tensor, constants: Constants) -> State:
-        """Returns the state at positions that are known, with what the energies remember of a step to them.
+        """Returns the state at given positions, with the energies' memory of a step that ends there.
 
         Args:
-            state: where the step starts.
-            q: (B, N, 3) positions where it ends [m].
+            state: start of the step.
+            q: (B, N, 3) positions at its end [m].
             constants: from `prepare`.
         """
         stage = self.method.stage(state, self.time_step)
@@ -479,11 +477,11 @@ class Simulator:
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> Linearisation:
-        """The residual of the step from a state, and its derivative, at any positions.
+        """Returns the residual of a step and its derivative, to be evaluated at any positions.
 
         Args:
-            state: where the step starts.
-            inputs: what acts during it.
+            state: start of the step.
+            inputs: loads and actuation during the step.
             parameters: see `prepare`.
 
         Raises:
@@ -504,7 +502,7 @@ class Simulator:
         )
 
     def _terms(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants) -> StepTerms:
-        """The incremental potential of a step, differentiable in everything that it depends on."""
+        """Returns the terms of a step's incremental potential, differentiable in state, inputs and constants."""
         batch, h = state.batch, stage.step
         # Mass damping is linear in x: it joins inertia and moves the target.
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
@@ -529,7 +527,7 @@ class Simulator:
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
     def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool = False) -> torch.Tensor:
-        """(1 or B, N, 3) gravity, external force and what parts add in equilibria or in steps [N]."""
+        """Loads (1 or B, N, 3): gravity, external force and the loads of the energies [N]."""
         mass = constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
@@ -547,19 +545,19 @@ class Simulator:
         start: torch.Tensor | None = None,
         batch: int | None = None,
     ) -> State:
-        """The state of rest under gravity and constant inputs, differentiable like a step.
+        """Returns the equilibrium under gravity and constant inputs, differentiable like a step.
 
         Args:
-            inputs: what acts on the body.
+            inputs: loads and actuation.
             parameters: see `prepare`.
-            start: (B, N, 3) first guess [m]; the rest shape where left out. Where Newton's method leads nowhere from it
-                in 100 iterations, the loads, inputs and motion of the clamp are put on bit by bit.
-            batch: environments, where no other argument tells.
+            start: (B, N, 3) first guess [m]; the rest shape by default. If Newton's method does not converge from it in
+                100 iterations, loads, inputs and motion of the clamp are increased step by step.
+            batch: number of environments, if it does not follow from another argument.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
-            ConvergenceError: no equilibrium was found, or a body that only grows, as an inflated one whose material
-                cannot hold the pressure.
+            ConvergenceError: no equilibrium was found, or the body grows without limit, as under a pressure that its
+                material cannot hold.
         """
         if not len(self.fixed):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
@@ -596,7 +594,7 @@ class Simulator:
     def _balance(
         self, inputs: Inputs, constants: Constants, rest: torch.Tensor, share: float, start: torch.Tensor
     ) -> tuple[torch.Tensor, SolveReport]:
-        """(B, N, 3) the equilibrium under a share of all loads, inputs and motion of the clamp [m]."""
+        """Returns the equilibrium (B, N, 3) under a share of all loads, inputs and motion of the clamp [m]."""
         batch = len(rest)
         values = self._set.acting(constants, inputs, batch)
         for name in self.inputs:
@@ -623,15 +621,15 @@ class Simulator:
         inputs: Inputs | None = None,
         parameters: Parameters | Constants | None = None,
     ) -> Trajectory:
-        """Steps many times.
+        """Returns the trajectory of many steps.
 
         Memory grows by the states and terms of each step, never by factors: the adjoint of a step rebuilds its Hessian
-        from the state it led to.
+        from the step's end.
 
         Args:
-            state: the start.
+            state: start of the roll-out.
             steps: T.
-            inputs: what acts during all steps, or, with an axis of time, during each of them.
+            inputs: constant over all steps, or with a time axis T.
             parameters: see `prepare`.
 
         Raises:
@@ -656,7 +654,7 @@ class Simulator:
         return Trajectory(q, v, reports, state, self.body, self.time_step)
 
     def _check(self, state: State, inputs: Inputs, constants: Constants) -> None:
-        """One sentence on the first argument that cannot be simulated."""
+        """Raises an InputError for the first argument that cannot be simulated."""
         batch, n, like = state.batch, self.body.n_vertices, self.rest_positions
         fields = {"state.q": state.q, "state.v": state.v}
         if state.previous is not None:
@@ -670,7 +668,7 @@ class Simulator:
         self._set.check_memory(state.memory, batch, like)
 
     def _check_inputs(self, inputs: Inputs, batch: int) -> None:
-        """One sentence on the first input that cannot be simulated."""
+        """Raises an InputError for the first input that cannot be simulated."""
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         accepted = {name: (quantity, self.counts[name]) for name, quantity in self.inputs.items()}

@@ -1,6 +1,6 @@
-"""Roll-outs on a Warp tape: the second door to the gradients that ``torch.autograd`` gives.
+"""Roll-outs on a Warp tape, as an alternative to gradients by ``torch.autograd``.
 
-A recorded roll-out stands between its user's kernels on a tape, and ``tape.backward`` differentiates all of it::
+A recorded roll-out is part of a tape with the user's kernels, and ``tape.backward`` differentiates all of it::
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])
@@ -8,8 +8,8 @@ A recorded roll-out stands between its user's kernels on a tape, and ``tape.back
         wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
     tape.backward(value)
 
-Nothing is copied on the way in or out: torch sees the memory of the arrays that are passed, and the arrays
-that come back see torch's. What a step keeps for its adjoint is what it keeps for torch, its states alone.
+Nothing is copied: torch uses the memory of the arrays that are passed, and the arrays that are returned use
+torch's. A step keeps only its states for its adjoint, as with torch.
 """
 
 from collections.abc import Callable, Mapping
@@ -51,23 +51,23 @@ def record_rollout(
     inputs: Mapping[str, wp.array] | None = None,
     parameters: Mapping[str, wp.array] | None = None,
 ) -> RecordedRollout:
-    """Steps many times, and records on a tape how to differentiate that.
+    """Returns a roll-out, recorded on a tape for differentiation.
 
     Gradients are added to the ``grad`` of every array given that requires gradients. As for Warp's own
     kernels, the arrays must keep their values until ``tape.backward``, which reads the gradients of the
-    results and sets them to zero unless they are to be retained. It may be called again.
+    results and sets them to zero unless ``retain_grad`` is set. It may be called again.
 
     Args:
         tape: entered by the caller or not.
-        simulator: of the body; its device and type are those of every array.
-        q: (B, N) vec3 positions [m]; a material with Prony branches begins relaxed there.
+        simulator: its device and type must be those of every array.
+        q: (B, N) vec3 positions [m]; Prony branches start relaxed.
         v: (B, N) vec3 velocities [m/s].
         steps: T.
-        previous: (q, v) one step earlier, where an earlier roll-out by BDF2 goes on: its ``(q[-2], v[-2])``.
-        inputs: what acts on the bodies, by a name of `Inputs`: ``external_force`` (B, N) vec3 [N], ``fixed_positions``
-            (B, D) vec3 [m], ``attached_mass`` (B, N) [kg], and those of the body's energies (B, n), each but the masses
-            with an axis of time, T, in front if it changes.
-        parameters: values in place of the simulator's, by a name of ``simulator.parameters``, shaped as for
+        previous: (q, v) one step earlier, to continue a roll-out by BDF2: its ``(q[-2], v[-2])``.
+        inputs: arrays by a name of `Inputs`: ``external_force`` (B, N) vec3 [N], ``fixed_positions`` (B, D) vec3 [m],
+            ``attached_mass`` (B, N) [kg], and the inputs of the body's energies (B, n). All but the masses may have a
+            time axis T in front.
+        parameters: values that replace the simulator's, by a name of ``simulator.parameters``, shaped as for
             `Simulator.prepare`.
 
     Raises:
@@ -95,10 +95,10 @@ def record_rollout(
 
 
 class _Leaves:
-    """The inputs of a roll-out as leaves of a torch graph, on the memory of the arrays.
+    """Inputs of a roll-out as leaves of a torch graph, on the memory of the arrays.
 
     Attributes:
-        pairs: each array that requires gradients, with its leaf.
+        pairs: arrays that require gradients, with their leaves.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -107,11 +107,11 @@ class _Leaves:
         self.pairs: list[tuple[wp.array, torch.Tensor]] = []
 
     def vectors(self, name: str, array: wp.array) -> torch.Tensor:
-        """(..., 3) leaf of an array of vec3."""
+        """Returns the leaf (..., 3) of an array of vec3."""
         return self._leaf(name, array, _VECTORS[self.dtype])
 
     def scalars(self, name: str, array: wp.array) -> torch.Tensor:
-        """Leaf of an array of numbers."""
+        """Returns the leaf of an array of numbers."""
         return self._leaf(name, array, _SCALARS[self.dtype])
 
     def _leaf(self, name: str, array: wp.array, dtype: type) -> torch.Tensor:
@@ -126,7 +126,7 @@ class _Leaves:
         return leaf
 
     def result(self, tensor: torch.Tensor) -> wp.array:
-        """The array of vec3 on the memory of a tensor of the graph."""
+        """Returns an array of vec3 on the memory of a tensor of the graph."""
         dtype = _VECTORS[self.dtype]
         array = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=bool(self.pairs))
         return cast(wp.array, array)
@@ -138,7 +138,7 @@ class _Leaves:
         return torch.cuda.stream(wp.stream_to_torch(self._warp_device))
 
     def backward(self, results: list[torch.Tensor], arrays: list[wp.array]) -> Callable[[], None]:
-        """The function that takes the gradients of the results to the leaves."""
+        """Returns the function that adds the gradients of the results to the arrays of the leaves."""
 
         def differentiate() -> None:
             with self.stream():

@@ -348,7 +348,7 @@ def test_directions_equal_the_bfgs_formula():
     state = minimiser.begin(start)
 
     def now(b):
-        return (each[b, vertex_at].flatten().clone() for each in (potential.positions, potential.residual))
+        return (field[b, vertex_at].flatten().clone() for field in (potential.positions, potential.residual))
 
     pairs = ([], [])
     here = [tuple(now(b)) for b in range(2)]
@@ -380,7 +380,7 @@ class OneVertex:
 
     def __init__(self, memory):
         self.own, self.vectors = minimisation_kernels(wp.float64), {}
-        self.progress, self.pairs, self.found = kernels.SolverProgress(), self.own.Pairs(), kernels.Evaluation()
+        self.progress, self.pairs, self.evaluation = kernels.SolverProgress(), self.own.Pairs(), kernels.Evaluation()
         self.tolerances, pairs = kernels.Tolerances(), self.pairs
         for name, variable in kernels.SolverProgress.vars.items():
             setattr(self.progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
@@ -388,10 +388,10 @@ class OneVertex:
         pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))
         pairs.r = wp.zeros((1, memory, memory), dtype=wp.float64, device="cpu")
         for name in ("energy", "size", "balance", "norm"):
-            setattr(self.found, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
-        self.found.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
+            setattr(self.evaluation, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
+        self.evaluation.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
         self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
-        for name in ("known", "newest", "order"):
+        for name in ("stored", "newest", "order"):
             setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
         self.history.start = wp.zeros((1, 1), dtype=wp.vec3d, device="cpu")
         self.history.correction = wp.zeros((1, 3, 1), dtype=wp.vec3d, device="cpu")
@@ -405,7 +405,7 @@ class OneVertex:
         inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
         kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
         views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
-        inputs = [1, self.tolerances, inertia, self.found, views["origin"], views["direction"], self.clamped]
+        inputs = [1, self.tolerances, inertia, self.evaluation, views["origin"], views["direction"], self.clamped]
         inputs += [views["positions"], views["gradient"], self.progress, self.pairs, self.history]
         wp.launch_tiled(self.own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
 

@@ -459,7 +459,7 @@ def test_a_line_search_that_gives_up(iterations, made, clamped, phase, wanted, s
         getattr(one.progress, name).fill_(value)
     one.progress.halvings.fill_(kernels.MOST_HALVINGS - 1)
     one.progress.rounding.fill_(np.inf)
-    one.found.energy.fill_(np.nan)
+    one.evaluation.energy.fill_(np.nan)
     one.clamped.fill_(clamped)
     one.accept()
     assert (one["phase"], one["wanted"], one["stalls"]) == (phase, wanted, stalls + 1)

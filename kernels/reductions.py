@@ -14,13 +14,13 @@ ZERO = wp.float64(0.0)
 
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
-    """The sum over a block, known to every thread of it."""
+    """Returns the sum over a block, in every thread of it."""
     return wp.tile_sum(wp.tile(value))[0]
 
 
 @wp.func
 def block_max(value: wp.float64) -> wp.float64:
-    """The maximum over a block, known to every thread of it."""
+    """Returns the maximum over a block, in every thread of it."""
     return wp.tile_max(wp.tile(value))[0]
 
 

@@ -1,4 +1,4 @@
-"""The values of an energy at a point, read from one array for each of them: of its part, its own, or of all."""
+"""Values of an energy at a point, each read from an array by part, by point, or common to all points."""
 
 import functools
 from typing import Any

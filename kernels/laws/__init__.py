@@ -1,4 +1,4 @@
-"""Laws of tension, one module a law; `kernels.axial` makes the same kernels of each.
+"""Laws of tension, one module per law; `kernels.axial` makes the kernels of a law.
 
 A module has
 

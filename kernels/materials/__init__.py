@@ -1,4 +1,4 @@
-"""Elastic energy densities, one module a material; `kernels.solid` makes the same kernels of each.
+"""Elastic energy densities, one module per material; `kernels.solid` makes the kernels of a material.
 
 The energy of a point is ``sum_t m_t W_t(F)``, the moduli m_t times the volume that the point carries for that term
 (shape terms and volume terms may be integrated at different points, so that a modulus may be zero). A module has

@@ -281,7 +281,7 @@ def test_a_tendon_cannot_push():
             lambda: Tendons([route(0.01)], directions=[[*ACROSS, ACROSS[0]]]),
             "the tendons have [3] directions of offsets",
         ),
-        (lambda: Tendons([route(0.01)], directions=[["up"]]), "a direction that is no array: 'up'"),
+        (lambda: Tendons([route(0.01)], directions=[["up"]]), "a direction that is not an array: 'up'"),
         (lambda: Tendons([route(0.01), route(0.02)], labels=("a", "a")), "tendons are called a, a: give each a name"),
         (
             lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]),

@@ -48,7 +48,7 @@ class Medium(Energy):
     ``added_layer`` [m].
 
     Raises:
-        InputError: a value out of range, or faces that are none of the surface.
+        InputError: a value out of range, or faces that are not on the surface.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (
@@ -64,8 +64,8 @@ class Medium(Energy):
     normal: Parameter = 0.0  # C_n, the same
     tangential: Parameter = 0.0  # C_t, the same
     layer: Parameter = 0.0  # l [m], the same
-    buoyancy: bool = True  # whether the medium carries the weight of what the body displaces
-    faces: NDArray[np.int64] | None = None  # (F, n) of `boundary_faces` that it acts on; all where left out
+    buoyancy: bool = True  # whether the displaced medium carries the body
+    faces: NDArray[np.int64] | None = None  # (F, n) faces of `boundary_faces` that the medium acts on; all by default
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -102,7 +102,7 @@ class Medium(Energy):
 
 
 class BoundMedium(BoundEnergy):
-    """A medium over the steps of a simulator: where the surface was, where it points, and buoyancy."""
+    """A medium over the steps of a simulator: surface positions and normals at the step's start, and buoyancy."""
 
     def __init__(self, medium: Medium, placement: EnergySite) -> None:
         super().__init__(medium, placement)
@@ -156,7 +156,7 @@ class BoundMedium(BoundEnergy):
 
 
 class MediumTerm(Term):
-    """Kernels of what a medium does over a stage."""
+    """Kernels of a medium over a stage."""
 
     @property
     @override
@@ -189,7 +189,7 @@ class MediumTerm(Term):
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`; through the energy's own derivatives, which torch takes twice."""
+        """Returns the function of `Term.adjoint`; torch differentiates the energy twice."""
         (s,) = self.sets
         nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)
         shares = torch.as_tensor(s.source.gradients[..., 0], device=self.launcher.device)  # (F, Q, K)
@@ -213,7 +213,7 @@ class MediumTerm(Term):
 def _energy(
     x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
 ) -> torch.Tensor:
-    """The sum of what `kernels.medium` has for each point."""
+    """Returns the energy of `kernels.medium`, summed over all points."""
     size = area.norm(dim=-1)
     n = area / size[..., None].clamp_min(1e-30)
     d, inertial = x - reference, ((x - target) * n).sum(-1)

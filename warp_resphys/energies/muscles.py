@@ -120,10 +120,10 @@ class Muscles(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """Returns the quadrature points of the cells; a cell that two muscles cross is there twice.
+        """Returns the quadrature points of the cells; a cell that two muscles cross has its points twice.
 
         Raises:
-            InputError: a cell that there is not.
+            InputError: a cell number out of range.
         """
         points, weights = mesh.element.rule
         nodes, operators, volumes, numbers = [], [], [], []
@@ -144,7 +144,7 @@ class Muscles(Energy):
         return (PartPoints(*map(np.concatenate, (nodes, operators, numbers, volumes))),)
 
     def lines(self, mesh: Mesh) -> dict[str, NDArray[np.float64]]:
-        """(2, 3) a line through the middle of each muscle, as far as its cells reach along it [m], by name."""
+        """Returns a line (2, 3) through the middle of every muscle, as long as the extent of its cells [m], by name."""
         lines = {}
         for name, muscle in zip(self.names, self.muscles, strict=True):
             corners = mesh.vertices[np.unique(mesh.cells[np.asarray(muscle.cells)])]

@@ -34,7 +34,7 @@ from .launcher import Launcher
 
 
 class PointwiseEnergy(Energy):
-    """The sum over points of a weight times a function of what the point sees and of its values.
+    """Sum over points of a weight times a function of the point's operator value and its values.
 
     A parameter's value where a simulation is given no other is the attribute of its name. Energies that remember
     something declare `memory`, one number a point, which is zero for a body that has been at rest for long.
@@ -122,7 +122,7 @@ class BoundPointwise(BoundEnergy):
         self.memory = tuple(Memory(q.name, q.unit, (points.n_points,), q.per or "point") for q in energy.memory)
 
     def _seen(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns what the points see of positions (B, N, 3)."""
+        """Returns the operator values of the points at positions (B, N, 3)."""
         seen = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes]).flatten(1, 2)
         return seen[..., 0] if seen.shape[-1] == 1 else seen
 
@@ -185,22 +185,22 @@ class PointwiseTerm(ReadingTerm):
 
 
 def at_vertices(vertices: ArrayLike, part: ArrayLike = 0) -> PartPoints:
-    """Returns points that see where vertices (P,) are, of weight one.
+    """Returns points of weight one whose operator gives the positions of vertices (P,).
 
     Args:
         vertices: their numbers.
-        part: the number of the part of each, or of all.
+        part: part number of every point, or of all points.
     """
     nodes = np.asarray(vertices, dtype=np.int64).reshape(-1, 1)
     return _unweighted(nodes, np.ones((len(nodes), 1, 1, 1)), part)
 
 
 def between(pairs: ArrayLike, part: ArrayLike = 0) -> PartPoints:
-    """Returns points that see the vectors from the first to the second vertices of (P, 2) pairs, of weight one.
+    """Returns points of weight one whose operator gives the vectors between the vertices of pairs (P, 2).
 
     Args:
         pairs: numbers of the vertices.
-        part: the number of the part of each, or of all.
+        part: part number of every point, or of all points.
     """
     nodes = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
     return _unweighted(nodes, np.tile(np.array([-1.0, 1.0])[:, None], (len(nodes), 1, 1, 1)), part)
@@ -211,7 +211,7 @@ def _unweighted(nodes: NDArray[np.int64], operators: NDArray[np.float64], part: 
 
 
 def in_cells(mesh: Mesh, cells: ArrayLike) -> PartPoints:
-    """Returns the quadrature points of some cells, which see the deformation gradient; their weights are volumes [m^3].
+    """Returns quadrature points of some cells; operators give the deformation gradient, weights are volumes [m^3].
 
     Args:
         mesh: the rest shape.

@@ -56,7 +56,7 @@ class PointInertia(Energy):
 
 
 class BoundInertia(BoundEnergy):
-    """Inertia of vertices that others determine, over the steps of a simulator, which gives its values."""
+    """Inertia of vertices that others determine; the simulator gives its values in every step."""
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
@@ -200,7 +200,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     """Returns the energies of a rigid part of a body: its rigidity and its inertia."""
     cells, controls = body.mesh.region(name), body.controls[name]
     corners = body.mesh.vertices[controls]
-    # The gradients of barycentric coordinates do not ask how the corners are ordered.
+    # The gradients of barycentric coordinates do not depend on the order of the corners.
     gradients = np.linalg.inv(np.vstack([corners.T, np.ones(4)]))[:, :3]
     moments, volume = _moments(body.mesh, cells, corners)
     carried = scipy.sparse.csr_array(np.array([[volume]]))

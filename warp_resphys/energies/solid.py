@@ -29,7 +29,7 @@ VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of 
 
 
 def device_matrix(matrix: scipy.sparse.sparray, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
-    """A sparse matrix on a device."""
+    """Returns a sparse matrix on a device."""
     coo = matrix.tocoo()
     indices = torch.as_tensor(np.stack([coo.row, coo.col]).astype(np.int64))
     tensor = torch.sparse_coo_tensor(indices, torch.as_tensor(coo.data), coo.shape, check_invariants=False)
@@ -37,7 +37,7 @@ def device_matrix(matrix: scipy.sparse.sparray, device: torch.device, dtype: tor
 
 
 def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """(1 or B, rows): a sparse (rows, M) operator applied to (1 or B, 1 or M) element values.
+    """Returns (1 or B, rows) products of a sparse operator (rows, M) with element values (1 or B, 1 or M).
 
     Raises:
         InputError: values for another number of elements.
@@ -53,11 +53,11 @@ def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Solid(Energy):
-    """The energy of a material in a body, or in a region of it; a body may have several.
+    """Energy of a material in a body or in one of its regions.
 
     The step's values are ``stiffness`` (B, P, T), the moduli times the points' volumes [J]; and, see
     `energies.viscosity`, ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; and ``dilation_offset``
-    (B, P), w. Its memory is ``viscous_strain`` (B, K, P, 3, 3), the strain that each Prony branch still carries.
+    (B, P), w. Its memory is ``viscous_strain`` (B, K, P, 3, 3), the strain of every Prony branch.
 
     Args:
         discretisation: of the body, or of some of its cells.
@@ -145,7 +145,7 @@ def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
 
 
 class BoundSolid(BoundEnergy):
-    """A solid over the steps of a simulator: its stiffness, its mass, and the viscous strain that it remembers."""
+    """A solid over the steps of a simulator: stiffness, mass and viscous strain."""
 
     def __init__(self, solid: Solid, placement: EnergySite) -> None:
         super().__init__(solid, placement)
@@ -222,7 +222,7 @@ class SolidTerm(Term):
     Args:
         launcher: of the potential.
         sets: the solid's points.
-        material: whose law it is.
+        material: gives the law.
         carried: (P, T) volumes that the points carry for each modulus [m^3].
     """
 
@@ -244,7 +244,7 @@ class SolidTerm(Term):
         return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        """What the kernels of this energy have in common."""
+        """Returns the arguments that all kernels of this energy share."""
         own, (stiffness, viscosity, strain, dilation) = self.launcher, (values[name] for name in self.shapes)
         assert stiffness is not None
         assert viscosity is not None
@@ -300,7 +300,7 @@ class SolidTerm(Term):
         return differentiate
 
     def strain(self, positions: torch.Tensor) -> torch.Tensor:
-        """(B, P, 3, 3) Green strain of (B, N, 3) positions."""
+        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3)."""
         own = self.launcher
         out = own.zeros(self.n_points, 3, 3)
         for s in self.sets:
@@ -310,7 +310,7 @@ class SolidTerm(Term):
         return out
 
     def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
-        """(B, N, 3) transposed derivative of `strain` applied to (B, P, 3, 3)."""
+        """Returns the transposed derivative (B, N, 3) of `strain`, applied to (B, P, 3, 3)."""
         own = self.launcher
         out, stress = torch.zeros_like(positions), own.zeros(self.n_points, 3, 3)
         adjoint = adjoint.contiguous()
@@ -324,7 +324,7 @@ class SolidTerm(Term):
 
 
 class GreenStrain(torch.autograd.Function):
-    """E = (F^T F - I) / 2 at every point, (B, N, 3) to (B, P, 3, 3)."""
+    """Green strain E = (F^T F - I) / 2 at every point, from (B, N, 3) to (B, P, 3, 3)."""
 
     @override
     @staticmethod

@@ -1,13 +1,13 @@
-r"""Weights on strings: masses that swing below a body, and pull on it only where their strings are taut.
+r"""Weights on strings: masses that swing below a body and pull on it only when their strings are taut.
 
 A string of length L and compliance c (inextensible for c = 0) is tied to a, the mean of some vertices, and carries a
 mass m. In an implicit stage of effective length h, in which inertia and gravity alone would take the mass to y, its
 place p minimises m/(2 h^2) |p - y|^2 and the string's energy together. It lies on the line from a to y, so that it can
-be eliminated: what is left for the body is a spring from a to y that only pulls,
+be eliminated: the body sees a spring from a to y that only pulls,
 
     E(a) = k s(|a - y| - L),     k = M / (1 + c M),     M = m / h^2,
 
-s being half the square of what is positive, rounded over a short distance (see `tendons`); and the mass goes to
+with s half the square of the positive part, rounded over a short distance as in `tendons`; and the mass goes to
 
     p = y + (k / M) s'(|a - y| - L) (a - y) / |a - y| .
 
@@ -46,7 +46,7 @@ class Strings(Energy):
     """Weights on strings.
 
     Its input is ``payload`` [kg], constant during a motion, its parameters are ``string_length`` [m] and
-    ``string_compliance`` [m/N]; each has a value for every string.
+    ``string_compliance`` [m/N]; all have one value for every string.
 
     Raises:
         InputError: no string, one that is tied to nothing, or a length or compliance out of range.
@@ -58,10 +58,10 @@ class Strings(Energy):
     )
     inputs: ClassVar[tuple[Quantity, ...]] = (PAYLOAD,)
 
-    tied_to: Sequence[NDArray[np.int64]]  # the vertices of each string, whose mean it is tied to
+    tied_to: Sequence[NDArray[np.int64]]  # vertices of every string, which is tied to their mean
     length: Parameter  # L [m]: a number, (S,) values with one for each string, (B, 1), or (B, S)
     compliance: Parameter = 0.0  # c [m/N], the same
-    toe: float = 1e-5  # by which a string is longer than its length when it is fully taut [m]
+    toe: float = 1e-5  # elongation at which a string is fully taut [m]
 
     def __post_init__(self) -> None:
         """Checks the values."""

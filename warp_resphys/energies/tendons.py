@@ -39,7 +39,7 @@ from .launcher import Launcher, warp_view
 
 @dataclass(frozen=True)
 class TendonPoints(PartPoints):
-    """The pieces of tendons between their guides, tendon after tendon; the operators are those of the kernels' F."""
+    """Pieces of tendons between their guides, tendon after tendon; the operators give the F of ``kernels.tendons``."""
 
     rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
 
@@ -57,7 +57,7 @@ class Tendons(Energy):
     """T L, or a spring on the length, of every tendon.
 
     Its inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m], its parameters ``tendon_stiffness`` [N/m] and,
-    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero unless others are given; each has a value for
+    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero by default. All have one value for
     every tendon.
 
     Raises:
@@ -73,8 +73,8 @@ class Tendons(Energy):
     # k [N/m], the parameter ``tendon_stiffness``: a number, (T,) values with one for each tendon, (B, 1), or (B, T);
     # zero for tendons whose tension is commanded
     stiffness: Parameter = 0.0
-    toe: float = 1e-4  # by which a tendon is longer than its winch leaves it when it is fully taut [m]
-    reach: float = 1e-3  # how far outside of the body a guide may lie [m]
+    toe: float = 1e-4  # elongation at which a tendon is fully taut [m]
+    reach: float = 1e-3  # largest distance of a guide outside of the body [m]
     labels: Sequence[str] = ()  # of the tendons; numbers where left out
     # one or two directions for each tendon, the same number for all, along which its guides may be off: (3,) for all of
     # its guides, or (G, 3) for each; per metre of offset, so that a direction of length one is an offset of the guide
@@ -111,7 +111,7 @@ class Tendons(Energy):
                 try:
                     direction = np.asarray(given, dtype=np.float64)
                 except (TypeError, ValueError):
-                    raise InputError(f"tendon {number} has a direction that is no array: {given!r}.") from None
+                    raise InputError(f"tendon {number} has a direction that is not an array: {given!r}.") from None
                 if direction.shape not in ((3,), route.shape):
                     raise InputError(
                         f"tendon {number} has a direction of offsets of shape {direction.shape}: give three numbers, "
@@ -121,7 +121,7 @@ class Tendons(Energy):
                     raise InputError(f"tendon {number} has a direction of offsets that is zero or not finite.")
 
     def rerouted(self, offsets: ArrayLike) -> "Tendons":
-        """The same tendons where offsets take their guides, without offsets of their own.
+        """Returns the tendons with their guides moved by offsets, and without directions of offsets.
 
         Args:
             offsets: (T, D) along the D directions of each of the T tendons [m].
@@ -135,7 +135,7 @@ class Tendons(Energy):
 
     @property
     def offset_count(self) -> int:
-        """Directions that each tendon has."""
+        """Number of directions of offsets, equal for all tendons."""
         return len(self.directions[0]) if len(self.directions) else 0
 
     @property
@@ -145,7 +145,7 @@ class Tendons(Energy):
 
     @property
     def guides(self) -> list[NDArray[np.float64]]:
-        """(G, 3) of each tendon [m]."""
+        """Guides (G, 3) of every tendon [m]."""
         return [np.asarray(route, dtype=np.float64) for route in self.routes]
 
     @property
@@ -165,14 +165,14 @@ class Tendons(Energy):
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """See `Energy.prepare`; offsets without a direction are zero."""
+        """Returns the values for the energy's terms; offsets without a direction are zero."""
         values = super().prepare(constants)
         zero = torch.zeros_like(values["tendon_stiffness"])
         return values | {offset.name: zero for offset in OFFSETS[self.offset_count :]}
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
-        """The pieces between guides, each bound to the cells that its ends lie in.
+        """Returns the pieces between guides, as points on the vertices of the cells around their ends.
 
         Raises:
             InputError: a guide outside of the body.
@@ -218,7 +218,7 @@ class Tendons(Energy):
 def _difference(
     mesh: Mesh, cells: NDArray[np.int64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Vertices and weights (K', 3) whose sums lead from one place to another, each vertex once."""
+    """Returns unique vertices and their weights (K', 3), whose sum is the vector from one place to another."""
     vertices, inverse = np.unique(mesh.cells[cells].ravel(), return_inverse=True)
     sums = np.zeros((len(vertices), 3))
     np.add.at(sums, inverse, np.concatenate([-weights[0], weights[1]]))
@@ -232,7 +232,7 @@ class TendonTerm(PartTerm):
     Args:
         launcher: of the potential.
         sets: the pieces.
-        tendons: whose they are.
+        tendons: the tendons of the pieces.
     """
 
     couples_cells = True
@@ -263,8 +263,8 @@ class TendonTerm(PartTerm):
         return dict.fromkeys(names, (self.count,))
 
     @property
-    def _found(self) -> tuple[Any, Any]:
-        """What `before` writes: c and the tension of each tendon."""
+    def _pull(self) -> tuple[Any, Any]:
+        """Outputs of `before`: c and the tension of every tendon."""
         return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
     @override
@@ -273,7 +273,7 @@ class TendonTerm(PartTerm):
         tension, contraction, stiffness, *offsets = self.views(values)
         runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
         inputs = [active, *runs, tension, contraction, stiffness, self._toe, positions]
-        outputs = [*self._found, warp_view(self._spring, wp.vec3d)]
+        outputs = [*self._pull, warp_view(self._spring, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
@@ -281,12 +281,12 @@ class TendonTerm(PartTerm):
         tension, _, stiffness, *_ = self.views(values)
         return kernels.local_step, [
             *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),
-            *(*self._found, warp_view(self._spring, wp.vec3d), positions),
+            *(*self._pull, warp_view(self._spring, wp.vec3d), positions),
         ]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._found, positions]
+        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._pull, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -296,7 +296,7 @@ class TendonTerm(PartTerm):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
-            inputs = [s.nodes, s.gradients, self.part, self._found[0], positions]
+            inputs = [s.nodes, s.gradients, self.part, self._pull[0], positions]
             out = [warp_view(self._direction, wp.mat33d)]
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
@@ -320,11 +320,10 @@ class TendonTerm(PartTerm):
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """See `Term.adjoint`."""
         own, (s,) = self.launcher, self.sets
         views = [warp_view(vectors, wp.vec3d) for vectors in (positions, direction)]
         shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
-        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._found, *views]
+        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._pull, *views]
         outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),

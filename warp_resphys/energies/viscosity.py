@@ -34,17 +34,17 @@ StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
 
 @dataclass(frozen=True)
 class Viscosity:
-    """Viscous constants of a solid; None for a part that does not act."""
+    """Viscous constants of a solid; None for an absent part."""
 
     damping: torch.Tensor  # (1 or B,) retardation time beta [s]
-    acts: bool  # whether beta may be other than zero
+    acts: bool  # whether beta may be nonzero
     ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu
     time: torch.Tensor | None  # (1 or B, K) their relaxation times [s]
 
     def step_values(
         self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, stage: ImplicitStage, time_step: float
     ) -> StepValues:
-        """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step, the last two None where nothing acts.
+        """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step, the last two None without viscosity.
 
         Args:
             strain: of the solid.

@@ -41,7 +41,7 @@ def mesh_arm(
 
     Raises:
         MeshError: a size is not positive or would give millions of cells; rotated segments are to be meshed with
-            hexahedra; there is no gmsh for tetrahedra, or it fails.
+            hexahedra; or gmsh, which makes tetrahedra, is not installed or fails.
     """
     if cells not in CELLS:
         raise MeshError(f"the arm's cells are {cells!r}: choose {' or '.join(CELLS)}.")

@@ -95,7 +95,7 @@ def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[flo
     """The numbers of a measure as a tuple.
 
     Raises:
-        MeshError: one is no finite number, or not positive.
+        MeshError: a measure is not finite or not positive.
     """
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise MeshError(f"the arm's {name} are {given!r}: give a list of numbers.")

@@ -18,7 +18,7 @@ def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
     Vertices are numbered from the base down.
 
     Raises:
-        MeshError: there is no gmsh, or it fails.
+        MeshError: gmsh is not installed, or it fails.
     """
 
     def describe(gmsh: Any) -> None:

@@ -94,7 +94,7 @@ class Element:
 
     name: str
     shape: Shape  # its shape functions; corners come first
-    parents: list[list[int]]  # for each node that is no corner, the corners in whose middle it lies
+    parents: list[list[int]]  # for every node that is not a corner, the corners whose mean it is
     rule: Rule  # points and weights of the shape term of an energy
     faces: IntArray  # (F, n) nodes, counter-clockwise seen from outside, corners first
     # (m, 3) exponents of the polynomials that the deformation gradient of the volume term is projected on, so that the

@@ -36,7 +36,7 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
-        raise InputError("a point that is to be found in a mesh is not finite.")
+        raise InputError("a point to locate in a mesh is not finite.")
     element, nodes = mesh.element, mesh.vertices[mesh.cells]  # (M, K, 3)
     low, high = nodes.min(axis=1), nodes.max(axis=1)
     cells, weights, gradients, outside = [], [], [], []

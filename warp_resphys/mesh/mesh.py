@@ -102,7 +102,7 @@ def box_hexahedra(
         nodes: Of a hexahedron: 8, 20 or 27; those beyond the corners are numbered after these.
 
     Raises:
-        MeshError: A length is not positive and finite, a number is not a positive integer, or there is no such element.
+        MeshError: A length is not positive and finite, a number is not a positive integer, or the element is unknown.
     """
     if nodes not in (8, 20, 27):
         raise MeshError(f"hexahedra have 8, 20 or 27 nodes, not {nodes}")
@@ -229,10 +229,10 @@ def surface_vertices(mesh: Mesh) -> IntArray:
 
 @dataclass(frozen=True)
 class Place:
-    """Where points lie, by coordinates: each a plane across its axis, or from one to another.
+    """Region of points by coordinates: every coordinate a plane, or an interval.
 
     Raises:
-        MeshError: no coordinate is given, or one is no finite number nor two that do not fall.
+        MeshError: no coordinate is given, or a coordinate is neither a finite number nor two in ascending order.
     """
 
     x: Extent | None = None  # [m]

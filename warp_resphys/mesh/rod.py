@@ -42,8 +42,8 @@ def rod(
             for one length, up to 1 for layers that are as slender as one another.
 
     Raises:
-        MeshError: fewer than two points, a radius that is not positive, a number that is no whole one, a grading out of
-            its range, or a curve that is bent more sharply than the rod is thick.
+        MeshError: fewer than two points, a radius that is not positive, a count that is not a whole number, a grading
+            out of its range, or a curve that is bent more sharply than the rod is thick.
     """
     axis, order = np.asarray(centreline, dtype=np.float64), 1 if nodes == 8 else 2
     if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():

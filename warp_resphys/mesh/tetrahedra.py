@@ -33,7 +33,7 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
         what: the body, for messages.
 
     Raises:
-        MeshError: there is no gmsh, or it fails.
+        MeshError: gmsh is not installed, or it fails.
     """
     try:
         import gmsh

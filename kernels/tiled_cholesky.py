@@ -204,7 +204,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
         unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but for one beyond n on the diagonal
         matrices: wp.array2d[scalar],  # (B, as many)
     ):
-        """Copies with whole blocks, which is cheaper than one thread per number."""
+        """Resets matrices to `unit`, with whole blocks, which is cheaper than one thread per number."""
         b, lane = wp.tid()
         if active[b] != 0:
             for k in range(lane, unit.shape[0], wp.block_dim()):

@@ -8,8 +8,8 @@
 # %% [markdown]
 # # Two silicones and a rigid cap
 #
-# Many soft robots are cast of several materials and end in a printed part. This beam of 10 cm has a stiff half, a soft
-# half, and a rigid cap of 1 cm, on which three markers sit. Both moduli are found from them.
+# Many soft robots are cast of several materials and end in a printed part. This beam has 5 cm of stiff silicone, 4 cm
+# of soft silicone and a rigid cap of 1 cm, on which three markers sit. They identify both moduli.
 #
 # Cells have names as *regions* of the mesh. A region has a material of its own, and its parameters by its name:
 # `soft_youngs_modulus`. A *rigid part* is an affine body: four control vertices carry all of its vertices, and a stiff
@@ -67,7 +67,7 @@ for name, value in identified.parameters.items():
 # %% [markdown]
 # ## What a second modulus is worth
 #
-# The simplest model that could do as well has one modulus. On the markers it comes close: how far the tip sags and how
+# A simpler model has one modulus. On the markers it comes close: how far the tip sags and how
 # fast it swings fix two numbers, and a mean modulus gives nearly both. Where no marker sits it is wrong. So the models
 # are compared on the whole body, which only a simulated robot shows:
 
@@ -119,19 +119,19 @@ both = wr.Simulator(
     time_step=0.01,
 )
 fall = both.rollout(both.rest_state(), 10)
-height = fall.q[-1, 0, scene.vertex_slice("cube"), 2].mean().item() - 0.01
+shift = fall.q[-1, 0, scene.vertex_slice("cube"), 2].mean().item() - 0.01
 print(
-    f"after 0.1 s the cube has fallen {-1e3 * height:.1f} mm, the tip of the beam "
+    f"after 0.1 s the cube has fallen {-1e3 * shift:.1f} mm, the tip of the beam "
     f"{-1e3 * (fall.q[-1, 0, scene.vertex_slice('beam'), 2][cap].mean().item() - mesh.vertices[cap, 2].mean()):.1f} mm"
 )
 
 # %% [markdown]
-# In an experiment all of this is YAML: `regions`, `rigid`, and a material's `regions`, as in
+# In an experiment, regions, rigid parts, further meshes, glue and materials are YAML, as in
 # [`experiment=beam_regions`](../simulator.md).
 #
 # ## What to take from this
 #
-# Both moduli come back within two per cent from three markers on the cap; on the whole body one modulus is a hundred
+# Both moduli come back within two per cent from three markers on the cap; on the whole body one modulus is dozens of
 # times further off than two.
 
 # %%
@@ -141,4 +141,4 @@ for name, value in wanted.items():
 assert everywhere["one modulus"].mean() > 20 * everywhere["two moduli"].mean()
 assert at_markers["two moduli"] < 0.2
 assert strain < 1e-4
-assert abs(height + 9.80709 * 0.01**2 * 10 * 11 / 2) < 1e-6
+assert abs(shift + 9.80709 * 0.01**2 * 10 * 11 / 2) < 1e-6

@@ -69,9 +69,17 @@ def test_forces_are_reconstructed_from_pixels():
     assert corrected < 0.1 * uncorrected
 
 
-def test_a_marker_behind_the_camera_is_not_seen():
-    behind = wr.CameraMarkers(MARKERS, camera().matrix * torch.tensor([[1.0], [1.0], [-1.0]], dtype=torch.float64))
-    assert behind(torch.as_tensor(MESH.vertices)[None]).isnan().all()
+def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
+    # The camera looks from the middle of the beam along it: the markers at the tip are in front, the other is behind.
+    looks = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    matrix = np.diag([FOCAL, FOCAL, 1.0]) @ np.column_stack([looks, -looks @ [0.08, 0.01, 0.0]])
+    sees, at = wr.CameraMarkers(MARKERS, torch.as_tensor(matrix)), torch.as_tensor(MESH.vertices)[None]
+    q = at.clone().requires_grad_(True)
+    shown = sees(q)
+    assert shown.isnan().any(-1)[0].tolist() == [False, True, False]
+    sees.residual(shown, torch.where(shown.isnan(), shown, 0.0).detach()).square().sum().backward()
+    assert q.grad.isfinite().all()
+    assert sees.transposed_jacobian(at).isfinite().all()
 
 
 def test_bad_input_is_named():

@@ -197,3 +197,10 @@ def test_bad_markers(settings, sentence):
     with pytest.raises(InputError) as error:
         bind_markers(MESH, **{"positions": POINTS, "names": NAMES, **settings})
     assert str(error.value).startswith(sentence)
+
+
+def test_a_map_of_one_environment_serves_a_batch():
+    positions = torch.as_tensor(np.random.default_rng(0).normal(size=(3, 6, 3)))
+    one, three = MarkerMap.at_vertices(torch.tensor([[1, 4]])), MarkerMap.at_vertices(torch.tensor([[1, 4]] * 3))
+    torch.testing.assert_close(one(positions), three(positions), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(one.transposed_jacobian(positions), three.transposed_jacobian(positions))

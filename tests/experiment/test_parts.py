@@ -92,6 +92,9 @@ def test_a_run_accepts_them():
         ("glued=[{region: tip, at: {x: 0.0}, to: body}]", r"glued\[0\].at: no vertex of the region 'tip'"),
         ("glued=[{region: tip, at: {x: 0.1}, to: body}]", "farther than the tolerance"),
         ("parts.tip.shift=[0,0]", "parts.tip.shift"),
+        ("parts={body: {mesh: {kind: box_hexahedra, size: [1, 1, 1], divisions: [1, 1, 1]}}}", r"parts\.body"),
+        ("regions={tip: {x: [0, 0.05]}}", r"regions\.tip"),
+        ("glued=[{region: tip, at: {x: 0.05}, to: body}, {region: tip, at: {x: 0.05}, to: body}]", "is glued twice"),
     ],
 )
 def test_what_does_not_fit_is_named(override, key):

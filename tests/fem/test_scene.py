@@ -19,6 +19,7 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.mesh.mesh import join
 
 SOFT = Corotated(2e5, 0.45)
 
@@ -73,3 +74,10 @@ def test_materials_and_the_joined_mesh_of_a_scene():
         Scene({"a": finger(), "ball": ball()}).mesh  # noqa: B018
     with pytest.raises(InputError, match="one or more bodies"):
         Scene({})
+
+
+def test_regions_of_one_name_are_refused():
+    mesh = box_hexahedra()
+    named = Mesh(mesh.vertices, mesh.cells, {"b": np.arange(1)})
+    with pytest.raises(MeshError, match="two regions have the name 'a_b'"):
+        join({"a_b": mesh, "a": named})

@@ -136,3 +136,11 @@ def test_invalid_motions_are_refused(robot):
         wr.identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match="does not train recurrent networks"):
         wr.fit_force(robot, wr.reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
+
+
+def test_whole_states_with_gaps_are_refused_by_gauss_newton(robot):
+    motion = let_go(robot, 0.1, known_start=True)
+    observed = motion.observed.clone()
+    observed[3, 0, 5] = torch.nan
+    with pytest.raises(wr.InputError, match=r"some were not seen.*lbfgsb"):
+        wr.reconstruct(beam(200e3), dataclasses.replace(motion, observed=observed))

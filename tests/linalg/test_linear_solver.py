@@ -229,3 +229,23 @@ def test_a_matrix_like_an_arrow_is_solved_as_one():
     assert isinstance(make_linear_solver("auto", rows, cols, n, 3, cpu, torch.float64), BorderedSolver)
     chain = rows - cols < 2
     assert isinstance(make_linear_solver("auto", rows[chain], cols[chain], n, 3, cpu, torch.float64), BandedSolver)
+
+
+def test_an_indefinite_arrow_may_have_a_singular_band():
+    """Both unknowns that couple to the hub alone have no stiffness of their own: only pivoting solves this."""
+    n = 30
+    rows, cols = np.array(sorted({(i, i) for i in range(n)} | {(i, 0) for i in range(n)})).T
+    solver = BorderedSolver(rows, cols, n, 1, torch.device("cpu"), torch.float64)
+    dense = np.eye(n)
+    dense[3, 3] = 0.0
+    dense[1:, 0] = dense[0, 1:] = np.linspace(0.5, 1.0, n - 1)
+    values = torch.zeros(1, solver.n_values, dtype=torch.float64)
+    values[0, solver.address[:, 0]] = torch.as_tensor(dense[rows, cols])
+    assert solver.factor(values).failed.all()
+    right = torch.as_tensor(np.random.default_rng(0).normal(size=(1, n, 2)))
+    factor = solver.factor(values, definite=False)
+    assert not factor.failed.any()
+    np.testing.assert_allclose(dense @ factor.solve(right)[0].numpy(), right[0], atol=1e-12)
+    column = right[:, solver.dofs, 0].clone()
+    factor.solve_in_place(column)
+    torch.testing.assert_close(column, factor.solve(right)[:, solver.dofs, 0])

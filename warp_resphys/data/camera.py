@@ -42,5 +42,6 @@ class CameraMarkers(Observation):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns pixels (B, M, 2), NaN for a marker behind the camera."""
         rays = self.markers(positions) @ self.matrix[:, :3].mT + self.matrix[:, 3]
-        depth = rays[..., 2:]
-        return rays[..., :2] / torch.where(depth > 0.0, depth, torch.nan)
+        in_front = rays[..., 2:] > 0.0
+        pixels = rays[..., :2] / torch.where(in_front, rays[..., 2:], 1.0)
+        return torch.where(in_front, pixels, torch.nan)  # A NaN of its own would spread through the gradient.

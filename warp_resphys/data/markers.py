@@ -74,14 +74,15 @@ class MarkerMap(Markers):
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Applies C: maps values at the vertices (B, N, ...) to values at the markers (B, m, ...)."""
-        batch = torch.arange(len(self.vertices), device=positions.device)[:, None, None]
+        batch = torch.arange(len(positions), device=positions.device)[:, None, None]
         weights = self.weights.reshape(*self.weights.shape, *[1] * (positions.ndim - 2))
         return (positions[batch, self.vertices] * weights).sum(2)
 
     @override
     def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
-        b, m, _ = self.vertices.shape
-        weights = self.weights.new_zeros(b, m, positions.shape[1]).scatter_add_(2, self.vertices, self.weights)
+        b, m = max(len(positions), len(self.vertices)), self.vertices.shape[1]
+        of_marker = [values.expand(b, -1, -1) for values in (self.vertices, self.weights)]
+        weights = self.weights.new_zeros(b, m, positions.shape[1]).scatter_add_(2, *of_marker)
         identity = torch.eye(3, device=weights.device, dtype=weights.dtype)
         return torch.einsum("bmn,ij->bnimj", weights, identity).reshape(b, -1, 3 * m)
 

@@ -6,7 +6,7 @@ Meshes and bodies are cached by their settings, since checks, stages and reports
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from importlib import resources
@@ -36,7 +36,6 @@ from ..mesh.tetrahedra import fill_surface
 from ..settings.body import (
     BodySettings,
     BoxesMesh,
-    BoxSettings,
     FileMesh,
     GeneratedArm,
     HexahedralBox,
@@ -204,7 +203,7 @@ def _built_body(content: str, place: str | None, files: tuple[str | None, ...]) 
 
 
 def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
-    mesh = _with_regions(mesh, settings.regions)
+    mesh = _with_regions(mesh, settings)
     energies = build_actuators(settings, mesh, payload_at)
     fixed = select_vertices(mesh, **settings.fixed.arguments())
     rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
@@ -223,11 +222,15 @@ def whole_mesh(settings: BodySettings) -> Mesh:
     mesh = build_mesh(settings.mesh)
     if not settings.parts:
         return mesh
+    if "body" in settings.parts:
+        raise MeshError("parts.body: this is the name of the first mesh: choose another.")
     parts = {}
     for name, part in settings.parts.items():
         own = build_mesh(part.mesh)
         parts[name] = replace(own, vertices=own.vertices + np.asarray(part.shift))
     joined = join({"body": mesh, **parts})
+    if twice := joined.regions.keys() & mesh.regions.keys():
+        raise MeshError(f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part.")
     return replace(joined, regions={**joined.regions, **mesh.regions})
 
 
@@ -245,10 +248,12 @@ def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
     return Glue(vertices, glue.to, glue.tolerance)
 
 
-def _with_regions(mesh: Mesh, boxes: Mapping[str, BoxSettings]) -> Mesh:
+def _with_regions(mesh: Mesh, settings: BodySettings) -> Mesh:
     """Adds the regions of the group ``regions`` to a mesh."""
     regions = dict(mesh.regions)
-    for name, box in boxes.items():
+    for name, box in settings.regions.items():
+        if name in settings.parts:
+            raise MeshError(f"regions.{name}: a part has this name already: choose another.")
         try:
             regions[name] = select_cells(mesh, **box.arguments())
         except MeshError as error:

@@ -109,6 +109,7 @@ def _check_memory(run: RunSettings) -> None:
     """Refuses meshes and networks that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
     meshes: dict[str, MeshSettings] = {"mesh": run.mesh}
+    meshes |= {f"parts.{name}.mesh": part.mesh for name, part in run.parts.items()}
     meshes |= {} if run.laboratory is None else {"laboratory.mesh": run.laboratory.mesh}
     for key, mesh in meshes.items():
         cells = math.prod(mesh.divisions) if isinstance(mesh, HexahedralBox | TetrahedralBox) else 0

@@ -354,7 +354,9 @@ def check_mesh(context: StageContext) -> None:
     The finer mesh uses the parameters that were identified on the original mesh.
     """
     settings: MeshCheckStage = context.settings
-    other = settings.model_copy(update={"mesh": finer(settings.mesh, settings.mesh_check)})
+    times, parts = settings.mesh_check, settings.parts
+    refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
+    other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
     experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
     model = "simulation" if settings.identified is None else "sysid"
     groups = experiments[0].batches(settings.groups["1"])

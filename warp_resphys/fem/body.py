@@ -188,7 +188,10 @@ class Body:
             controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name)
             weights |= part_weights
         for glue in self.glued:
-            weights |= self._glued_weights(glue, part_of_vertex)
+            glued = self._glued_weights(glue, part_of_vertex)
+            if twice := weights.keys() & glued.keys():
+                raise InputError(f"vertex {min(twice)} is glued twice: leave it out of the glue to {glue.to!r}.")
+            weights |= glued
         return controls, Coordinates.of(self.n_vertices, weights)
 
     def _glued_weights(

@@ -40,13 +40,13 @@ def equilibrium_under_feedback(
         ConvergenceError: there is no equilibrium, or the iteration does not converge; its report says which
             environments converged, (B,).
     """
-    state, acceleration, stalled = guess, _AndersonAcceleration(), 0
+    state, solution, acceleration, stalled = guess, guess, _AndersonAcceleration(), 0
     current: torch.Tensor | None = None
     smallest: torch.Tensor | None = None
     for number in range(_ITERATIONS):
         previous, current = current, force(state)
-        if previous is not None and torch.equal(current, previous):  # It depends on the inputs alone.
-            return state
+        if previous is not None and torch.equal(current, previous):  # The last solution is in equilibrium with it.
+            return solution
         solution = simulator.static_equilibrium(inputs.plus(current), constants, start=state.q.detach())
         change = solution.q - state.q
         size = change.detach().abs().amax((1, 2))

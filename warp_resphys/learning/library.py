@@ -132,7 +132,7 @@ def reconstruct(
         simulator: to correct. With markers, BDF2 replaces the midpoint rule.
         motion: observed states or markers.
         parameters: values in place of the simulator's own, such as `Identification.parameters`.
-        settings: method, regularisation [m^2/N^2], tolerance and iterations; the defaults of the class.
+        settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the class.
 
     Returns:
         The S = B T steps, motion after motion: initial positions (S, N, 3) [m] and velocities (S, N, 3) [m/s], the
@@ -250,7 +250,7 @@ def evaluate(
         state = replay.initial_state(start, constants, resting)
         q = closed_loop(Rollout(used, predict, inputs, constants), state, observed.shape[1] - 1)
         points = torch.stack([replay.observe(positions) for positions in q.unbind(1)], 1)
-        distance = (points - observed).norm(dim=-1).nan_to_num(math.inf)
+        distance = replay.observe.residual(points, observed).norm(dim=-1).nan_to_num(math.inf)
         mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
     return mean.transpose(0, 1)
 

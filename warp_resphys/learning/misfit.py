@@ -182,7 +182,7 @@ class Misfit:
         for (replay, _), errors, weight in zip(self._replays, residuals, self._weights, strict=True):
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             jacobian = slopes(weighted.reshape(*weighted.shape[:2], -1))
-            seen = 3 * replay.trials.seen.sum((1, 2)).cpu().numpy()
+            seen = replay.trials.observed.shape[-1] * replay.trials.seen.sum((1, 2)).cpu().numpy()
             rows = weighted[0].reshape(*weighted.shape[1:3], -1)
             trials += zip(rows, jacobian, seen.tolist(), strict=True)
         return trials, slopes(prior.double().cpu().numpy())

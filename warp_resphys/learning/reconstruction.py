@@ -76,10 +76,8 @@ class Reconstructor(ABC):
                 "determine the whole force."
             )
         last = self.simulator.body.n_vertices - 1
-        if (
-            isinstance(observation, Markers)
-            and not 0 <= int(observation.vertices.min()) <= int(observation.vertices.max()) <= last
-        ):
+        markers = getattr(observation, "markers", observation)
+        if isinstance(markers, Markers) and not 0 <= int(markers.vertices.min()) <= int(markers.vertices.max()) <= last:
             raise InputError(f"a marker is on a vertex that the body does not have: its vertices are 0 to {last}.")
 
     def with_constants(self, constants: Constants) -> Self:
@@ -230,7 +228,7 @@ def make_reconstructor(
     Args:
         simulator: to correct.
         method: ``gauss_newton``, ``lbfgsb``, or for markers ``levenberg_marquardt``.
-        regularisation: lambda, positive for markers [m^2/N^2].
+        regularisation: lambda, positive for sparse observations [unit^2/N^2].
         tolerance: see the methods.
         max_iterations: of a step, after which it has failed.
         modes: number of vibration modes that span the forces; any force on the free vertices if None.

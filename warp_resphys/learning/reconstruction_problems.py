@@ -11,7 +11,7 @@ from typing_extensions import override
 from ..data.observation import WHOLE_STATE, Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, InputError
 from ..linalg.conjugate_gradients import conjugate_gradients
 from ..linalg.least_squares import Move, Point, Problem, ridge
 from ..stepping.inputs import Inputs
@@ -27,7 +27,7 @@ class Step:
     state: State  # at its start
     inputs: Inputs  # during the step
     observed: torch.Tensor  # (B, M, D) measured points at its end, NaN where a point was not seen [unit]
-    weight: float  # lambda [m^2/N^2]
+    weight: float  # lambda [unit^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
 
@@ -41,7 +41,8 @@ class Step:
 
     def transposed_jacobian(self, end: torch.Tensor) -> torch.Tensor:
         """Returns C'^T, (B, 3 N, M D), zero for points that were not seen."""
-        return self.observation.transposed_jacobian(end) * torch.isfinite(self.observed).flatten(1)[:, None]
+        seen = torch.isfinite(self.observed).all(-1, keepdim=True).expand_as(self.observed)
+        return torch.where(seen.flatten(1)[:, None], self.observation.transposed_jacobian(end), 0.0)
 
 
 class StepProblem(Problem):
@@ -85,6 +86,11 @@ class FullStateProblem(StepProblem):
 
     @override
     def __init__(self, step: Step) -> None:
+        if not bool(torch.isfinite(step.observed).all()):
+            raise InputError(
+                "Gauss-Newton needs the positions of all vertices, but some were not seen: observe those that were as "
+                "markers (MarkerMap.at_vertices), or take method=lbfgsb."
+            )
         self._step = step.linearise()
         self._target = self._step.hold(step.simulator.method.solution_for(step.state, step.observed))
         self._weight = step.weight * self._step.stage.end**2

@@ -5,13 +5,15 @@ The control vertices of a rigid part couple to every vertex around it and would 
     [A  B^T] [x]   [f]
     [B  C  ] [y] = [g],
 
-A is banded, A^-1 B^T is computed once per factorisation, the Schur complement S = C - B A^-1 B^T is small, dense:
+A is banded, A^-1 B^T is computed once per factorisation, and S = C - B A^-1 B^T is small and dense:
 
     y = S^-1 (g - B A^-1 f),   x = A^-1 f - A^-1 B^T y.
 
-The matrix is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares with dense
-factorisations.
+The matrix is positive definite if and only if A and S are. An indefinite one may have a singular A, so it goes to
+SuperLU, which pivots. `tests/linalg/test_linear_solver.py` compares with dense factorisations.
 """
+
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,9 +21,10 @@ from typing_extensions import override
 
 from .banded import BandedSolver
 from .linear_solver import Factor, Indices, LinearSolver
+from .sparse import SparseSolver
 
 _HUB = 4.0  # a hub has more than this many times the median number of neighbours
-_MOST_HUBS = 64  # nodes
+_MOST_HUBS = 0.1  # share of the nodes
 
 
 def hubs(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
@@ -29,7 +32,7 @@ def hubs(rows: Indices, cols: Indices, n_nodes: int) -> Indices:
     apart = rows != cols
     neighbours = np.bincount(np.concatenate([rows[apart], cols[apart]]), minlength=n_nodes)
     nodes = np.flatnonzero(neighbours > _HUB * max(float(np.median(neighbours)), 1.0))
-    return nodes if len(nodes) <= _MOST_HUBS else nodes[:0]
+    return nodes if len(nodes) <= _MOST_HUBS * n_nodes else nodes[:0]
 
 
 def banded_rest(rows: Indices, cols: Indices, n_nodes: int, border: Indices) -> tuple[Indices, Indices, Indices]:
@@ -47,6 +50,7 @@ class BorderedSolver(LinearSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         border = hubs(rows, cols, n_nodes)
+        self._pattern = rows, cols, n_nodes
         own_rows, own_cols, number = banded_rest(rows, cols, n_nodes, border)
         self.band = BandedSolver(
             own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype, self.positions
@@ -72,13 +76,47 @@ class BorderedSolver(LinearSolver):
     def _factorise(
         self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
     ) -> Factor:
+        if not definite:
+            return _Reordered(self, self._sparse.factor(self._to_sparse(values), definite=False))
         banded, border = values.split([self.band.n_values, self.n_values - self.band.n_values], -1)
         arrow = border.reshape(len(values), -1, self.n)[..., self._unknowns]  # (B, m, n) B and C
         cross, corner = arrow[..., : self.band_size].mT, arrow[..., self.band_size :].tril()
         corner = corner + corner.tril(-1).mT
         kept = before if isinstance(before, _Bordered) else None
-        inner = self.band.factor(banded.clone(), definite, idle=idle, before=None if kept is None else kept.inner)
-        return _Bordered(self, inner, cross, corner, definite, idle, kept)
+        inner = self.band.factor(banded.clone(), idle=idle, before=None if kept is None else kept.inner)
+        return _Bordered(self, inner, cross, corner, idle, kept)
+
+    @cached_property
+    def _sparse(self) -> SparseSolver:
+        rows, cols, n_nodes = self._pattern
+        return SparseSolver(rows, cols, n_nodes, self.block, self.device, self.dtype, self.positions)
+
+    def _to_sparse(self, values: torch.Tensor) -> torch.Tensor:
+        """Returns the values (B, n_values) in the layout of the sparse solver."""
+        stored = self._sparse.address >= 0
+        out = values.new_zeros(len(values), self._sparse.n_values)
+        out[:, self._sparse.address[stored]] = values[:, self.address[stored]]
+        return out
+
+
+class _Reordered(Factor):
+    """A factor by another solver, for right-hand sides in this solver's order.
+
+    Args:
+        solver: the solver that has the order.
+        factor: the factor.
+    """
+
+    def __init__(self, solver: BorderedSolver, factor: Factor) -> None:
+        self._solver, self._factor, self.failed = solver, factor, factor.failed
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        return self._factor.solve(rhs)
+
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        columns.copy_(self.solve(columns[:, self._solver.places, None])[:, self._solver.dofs, 0])
 
 
 class _Bordered(Factor):
@@ -89,7 +127,6 @@ class _Bordered(Factor):
         inner: factor of A.
         cross: (B, n - m, m) B^T.
         corner: (B, m, m) C.
-        definite: whether S must be positive definite.
         idle: (B,) matrices that keep their previous factor, if any.
         before: the previous factors.
     """
@@ -103,7 +140,6 @@ class _Bordered(Factor):
         inner: Factor,
         cross: torch.Tensor,
         corner: torch.Tensor,
-        definite: bool,
         idle: torch.Tensor | None,
         before: "_Bordered | None",
     ) -> None:
@@ -113,28 +149,19 @@ class _Bordered(Factor):
         self.solver, self.inner, self.cross, self.corner = solver, inner, cross, corner
         self.solved = inner.solve(cross)  # (B, n - m, m) A^-1 B^T
         schur = corner - cross.mT @ self.solved
-        failed = torch.zeros(len(corner), dtype=torch.bool)
-        if definite:
-            factor, info = torch.linalg.cholesky_ex(schur.nan_to_num(posinf=0.0, neginf=0.0))
-            failed, self._small = info > 0, (factor,)
-        else:
-            self._small = torch.linalg.lu_factor_ex(schur)[:2]
+        self._schur, info = torch.linalg.cholesky_ex(schur.nan_to_num(posinf=0.0, neginf=0.0))
+        failed = info > 0
         if idle is not None and before is None:
             failed &= ~idle
         self.failed = inner.failed | failed.numpy()
         order = solver.band.dofs
         self._cross_in_order, self._solved_in_order = self.cross[:, order], self.solved[:, order]
 
-    def _corner_solve(self, right: torch.Tensor) -> torch.Tensor:
-        if len(self._small) == 1:
-            return torch.cholesky_solve(right, self._small[0])
-        return torch.linalg.lu_solve(*self._small, right)
-
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         f, g = rhs[:, self.solver._unknowns].split([self.solver.band_size, self.cross.shape[2]], 1)
         x = self.inner.solve(f)
-        y = self._corner_solve(g - self.cross.mT @ x)
+        y = torch.cholesky_solve(g - self.cross.mT @ x, self._schur)
         out = torch.empty_like(rhs)
         out[:, self.solver._unknowns] = torch.cat([x - self.solved @ y, y], 1)
         return out
@@ -144,6 +171,6 @@ class _Bordered(Factor):
         size = self.solver.band_size
         x, g = columns[:, :size].contiguous(), columns[:, size:, None]
         self.inner.solve_in_place(x)
-        y = self._corner_solve(g - self._cross_in_order.mT @ x[:, :, None])
+        y = torch.cholesky_solve(g - self._cross_in_order.mT @ x[:, :, None], self._schur)
         columns[:, :size] = x - (self._solved_in_order @ y)[:, :, 0]
         columns[:, size:] = y[:, :, 0]

@@ -278,7 +278,7 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
     Its regions are the meshes by name and, as ``name_region``, their own regions.
 
     Raises:
-        MeshError: the meshes have different kinds of cells.
+        MeshError: the meshes have different kinds of cells, or two regions have one name.
     """
     kinds = {mesh.kind for mesh in meshes.values()}
     if len(kinds) > 1:
@@ -286,11 +286,14 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
             f"meshes of {' and '.join(sorted(kinds))} cells cannot be joined: give {' and '.join(meshes)} cells of one "
             "kind."
         )
-    cells, regions, first, count = [], {}, 0, 0
+    cells, first, count = [], 0, 0
+    regions: dict[str, IntArray] = {}
     for name, mesh in meshes.items():
         cells.append(mesh.cells + first)
-        regions[name] = np.arange(count, count + len(mesh.cells))
-        regions |= {f"{name}_{region}": count + own for region, own in mesh.regions.items()}
+        own = {name: np.arange(len(mesh.cells))} | {f"{name}_{region}": cells for region, cells in mesh.regions.items()}
+        if twice := regions.keys() & own.keys():
+            raise MeshError(f"two regions have the name {min(twice)!r}: rename a mesh or its region.")
+        regions |= {region: count + cells for region, cells in own.items()}
         first, count = first + len(mesh.vertices), count + len(mesh.cells)
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes.values()]), np.concatenate(cells), regions)
 

@@ -245,7 +245,7 @@ class GlueSettings(Settings):
     """Glue between regions whose cells do not match: vertices that follow another region, by `fem.rigid.Glue`."""
 
     region: Word = setting(description="region with the glued vertices")
-    at: PlaceSettings = setting(description="vertices of this region")
+    at: PlaceSettings = setting(description="where the glued vertices of that region lie")
     to: Word = setting(description="region that they follow")
     tolerance: Positive = setting(1.0e-3, "largest distance from that region", "m")
 

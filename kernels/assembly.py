@@ -1,4 +1,4 @@
-"""Hessian blocks of the cells, and their gather into the value array of a matrix layout."""
+"""Hessian blocks of the cells, and their assembly into the value array of a linear solver."""
 
 import functools
 from typing import Any
@@ -14,7 +14,7 @@ ZERO = wp.float64(0.0)
 
 @wp.kernel
 def cell_blocks(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     gradients: wp.array2d[wp.vec3d],
     points_per_cell: int,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
@@ -44,7 +44,7 @@ def cell_blocks(
 
 @wp.kernel
 def cell_pair_blocks(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     gradients: wp.array2d[wp.vec3d],
     points_per_cell: int,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
@@ -52,7 +52,7 @@ def cell_pair_blocks(
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],
 ):
-    """The same as `cell_blocks`, a thread a block: more arithmetic, and every block is written once."""
+    """`cell_blocks` with one thread per block: more arithmetic, but every block is written once."""
     b, cell, pair = wp.tid()
     if active[b] == 0:
         return
@@ -71,7 +71,7 @@ def cell_pair_blocks(
 
 @wp.kernel
 def line_pair_blocks(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     weights: wp.array2d[wp.float64],  # (P, K)
     points_per_cell: int,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
@@ -79,7 +79,7 @@ def line_pair_blocks(
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],
 ):
-    """The same as `cell_pair_blocks`, where an energy is a function of a vector."""
+    """`cell_pair_blocks` of an energy that is a function of a vector."""
     b, cell, pair = wp.tid()
     if active[b] == 0:
         return
@@ -93,21 +93,21 @@ def line_pair_blocks(
 
 @functools.cache
 def scatter_kernel(scalar: Any) -> Any:
-    """`scatter_blocks` into values of a type, ``wp.float64`` or ``wp.float32``."""
+    """Returns `scatter_blocks` for values of type ``wp.float64`` or ``wp.float32``."""
     module = named_module(f"assembly.{scalar.__name__}")
 
     @wp.kernel(module=module)
     def scatter_blocks(
-        active: wp.array[int],  # (B) zero where nothing is to be done
-        block_start: wp.array[int],  # (blocks + 1) where a matrix block's contributions begin
-        contribution: wp.array[int],  # cell block, or -1 - cell block where it enters transposed
-        diagonal_vertex: wp.array[int],  # (blocks) the vertex of a diagonal block, else -1
-        address: wp.array2d[int],  # (blocks, 9) place in the layout's value array, or -1
+        active: wp.array[int],  # (B) zero: skip the environment
+        block_start: wp.array[int],  # (blocks + 1) first contribution of each matrix block
+        contribution: wp.array[int],  # index of a cell block, or -1 - index for its transpose
+        diagonal_vertex: wp.array[int],  # (blocks) vertex of a diagonal block, else -1
+        address: wp.array2d[int],  # (blocks, 9) index in the value array, or -1
         cell_block: wp.array2d[wp.mat33d],
         inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
         values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
     ):
-        """The entries of a layout: the sums of the blocks of the cells, and inertia on the diagonal."""
+        """Writes the matrix entries: sums of cell blocks, plus inertia on the diagonal."""
         b, block = wp.tid()
         if active[b] == 0:
             return

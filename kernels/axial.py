@@ -1,4 +1,4 @@
-"""Energies of a length: stress, tangent and derivatives by values, for any law of the tension.
+"""Energies that are functions of a length: stress, tangent and derivatives by values, for any tension law.
 
 The vector at a point, sum_a g_a x_a - o, has the length l and the unit vector u. With the point's weight w and its
 values v, a law gives
@@ -6,7 +6,7 @@ values v, a law gives
     e(l, v),   tension t = de/dl,   slope dt/dl,   and dt/dv,
 
 so that the stress is w t u and the tangent w (slope u u^T + t / l (1 - u u^T)), which has a negative eigenvalue only
-where a law pushes. The origin o is zero, or the first three values of a law that is tied to a given place.
+for a negative tension. The origin o is zero, or the first three values of a law tied to a given point.
 """
 
 import functools
@@ -23,14 +23,14 @@ ZERO = wp.float64(0.0)
 
 @functools.cache
 def axial_kernels(law: ModuleType) -> SimpleNamespace:
-    """Kernels for one of ``kernels.laws``."""
+    """Returns the kernels of one of ``kernels.laws``."""
     module = named_module(f"axial.{law.NAME}")
     vector, tension, tied = law.values, law.tension, law.TIED
     read_values = value_reader(vector)
 
     @wp.func(module=module)
     def stretched(x: wp.vec3d, v: vector):
-        """The unit vector along what is stretched, and its length."""
+        """Returns the unit vector along the stretched line, and the length."""
         if wp.static(tied):
             x -= wp.vec3d(v[0], v[1], v[2])
         length = wp.length(x)
@@ -40,14 +40,14 @@ def axial_kernels(law: ModuleType) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def local_step(
-        active: wp.array[int],  # (B) zero where nothing is to be done
+        active: wp.array[int],  # (B) zero: skip the environment
         nodes: wp.array2d[int],
         operators: wp.array2d[wp.float64],  # (P, K)
         weights: wp.array[wp.float64],  # (P) w
         addresses: wp.array[wp.uint64],  # see `values`
         sizes: wp.array[int],
         places: wp.array2d[int],
-        toe: wp.float64,  # length over which the law tightens
+        toe: wp.float64,  # elongation at which the law reaches its full stiffness
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         stress_out: wp.array2d[wp.vec3d],

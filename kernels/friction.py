@@ -1,11 +1,11 @@
-"""Bristle friction along a line: the potential of a step, see ``energies.friction``."""
+"""Bristle friction along a line: incremental potential of a step (``energies.friction``)."""
 
 import warp as wp
 
 
 @wp.func
 def bristle_energy(line: wp.vec3d, v: wp.vec4d) -> wp.float64:
-    """F_c / z_c times the integral of z over the slide; values: F_c, z_c, and z and the length at the step's start."""
+    """F_c / z_c times the integral of z over the slide; values: F_c, z_c, deflection and length at the step's start."""
     slide = wp.length(line) - v[3]
     start = v[2]
     if slide < wp.float64(0.0):

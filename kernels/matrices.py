@@ -2,7 +2,7 @@
 
 import warp as wp
 
-# Squared size of the last update at which an iteration has converged to rounding: Newton's squares its error.
+# Squared norm of the last update at which an iteration has converged to rounding; Newton's converges quadratically.
 UPDATE_TOLERANCE, NEWTON_TOLERANCE = wp.float64(1.0e-30), wp.float64(1.0e-16)
 SINGULAR, NEARLY_A_LINE = wp.float64(1.0e-12), wp.float64(1.0e-3)
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
@@ -41,8 +41,8 @@ def signed_svd(f: wp.mat33d):
 def polar_rotation(f: wp.mat33d) -> wp.mat33d:
     """Rotation of the polar decomposition, det R = 1.
 
-    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) from R = F; the signed SVD where F is inverted, and
-    where it is so flat that the iteration would not settle.
+    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) from R = F; the signed SVD where F is inverted or so flat that
+    the iteration does not converge.
     """
     r = f
     update = ONE
@@ -65,10 +65,10 @@ def polar_rotation(f: wp.mat33d) -> wp.mat33d:
 def nearest_unimodular(f: wp.mat33d) -> wp.mat33d:
     """The matrix D with det D = 1 that minimises ||F - D||.
 
-    Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal
-    to that surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). It starts from F, or
-    from F's rotation where F is so close to a line or a point that its own tangent plane is lost. From an F that
-    is turned inside out as a whole it may end on another stationary point.
+    Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal to that
+    surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). The start is F, or the rotation of
+    F if F is nearly a line or a point and its own tangent plane is undefined. For an inverted F the result may be
+    another stationary point.
     """
     d = f
     c = cofactor(f)

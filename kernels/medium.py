@@ -1,8 +1,8 @@
 """Drag and added mass of a medium on a surface over an implicit stage: stress and tangent.
 
-A point sees the place x = sum_a g_a x_a on the surface. With its area a and normal n at the
-start of the step, d its way since then, e its distance from where inertia alone would take it, and the coefficients
-c = (linear, normal, tangential, inertial) of the step, its energy is
+A point of the surface is at x = sum_a g_a x_a. With its area a and normal n at the start of the step, its displacement
+d since then, its offset e from the inertial target, and the coefficients c = (linear, normal, tangential, inertial) of
+the step, its energy is
 
     a (c_l / 2 |d|^2 + c_n / 3 |d . n|^3 + c_t / 3 |d_t|^3 + c_i / 2 (e . n)^2),     d_t = d - (d . n) n .
 """
@@ -17,20 +17,20 @@ ZERO, HALF, THIRD = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0 / 3.0)
 
 
 @wp.func
-def split(way: wp.vec3d, area: wp.vec3d):
-    """Size and normal of an area, and the parts of a way across it (a length) and along it (a vector)."""
+def split(displacement: wp.vec3d, area: wp.vec3d):
+    """Returns size and normal of an area, and the normal (scalar) and tangential (vector) parts of a displacement."""
     n = wp.normalize(area)
-    across = wp.dot(way, n)
-    return wp.length(area), n, across, way - across * n
+    across = wp.dot(displacement, n)
+    return wp.length(area), n, across, displacement - across * n
 
 
 @wp.kernel
 def local_step(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     weights: wp.array2d[wp.float64],
-    reference: wp.array2d[wp.vec3d],  # (B, P) where the point was [m]
-    target: wp.array2d[wp.vec3d],  # (B, P) where inertia alone would take it [m]
+    reference: wp.array2d[wp.vec3d],  # (B, P) position at the start of the step [m]
+    target: wp.array2d[wp.vec3d],  # (B, P) inertial target [m]
     area: wp.array2d[wp.vec3d],  # (B, P) a n [m^2]
     coefficients: wp.array2d[wp.vec4d],  # (B, 1)
     points_per_cell: int,
@@ -58,7 +58,7 @@ def local_step(
 @wp.kernel
 def tangent(
     active: wp.array[int],
-    clamp: wp.array[int],  # (B) of no effect: the energy is convex
+    clamp: wp.array[int],  # (B) without effect: the energy is convex
     nodes: wp.array2d[int],
     weights: wp.array2d[wp.float64],
     reference: wp.array2d[wp.vec3d],
@@ -69,7 +69,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """The second derivative; the energy is convex, so that it has no negative eigenvalues."""
+    """Second derivative, without negative eigenvalues as the energy is convex."""
     b, p = wp.tid()
     if active[b] == 0:
         return

@@ -1,15 +1,15 @@
-"""L-BFGS directions, backtracking line search and convergence of a batch, decided where the data are.
+"""L-BFGS directions, backtracking line search and convergence tests of a batch, on the device.
 
 One block of threads works on one environment. Every environment has its own phase, so that none waits for the line
 search of another:
 
-==============  ===============================================================================================
-START           the start is evaluated next
-NEED_DIRECTION  the next direction comes from `project`, a solve with the global step's matrix, and `aim`
-LINE_SEARCH     the positions are a trial, which is evaluated next and accepted or halved by `accept`
-DONE            the environment has converged
-FAILED          the environment has not converged, and is not tried again
-==============  ===============================================================================================
+===============  ==================================================================================
+STARTING         the starting point is evaluated next
+NEEDS_DIRECTION  next: `project`, a solve with the matrix of the global step, `set_direction`
+TRIAL            the positions are a trial, which is evaluated next and tested by `accept`
+CONVERGED        the environment has converged
+FAILED           the environment has not converged and gets no further step
+===============  ==================================================================================
 """
 
 import functools
@@ -18,130 +18,72 @@ from typing import Any
 
 import warp as wp
 
+from .extrapolation import History, extrapolated, record_solution
 from .modules import named_module
 from .reductions import block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
 
-START, NEED_DIRECTION, LINE_SEARCH, DONE, FAILED = (wp.constant(k) for k in range(5))
+STARTING, NEEDS_DIRECTION, TRIAL, CONVERGED, FAILED = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
-NEVER = wp.constant(2**28)  # iterations after which a factor is made anew
+NEVER = wp.constant(2**28)  # a number of iterations that no solve reaches
 
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 INFINITE = wp.constant(wp.float64(float("inf")))
 ARMIJO = wp.constant(wp.float64(1e-4))
-LEAST_CURVATURE = wp.constant(wp.float64(1e-10))
-MOST_HALVINGS = wp.constant(25)
-STALLS = wp.constant(3)
-ASKS_AGAIN = wp.constant(16)  # stalls: one nudge may happen to change little
-# Factor by which a higher order, which amplifies fast modes, must reduce the squared error.
-BETTER = wp.constant(wp.float64(0.1))
-UNIT = wp.constant(wp.float64(2.0**-52))  # relative rounding unit
-# Rounding error of a sum of energies whose terms cancel, per unit of stiffness and of energy.
+MIN_CURVATURE = wp.constant(wp.float64(1e-10))
+MAX_HALVINGS = wp.constant(25)
+STALLS_BEFORE_CHECK = wp.constant(3)
+STALLS_BETWEEN_CHECKS = wp.constant(16)  # a single perturbation may happen to change little
+ROUNDING_UNIT = wp.constant(wp.float64(2.0**-52))
+# Rounding error of a sum of energies with cancellation, per unit of stiffness and of energy.
 ENERGY_ROUNDING = wp.constant(wp.float64(8.0 * 2.0**-52))
 
 
 @wp.struct
 class SolverProgress:
-    """Progress of the solve in every environment: arrays of shape (B)."""
+    """State of the solver, (B) each."""
 
     phase: wp.array[int]
-    wanted: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR, requested before the next direction
-    factored: wp.array[int]  # 1 if there is a factor, of this solve or an earlier one
-    asks: wp.array[int]  # 1 if the rounding error of the residual is to be measured
-    iterations: wp.array[int]  # directions of this solve; before it begins, of the last one
-    since: wp.array[int]  # directions since the start of the solve or its last factorisation
-    made: wp.array[int]  # factorisations in this solve
+    request: wp.array[int]  # 0, FACTOR or CLAMPED_FACTOR: factorisation needed before the next direction
+    factored: wp.array[int]  # 1: a factor exists, of this solve or an earlier one
+    check_rounding: wp.array[int]  # 1: measure next whether the residual is rounding error
+    iterations: wp.array[int]  # directions of this solve; before its start, those of the last solve
+    since_factor: wp.array[int]  # directions since the start of the solve or its last factorisation
+    factorisations: wp.array[int]  # factorisations in this solve
     halvings: wp.array[int]
-    stalls: wp.array[int]  # evaluations in a row that have not halved the residual
-    step: wp.array[wp.float64]  # length, as a share of the direction
-    slope: wp.array[wp.float64]  # of the energy along the direction [J]
-    energy: wp.array[wp.float64]  # at the iterate [J]
-    scale: wp.array[wp.float64]  # norm of the balancing forces there [N]
+    stalls: wp.array[int]  # evaluations since the residual was last halved
+    step: wp.array[wp.float64]  # step length, as a fraction of the direction
+    slope: wp.array[wp.float64]  # slope of the energy along the direction [J]
+    energy: wp.array[wp.float64]  # energy at the iterate [J]
+    scale: wp.array[wp.float64]  # norm of the balancing forces at the iterate [N]
     relative: wp.array[wp.float64]  # residual over scale
-    smallest: wp.array[wp.float64]  # norm of the residual in this solve [N]
-    rounding: wp.array[wp.float64]  # norm of the residual's rounding error, infinite until measured [N]
+    smallest_norm: wp.array[wp.float64]  # smallest norm of a residual so far [N]
+    rounding: wp.array[wp.float64]  # measured rounding error of the residual, infinite before a measurement [N]
     force: wp.array[wp.float64]  # norm of the loads [N]
     stiffness: wp.array[wp.float64]  # sum over all points [J]
 
 
 @wp.struct
 class Evaluation:
-    """Values of the potential at the current positions: (B), and (B, N) for the residual."""
+    """The potential at the current positions, (B) each except for the residual."""
 
     energy: wp.array[wp.float64]  # [J]
     size: wp.array[wp.float64]  # sum of the energies' absolute values [J]
     balance: wp.array[wp.float64]  # norm of inertia less all loads [N]
-    norm: wp.array[wp.float64]  # of the residual [N]
+    norm: wp.array[wp.float64]  # norm of the residual [N]
     residual: wp.array2d[wp.vec3d]  # (B, N) [N]
 
 
 @wp.struct
-class History:
-    """Corrections of the last steps: their solutions less the starts that inertia alone gives."""
-
-    stored: wp.array[int]  # (B) number of corrections, 0 to 3
-    newest: wp.array[int]  # (B) place of the last correction in the ring
-    order: wp.array[int]  # (B) number of corrections that are extrapolated to the next step
-    start: wp.array2d[wp.vec3d]  # (B, N) [m]
-    correction: wp.array3d[wp.vec3d]  # (B, 3, N) solution less start, a ring [m]
-
-
-@wp.struct
 class Tolerances:
-    """When a solve has converged, and how long it may take."""
+    """Convergence tolerances and limits of a solve."""
 
     relative: wp.float64
     absolute: wp.float64  # [N]
-    epsilon: wp.float64  # of the states' type
+    epsilon: wp.float64  # machine epsilon of the states' dtype
     max_iterations: int
-    refactor_after: int  # iterations of a solve above which the next one gets a new factor
-
-
-@wp.func
-def correction(history: History, b: int, i: int, age: int) -> wp.vec3d:
-    """Correction of a vertex; age 0 is the newest [m]."""
-    return history.correction[b, (history.newest[b] + 3 - age) % 3, i]
-
-
-@wp.func
-def extrapolated(history: History, b: int, i: int, order: int) -> wp.vec3d:
-    """Correction extrapolated to the next step [m]: zero, or a constant, line or parabola through the last ones."""
-    guess = wp.vec3d()
-    if order == 1:
-        guess = correction(history, b, i, 0)
-    elif order == 2:
-        guess = wp.float64(2.0) * correction(history, b, i, 0) - correction(history, b, i, 1)
-    elif order == 3:
-        guess = wp.float64(3.0) * (correction(history, b, i, 0) - correction(history, b, i, 1))
-        guess += correction(history, b, i, 2)
-    return guess
-
-
-@wp.func
-def remember(history: History, positions: wp.array2d[wp.vec3d], b: int, lane: int):
-    """Adds a solution, and chooses the order whose extrapolation would have been closest to it."""
-    lanes = wp.block_dim()
-    n = positions.shape[1]
-    stored = history.stored[b]
-    place = (history.newest[b] + 1) % 3
-    best = wp.int32(0)
-    least = wp.float64(INFINITE)
-    for order in range(stored + 1):
-        total = wp.float64(0.0)
-        for i in range(lane, n, lanes):
-            error = positions[b, i] - history.start[b, i] - extrapolated(history, b, i, order)
-            total += wp.dot(error, error)
-        total = block_sum(total)
-        if total < BETTER * least:
-            best = order
-            least = total
-    for i in range(lane, n, lanes):
-        history.correction[b, place, i] = positions[b, i] - history.start[b, i]
-    if lane == 0:
-        history.newest[b] = place
-        history.stored[b] = wp.min(stored + 1, 3)
-        history.order[b] = best
+    refactor_after: int  # iterations of a solve above which the next one starts with a new factor
 
 
 @wp.kernel
@@ -154,13 +96,13 @@ def begin(
     progress: SolverProgress,
     history: History,
 ):
-    """Starts at the extrapolation of the last steps, and resets the progress of the solve."""
+    """Sets the extrapolated starting point, and sums the quantities that stay constant during this solve."""
     b, lane = wp.tid()
     square = wp.float64(0.0)
-    stored = history.stored[b]
-    if progress.phase[b] != DONE:  # The solve before has failed.
-        stored = 0
-    order = wp.min(history.order[b], stored)
+    count = history.count[b]
+    if progress.phase[b] != CONVERGED:  # The last solve failed.
+        count = 0
+    order = wp.min(history.order[b], count)
     for i in range(lane, force.shape[1], wp.block_dim()):
         square += wp.dot(force[b, i], force[b, i])
         start = positions[b, i]
@@ -170,101 +112,103 @@ def begin(
         origin_out[b, i] = start
     square = block_sum(square)
     if lane == 0:
-        history.stored[b] = stored
-        progress.phase[b] = START
-        progress.wanted[b] = 0
+        history.count[b] = count
+        progress.phase[b] = STARTING
+        progress.request[b] = 0
         if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
-            progress.wanted[b] = FACTOR
-        progress.asks[b] = 0
+            progress.request[b] = FACTOR
+        progress.check_rounding[b] = 0
         progress.iterations[b] = 0
-        progress.since[b] = 0
-        progress.made[b] = 0
+        progress.since_factor[b] = 0
+        progress.factorisations[b] = 0
         progress.stalls[b] = 0
         progress.energy[b] = INFINITE
-        progress.smallest[b] = INFINITE
+        progress.smallest_norm[b] = INFINITE
         progress.rounding[b] = INFINITE
         progress.force[b] = wp.sqrt(square)
         progress.stiffness[b] = stiffness[b]
 
 
 @wp.kernel
-def choose(progress: SolverProgress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]):
-    """Marks the environments to factorise next, and those to clamp; drops the pairs of the old factors."""
+def select_for_factorisation(
+    progress: SolverProgress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]
+):
+    """Selects the environments to factorise next, clamped or not, and deletes their L-BFGS pairs."""
     b = wp.tid()
-    wanted = progress.wanted[b]
-    chosen = progress.phase[b] == NEED_DIRECTION and wanted > 0
-    active_out[b] = int(chosen)
-    clamp_out[b] = int(chosen and wanted == CLAMPED_FACTOR)
-    if chosen:
-        progress.wanted[b] = 0
+    request = progress.request[b]
+    selected = progress.phase[b] == NEEDS_DIRECTION and request > 0
+    active_out[b] = int(selected)
+    clamp_out[b] = int(selected and request == CLAMPED_FACTOR)
+    if selected:
+        progress.request[b] = 0
         progress.factored[b] = 1
-        progress.since[b] = 0
-        progress.made[b] += 1
+        progress.since_factor[b] = 0
+        progress.factorisations[b] += 1
         pairs[b] = 0
 
 
 @wp.kernel
-def mark(
-    active: wp.array[int],  # (B) zero where the factor stays
+def mark_clamped(
+    active: wp.array[int],  # (B) zero where the factor is kept
     clamp: wp.array[int],  # (B)
-    clamped_out: wp.array[wp.bool],  # (B) whether the factor is that of a clamped matrix
+    clamped_out: wp.array[wp.bool],  # (B) whether the factor is of a clamped matrix
 ):
-    """Marks the environments whose next factor is of a clamped matrix."""
+    """Marks the environments whose new factor is of a clamped matrix."""
     b = wp.tid()
     if active[b] != 0:
         clamped_out[b] = clamp[b] != 0
 
 
 @wp.kernel
-def repeat(active: wp.array[int], clamp: wp.array[int], wanting_out: wp.array[int]):
-    """Marks the environments to factorise again, clamped, and counts them; launched with one block."""
+def request_clamped(active: wp.array[int], clamp: wp.array[int], count_out: wp.array[int]):
+    """Requests clamping for all active environments, and counts them; launched as a single block."""
     _, lane = wp.tid()
-    wanting = wp.float64(0.0)
+    count = wp.float64(0.0)
     for b in range(lane, active.shape[0], wp.block_dim()):
         if active[b] != 0:
             clamp[b] = 1
-            wanting += ONE
-    wanting = block_sum(wanting)
+            count += ONE
+    count = block_sum(count)
     if lane == 0:
-        wanting_out[0] = int(wanting)
+        count_out[0] = int(count)
 
 
 @wp.kernel
-def nudge(
+def perturb(
     progress: SolverProgress,
     signs: wp.array2d[wp.vec3d],  # (draws, N) random signs
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    positions_out: wp.array2d[wp.vec3d],  # (B, N) before the move [m]
+    positions_out: wp.array2d[wp.vec3d],  # (B, N) copy of the unperturbed positions [m]
 ):
-    """Moves the coordinates of environments that measure rounding by one rounding unit of the largest coordinate.
+    """Moves every coordinate by one rounding unit of the largest coordinate, where rounding is to be checked.
 
-    Not by a unit of each coordinate: deformation gradients sum over coordinates of all sizes.
+    The largest coordinate counts because deformation gradients sum over coordinates of all sizes.
     """
     b, lane = wp.tid()
-    if progress.asks[b] == 0:
+    if progress.check_rounding[b] == 0:
         return
     size = wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
         positions_out[b, i] = positions[b, i]
         size = wp.max(size, wp.max(wp.abs(positions[b, i])))
-    unit = UNIT * block_max(size)
+    unit = ROUNDING_UNIT * block_max(size)
     draw = progress.iterations[b] % signs.shape[0]
     for i in range(lane, positions.shape[1], wp.block_dim()):
         positions[b, i] = positions[b, i] + unit * signs[draw, i]
 
 
 @wp.kernel
-def compare(
+def check_rounding(
     progress: SolverProgress,
-    kept: wp.array2d[wp.vec3d],  # (B, N) positions before `nudge` [m]
-    gradient: wp.array2d[wp.vec3d],  # (B, N) there [N]
-    residual: wp.array2d[wp.vec3d],  # (B, N) after it [N]
+    kept: wp.array2d[wp.vec3d],  # (B, N) positions before `perturb` [m]
+    gradient: wp.array2d[wp.vec3d],  # (B, N) residual at these positions [N]
+    residual: wp.array2d[wp.vec3d],  # (B, N) residual after `perturb` [N]
     positions: wp.array2d[wp.vec3d],  # (B, N) restored [m]
     history: History,
 ):
-    """Measures the rounding error of the residual; an environment whose residual is not larger has converged."""
+    """Marks an environment as converged if its residual is not larger than its change by the perturbation."""
     b, lane = wp.tid()
-    if progress.asks[b] == 0:
+    if progress.check_rounding[b] == 0:
         return
     rounding = progress.rounding[b]
     change, size = wp.float64(0.0), wp.float64(0.0)
@@ -277,61 +221,66 @@ def compare(
     if rounding < INFINITE:
         change = wp.max(change, rounding)
     if size <= change:
-        remember(history, positions, b, lane)
+        record_solution(history, positions, b, lane)
     if lane == 0:
-        progress.asks[b] = 0
+        progress.check_rounding[b] = 0
         progress.rounding[b] = change
         if size <= change:
-            progress.phase[b] = DONE
+            progress.phase[b] = CONVERGED
 
 
 @wp.kernel
 def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: wp.array[int]):
-    """Counts for the host, see `Summary`, and (B) flags of environments to evaluate again; launched with one block."""
+    """Counts environments for the host, and sets (B) which need a further evaluation; launched as a single block."""
     _, lane = wp.tid()
-    active, aiming = wp.float64(0.0), wp.float64(0.0)
-    wanting, asking = wp.float64(0.0), wp.float64(0.0)
+    active, directions = wp.float64(0.0), wp.float64(0.0)
+    factors, checks = wp.float64(0.0), wp.float64(0.0)
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
-        asking += wp.float64(progress.asks[b])
-        # An environment that measures rounding is evaluated once more, even if it has failed.
-        active_out[b] = int(progress.phase[b] < DONE or progress.asks[b] != 0)
-        if progress.phase[b] < DONE:
+        checks += wp.float64(progress.check_rounding[b])
+        # A rounding check needs one more evaluation, even after the last step.
+        active_out[b] = int(progress.phase[b] < CONVERGED or progress.check_rounding[b] != 0)
+        if progress.phase[b] < CONVERGED:
             active += ONE
-        if progress.phase[b] == NEED_DIRECTION:
-            aiming += ONE
-            if progress.wanted[b] > 0:
-                wanting += ONE
-    active, aiming, wanting, asking = block_sum(active), block_sum(aiming), block_sum(wanting), block_sum(asking)
+        if progress.phase[b] == NEEDS_DIRECTION:
+            directions += ONE
+            if progress.request[b] > 0:
+                factors += ONE
+    active, directions, factors, checks = (
+        block_sum(active),
+        block_sum(directions),
+        block_sum(factors),
+        block_sum(checks),
+    )
     if lane == 0:
         summary_out[0] = int(active)
-        summary_out[1] = int(aiming)
-        summary_out[2] = int(wanting)
-        summary_out[3] = int(asking)
+        summary_out[1] = int(directions)
+        summary_out[2] = int(factors)
+        summary_out[3] = int(checks)
 
 
 @wp.func
 def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, iterations: int, stalls: int) -> bool:
-    """Returns whether to measure the rounding error of a residual that no longer falls: once, then every 16 stalls."""
-    stuck = iterations >= STALLS and stalls >= STALLS
-    return stuck and (norm <= progress.rounding[b] or stalls % ASKS_AGAIN == 0)
+    """Whether to measure the rounding error of a stalled residual: once, and again every few stalls."""
+    stuck = iterations >= STALLS_BEFORE_CHECK and stalls >= STALLS_BEFORE_CHECK
+    return stuck and (norm <= progress.rounding[b] or stalls % STALLS_BETWEEN_CHECKS == 0)
 
 
 @wp.func
-def give_up(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
-    """Ends a failed line search: tries a new factor, then a clamped one, before the environment fails."""
-    progress.phase[b] = NEED_DIRECTION
+def abandon_search(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
+    """Ends a failed line search: requests a new factor, then a clamped one, before the environment counts as failed."""
+    progress.phase[b] = NEEDS_DIRECTION
     progress.stalls[b] += 1
     norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
     if may_be_rounding(progress, b, norm, progress.iterations[b], progress.stalls[b]):
-        progress.asks[b] = 1
+        progress.check_rounding[b] = 1
     if progress.iterations[b] >= tolerances.max_iterations:
         progress.phase[b] = FAILED
-    elif progress.made[b] == 0:
-        progress.wanted[b] = FACTOR
+    elif progress.factorisations[b] == 0:
+        progress.request[b] = FACTOR
     elif clamped[b]:
         progress.phase[b] = FAILED
     else:
-        progress.wanted[b] = CLAMPED_FACTOR
+        progress.request[b] = CLAMPED_FACTOR
 
 
 @wp.func
@@ -344,7 +293,7 @@ def within_rounding(
     b: int,
     lane: int,
 ) -> bool:
-    """Returns whether a step, and the balancing forces after it, are within the rounding of the state."""
+    """Whether a step and the balancing forces after it are within the rounding of the state."""
     moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, positions.shape[1], wp.block_dim()):
         for c in range(3):
@@ -358,25 +307,25 @@ def within_rounding(
 
 @functools.cache
 def minimisation_kernels(scalar: Any) -> SimpleNamespace:
-    """Kernels whose pairs, right-hand sides and solutions are of a type, ``wp.float64`` or ``wp.float32``."""
+    """Returns kernels for pairs, right-hand sides and solutions of type ``wp.float64`` or ``wp.float32``."""
     module = named_module(f"minimisation.{scalar.__name__}")
     vector = wp.vec3d if scalar is wp.float64 else wp.vec3f
 
     @wp.struct
     class Pairs:
-        """The last pairs of displacement and change of the residual, and R = triu(S Y^T); a ring of M places."""
+        """Last pairs of displacement s and change of residual y, and R = triu(S Y^T); ring buffers of size M."""
 
         count: wp.array[int]  # (B)
-        last: wp.array[int]  # (B) place of the newest
+        last: wp.array[int]  # (B) index of the newest pair
         s: wp.array3d[vector]  # (B, M, N) [m]
         y: wp.array3d[vector]  # (B, M, N) [N]
         r: wp.array3d[wp.float64]  # (B, M, M) by place [J]
-        a: wp.array2d[wp.float64]  # (B, M) by age, oldest first: coefficients of `project`
-        b: wp.array2d[wp.float64]  # (B, M) coefficients of `aim`; holds S g in between
+        a: wp.array2d[wp.float64]  # (B, M) coefficients of `project`, oldest pair first
+        b: wp.array2d[wp.float64]  # (B, M) S g in `project`, coefficients of `set_direction`
 
     @wp.func(module=module)
     def place(pairs: Pairs, b: int, age: int) -> int:
-        """Place of a pair in the ring; age 0 is the oldest."""
+        """Returns the index of a pair in the ring buffer; age 0 is the oldest."""
         m = pairs.s.shape[1]
         return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
 
@@ -384,13 +333,13 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
     def project(
         progress: SolverProgress,
         pairs: Pairs,
-        vertex_at: wp.array[int],  # (F) the vertex at each place of the linear solver's order
+        vertex_at: wp.array[int],  # (F) vertices in the order of the linear solver
         gradient: wp.array2d[wp.vec3d],  # (B, N) [N]
         right_out: wp.array2d[vector],  # (B, F) g - Y^T a, with a = R^-1 S g
     ):
-        """Right-hand side of the solve in the compact form of L-BFGS; zero where no direction is needed."""
+        """Computes the right-hand side of the solve in compact L-BFGS form; zero where no direction is needed."""
         b, lane = wp.tid()
-        if progress.phase[b] != NEED_DIRECTION:
+        if progress.phase[b] != NEEDS_DIRECTION:
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 right_out[b, p] = vector()
             return
@@ -401,7 +350,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             for v in range(lane, gradient.shape[1], wp.block_dim()):
                 total += wp.dot(wp.vec3d(row[v]), gradient[b, v])
             pairs.b[b, i] = block_sum(total)
-        # Every thread solves the small system by itself: all write the same.
+        # Every thread solves the small system redundantly and writes the same values.
         for j in range(k):
             i = k - 1 - j
             here = place(pairs, b, i)
@@ -417,22 +366,22 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             right_out[b, p] = vector(value)
 
     @wp.kernel(module=module)
-    def aim(
+    def set_direction(
         progress: SolverProgress,
         pairs: Pairs,
         vertex_at: wp.array[int],
         gradient: wp.array2d[wp.vec3d],
-        solution: wp.array2d[vector],  # (B, F) z, of the matrix with the right-hand side of `project` [m]
+        solution: wp.array2d[vector],  # (B, F) z, solution for the right-hand side of `project` [m]
         positions: wp.array2d[wp.vec3d],  # (B, N) becomes the first trial
         origin_out: wp.array2d[wp.vec3d],
         direction_out: wp.array2d[wp.vec3d],  # (B, N) -(z + S^T b), with b = R^-T (D a - Y z); zero at fixed vertices
     ):
-        """Computes the direction, its slope and the first trial.
+        """Sets the direction, its slope and the first trial.
 
-        Where the slope is positive or not finite, the pairs are dropped; without pairs a new factor is requested, once.
+        If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is requested, once.
         """
         b, lane = wp.tid()
-        if progress.phase[b] != NEED_DIRECTION:
+        if progress.phase[b] != NEEDS_DIRECTION:
             return
         k = pairs.count[b]
         for i in range(k):
@@ -462,17 +411,17 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                 origin_out[b, v] = positions[b, v]
                 positions[b, v] = positions[b, v] + direction_out[b, v]
             if lane == 0:
-                progress.phase[b] = LINE_SEARCH
+                progress.phase[b] = TRIAL
                 progress.iterations[b] += 1
-                progress.since[b] += 1
+                progress.since_factor[b] += 1
                 progress.halvings[b] = 0
                 progress.step[b] = ONE
                 progress.slope[b] = slope
         elif lane == 0:
             if k > 0:
                 pairs.count[b] = 0
-            elif progress.made[b] == 0:
-                progress.wanted[b] = FACTOR
+            elif progress.factorisations[b] == 0:
+                progress.request[b] = FACTOR
             else:
                 progress.phase[b] = FAILED
 
@@ -486,7 +435,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         before: wp.array2d[wp.vec3d],
         after: wp.array2d[wp.vec3d],
     ):
-        """Stores a pair if its curvature is positive."""
+        """Stores a pair of positive curvature."""
         m, lanes = pairs.s.shape[1], wp.block_dim()
         k = pairs.count[b]
         new = (pairs.last[b] + 1) % m
@@ -500,7 +449,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             lengths += wp.dot(moved, moved)
             changes += wp.dot(changed, changed)
         curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
-        if not curvature > LEAST_CURVATURE * wp.sqrt(lengths * changes):
+        if not curvature > MIN_CURVATURE * wp.sqrt(lengths * changes):
             return
         for v in range(lane, direction.shape[1], lanes):
             s[v] = vector(step * direction[b, v])
@@ -522,28 +471,28 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def accept(
-        remembers: int,  # 1 if pairs are stored
+        keeps_pairs: int,  # 1: L-BFGS pairs are stored
         tolerances: Tolerances,
         inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
         evaluation: Evaluation,  # at the positions
         origin: wp.array2d[wp.vec3d],
         direction: wp.array2d[wp.vec3d],
-        clamped: wp.array[wp.bool],  # (B) whether the global step's matrix is positive definite by force
+        clamped: wp.array[wp.bool],  # (B) whether the matrix of the global step is clamped
         positions: wp.array2d[wp.vec3d],
-        gradient: wp.array2d[wp.vec3d],  # (B, N) set to the residual where the trial is accepted
+        gradient: wp.array2d[wp.vec3d],  # (B, N) becomes the residual if the trial is accepted
         progress: SolverProgress,
         pairs: Pairs,
         history: History,
     ):
-        """Accepts a trial that decreases the energy, or its slope where the energy is down to rounding; else halves it.
+        """Accepts a trial that decreases the energy enough, or halves the step; tests convergence.
 
-        The second test is the approximate Wolfe condition of Hager and Zhang (2005).
+        Where the decrease is within rounding, the approximate Wolfe condition (Hager and Zhang 2005) decides.
         """
         b, lane = wp.tid()
         phase = progress.phase[b]
         lanes = wp.block_dim()
         n = positions.shape[1]
-        if phase != START and phase != LINE_SEARCH:
+        if phase != STARTING and phase != TRIAL:
             return
         energy = evaluation.energy[b]
         norm = evaluation.norm[b]
@@ -551,7 +500,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
         iterations = progress.iterations[b]
         stalls = progress.stalls[b]
-        if phase == LINE_SEARCH:
+        if phase == TRIAL:
             step = progress.step[b]
             slope = progress.slope[b]
             halvings = progress.halvings[b]
@@ -559,62 +508,62 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             for i in range(lane, n, lanes):
                 after += wp.dot(evaluation.residual[b, i], direction[b, i])
             after = block_sum(after)
-            taken = energy <= before + ARMIJO * step * slope
-            if not taken:
-                taken = energy <= before + flat and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
-            if not taken:
+            accepted = energy <= before + ARMIJO * step * slope
+            if not accepted:
+                accepted = energy <= before + flat and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
+            if not accepted:
                 step = HALF * step
-                given_up = halvings + 1 >= MOST_HALVINGS
+                given_up = halvings + 1 >= MAX_HALVINGS
                 if given_up:
                     step = wp.float64(0.0)
                 for i in range(lane, n, lanes):
                     positions[b, i] = origin[b, i] + step * direction[b, i]
-                rests = False
+                at_rest = False
                 if given_up and iterations == 1 and progress.force[b] == ZERO:
                     scale = progress.scale[b]
-                    rests = within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
+                    at_rest = within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
                 if lane == 0:
                     progress.step[b] = step
                     progress.halvings[b] = halvings + 1
-                    if rests:
-                        progress.phase[b] = DONE
-                        history.stored[b] = 0
+                    if at_rest:
+                        progress.phase[b] = CONVERGED
+                        history.count[b] = 0
                     elif given_up:
-                        give_up(progress, tolerances, clamped, b)
+                        abandon_search(progress, tolerances, clamped, b)
                 return
-            if remembers == 1:
+            if keeps_pairs == 1:
                 add_pair(pairs, b, lane, step, direction, gradient, evaluation.residual)
         for i in range(lane, n, lanes):
             gradient[b, i] = evaluation.residual[b, i]
         scale = evaluation.balance[b] + progress.force[b]
-        smallest = progress.smallest[b]
+        smallest = progress.smallest_norm[b]
         stalls += 1
         if norm < HALF * smallest:
             stalls = 0
         done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
         done = done and norm + scale < INFINITE
-        if phase == LINE_SEARCH and iterations == 1 and progress.force[b] == ZERO:
+        if phase == TRIAL and iterations == 1 and progress.force[b] == ZERO:
             done = done or within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
-        # Before the values of this environment are written, every thread has read them.
-        asks = block_max(ZERO)
+        # A barrier: every thread has read the values of this environment before they are written.
+        check = block_max(ZERO)
         if may_be_rounding(progress, b, norm, iterations, stalls) and before - energy <= flat and not done:
-            asks = ONE
+            check = ONE
         if done:
-            remember(history, positions, b, lane)
+            record_solution(history, positions, b, lane)
         if lane == 0:
             relative = norm / wp.max(scale, tolerances.absolute)
             progress.energy[b] = energy
             progress.scale[b] = scale
             progress.relative[b] = relative
-            progress.smallest[b] = wp.min(norm, smallest)
+            progress.smallest_norm[b] = wp.min(norm, smallest)
             progress.stalls[b] = stalls
-            progress.asks[b] = int(asks)
-            progress.phase[b] = NEED_DIRECTION
-            if progress.since[b] >= 3 * tolerances.refactor_after:
-                progress.wanted[b] = FACTOR
+            progress.check_rounding[b] = int(check)
+            progress.phase[b] = NEEDS_DIRECTION
+            if progress.since_factor[b] >= 3 * tolerances.refactor_after:
+                progress.request[b] = FACTOR
             if done:
-                progress.phase[b] = DONE
+                progress.phase[b] = CONVERGED
             elif not wp.isfinite(relative) or iterations >= tolerances.max_iterations:
                 progress.phase[b] = FAILED
 
-    return SimpleNamespace(project=project, aim=aim, accept=accept, Pairs=Pairs)
+    return SimpleNamespace(project=project, set_direction=set_direction, accept=accept, Pairs=Pairs)

@@ -1,4 +1,4 @@
-"""Warp modules, of which a run compiles those it launches from, and the streams that kernels run on."""
+"""Named Warp modules, which are compiled only if used, and the streams of kernel launches."""
 
 import functools
 from collections.abc import Iterator
@@ -9,11 +9,11 @@ from typing import Any
 import torch
 import warp as wp
 
-_SETTINGS = Lock()  # Warp has them for the whole process.
+_SETTINGS = Lock()  # Warp's settings are global to the process.
 
 
 def named_module(part: str) -> wp.Module:
-    """Returns the Warp module of a part that is made more than once, by law or by type; nothing is differentiated."""
+    """Returns the Warp module of kernels that are generated per law or per type, without Warp's own adjoints."""
     module = wp.get_module(f"{__package__}.{part}")
     wp.set_module_options({"enable_backward": False}, module)
     return module
@@ -21,10 +21,10 @@ def named_module(part: str) -> wp.Module:
 
 @contextmanager
 def shareable() -> Iterator[None]:
-    """Warp modules that are loaded meanwhile may be launched by several threads at once, on a CPU.
+    """Loads Warp modules so that several CPU threads may launch their kernels concurrently.
 
-    Otherwise every launch would register the place of its tiles, which these kernels do not use, in a variable that
-    all threads share.
+    By default every launch registers its tile memory, which these kernels do not use, in a variable shared by all
+    threads.
     """
     with _SETTINGS:
         before = wp.config.enable_tiles_in_stack_memory
@@ -36,16 +36,16 @@ def shareable() -> Iterator[None]:
 
 
 def launch_stream(device: torch.device) -> Any:
-    """Torch's current stream, for launches by Warp; None on a CPU."""
+    """Returns torch's current stream for launches by Warp, None on a CPU."""
     if device.type == "cpu":
         return None
     handle = torch.cuda.current_stream(device).cuda_stream
     own = wp.get_device(str(device)).stream
-    # Torch may work on Warp's own stream, which a second object for it would take from Warp when it goes.
+    # Torch may use Warp's own stream; a second wp.Stream on its handle would destroy it when collected.
     return own if handle == own.cuda_stream else _stream(str(device), handle)
 
 
 @functools.cache
 def _stream(device: str, handle: int) -> Any:
-    """Kept, as Warp forgets a stream of torch's with its object, and torch uses few of them again and again."""
+    """Cached: Warp unregisters a stream with its object, and torch reuses a few streams."""
     return wp.Stream(device, cuda_stream=handle)

@@ -1,4 +1,4 @@
-"""Inertia of points that weighted sums of vertices move: k / 2 |x - y|^2."""
+"""Inertia of points at weighted sums of vertices, k / 2 |x - y|^2."""
 
 import warp as wp
 
@@ -11,11 +11,11 @@ ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
 @wp.kernel
 def local_step(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     weights: wp.array2d[wp.float64],
     inertia: wp.array2d[wp.float64],  # (B, P) k, mass over the square of the effective time step [N/m]
-    target: wp.array2d[wp.vec3d],  # (B, P) y, where inertia alone would take the point [m]
+    target: wp.array2d[wp.vec3d],  # (B, P) y, inertial target [m]
     points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.vec3d],
@@ -34,7 +34,7 @@ def local_step(
 @wp.kernel
 def tangent(
     active: wp.array[int],
-    clamp: wp.array[int],  # (B) of no effect: the energy is convex
+    clamp: wp.array[int],  # (B) without effect: the energy is convex
     inertia: wp.array2d[wp.float64],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):

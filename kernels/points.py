@@ -1,8 +1,8 @@
-"""What the points of every energy share: what a point sees of the positions, the gather, the product with a tangent.
+"""Kernels shared by the points of all energies: kinematics, gather, product with a tangent.
 
 A point has an operator g_a for each of its nodes. Either g_a is a vector, and the energy is a function of the matrix
-F = sum_a x_a g_a^T, such as a deformation gradient; or it is a number, and the energy is a function of the vector
-sum_a g_a x_a alone, such as a fibre or a place. The stress has the shape of what the energy is a function of.
+F = sum_a x_a g_a^T, such as a deformation gradient; or g_a is a number, and the energy is a function of the vector
+sum_a g_a x_a, such as a fibre or a position. The stress has the shape of the argument of the energy.
 """
 
 import functools
@@ -32,7 +32,7 @@ def deformation_gradient(
 def line_at(
     positions: wp.array2d[wp.vec3d], nodes: wp.array2d[int], weights: wp.array2d[wp.float64], b: int, p: int, cell: int
 ) -> wp.vec3d:
-    """sum_a g_a x_a: a deformed line, or a place."""
+    """sum_a g_a x_a: a deformed line, or a position."""
     x = wp.vec3d(ZERO, ZERO, ZERO)
     for a in range(nodes.shape[1]):
         x += weights[p, a] * positions[b, nodes[cell, a]]
@@ -48,7 +48,7 @@ def green_strain(f: wp.mat33d) -> wp.mat33d:
 
 @functools.cache
 def gather_kernels(width: int) -> SimpleNamespace:
-    """Kernels from stresses to forces, for operators of three components or of one."""
+    """Returns kernels from stresses to forces, for operators with three components or one."""
     module = named_module(f"points.{width}")
     operator, shape = (wp.float64, wp.vec3d) if width == 1 else (wp.vec3d, wp.mat33d)
 
@@ -57,12 +57,12 @@ def gather_kernels(width: int) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[operator],
         points_per_cell: int,
-        incident_start: wp.array[int],  # (N + 1) where a vertex's entries begin
+        incident_start: wp.array[int],  # (N + 1) first entry of each vertex
         incident: wp.array[int],  # cell * K + local node, cells in ascending order: a fixed summation order
         stress: wp.array2d[shape],
-        force_out: wp.array2d[wp.vec3d],  # (B, N) [N] has the transposed operator of the stress added
+        force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
     ):
-        """Adds the transposed operator of the stress to the force of every vertex."""
+        """Adds the transposed operator applied to the stress to the force of every vertex."""
         b, i = wp.tid()
         total = force_out[b, i]
         k = nodes.shape[1]
@@ -76,13 +76,13 @@ def gather_kernels(width: int) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def cell_forces(
-        active: wp.array[int],  # (B) zero where nothing is to be done
+        active: wp.array[int],  # (B) zero: skip the environment
         gradients: wp.array2d[operator],  # (P, K)
         points_per_cell: int,
         stress: wp.array2d[shape],
         force_out: wp.array2d[wp.vec3d],  # (B, C K) [N]
     ):
-        """The transposed operator of the stress, by cell and local node: what `gather_cells` sums."""
+        """Applies the transposed operator to the stress, per cell and local node; `gather_cells` sums the results."""
         b, entry = wp.tid()
         if active[b] == 0:
             return
@@ -103,7 +103,7 @@ def gather_cells(
     incident_start: wp.array[int],
     incident: wp.array[int],
     cell_force: wp.array2d[wp.vec3d],  # (B, C K) [N]
-    force_out: wp.array2d[wp.vec3d],  # (B, N) [N] has them added
+    force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
 ):
     """Adds the results of `cell_forces` to the force of every vertex."""
     b, i = wp.tid()
@@ -116,7 +116,7 @@ def gather_cells(
 @wp.kernel
 def inertia_residual(
     inertia: wp.array2d[wp.float64],  # (B, N) [N/m] mass over the square of the effective time step
-    target: wp.array2d[wp.vec3d],  # (B, N) [m] where inertia alone would take the vertex
+    target: wp.array2d[wp.vec3d],  # (B, N) [m] inertial target
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     positions: wp.array2d[wp.vec3d],
     residual_out: wp.array2d[wp.vec3d],  # (B, N) [N]
@@ -139,7 +139,7 @@ def tangent_product(
     direction: wp.array2d[wp.vec3d],  # (B, N) [m]
     stress_out: wp.array2d[wp.mat33d],  # (B, P) dP in that direction [J]
 ):
-    """The change of stress in a direction."""
+    """Derivative of the stress in a direction."""
     b, p = wp.tid()
     df = deformation_gradient(direction, nodes, gradients, b, p, p / points_per_cell)
     t = tangent[b, p]
@@ -163,6 +163,6 @@ def line_tangent_product(
     direction: wp.array2d[wp.vec3d],  # (B, N) [m]
     stress_out: wp.array2d[wp.vec3d],  # (B, P)
 ):
-    """The change of stress in a direction, where an energy is a function of a vector."""
+    """Derivative of the stress in a direction, for an energy that is a function of a vector."""
     b, p = wp.tid()
     stress_out[b, p] = tangent[b, p, 0] * line_at(direction, nodes, weights, b, p, p / points_per_cell)

@@ -1,12 +1,12 @@
-"""Kernels of an energy that is one Warp function of what a point sees and of its values.
+"""Kernels of an energy given as one Warp function of the kinematic variable at a point and of its values.
 
-The function e(f, v) has the energy of a point of weight one. f is a vector or a matrix, see `points`, and says by its
-type which of both; v is the vector of values. From it follow
+The function e(f, v) returns the energy of a point of weight one; f is a vector or a matrix (`points`), v the vector of
+values. From it follow
 
-- the stress w de/df, exact: Warp differentiates the function;
-- the tangent w d2e/df2, by differences of fourth order of the exact stress, of the step h = 3e-4 of the size of f that
-  the energy declares. The error is about h^4/30 of a fifth derivative, and 1e-12 of the stress over the size of f from
-  rounding: 1e-9 of the tangent or better, where e is smooth over h (tests/energies/test_pointwise.py);
+- the stress w de/df, exact, by Warp's differentiation of the function;
+- the tangent w d2e/df2, by fourth-order differences of the exact stress with the step h = 3e-4 times the size of f that
+  the energy declares. The error is about h^4/30 times a fifth derivative, plus 1e-12 of the stress over the size of f
+  from rounding: 1e-9 of the tangent or better, where e is smooth over h (tests/energies/test_pointwise.py);
 - the derivatives by the values, -z . d residual/dv = -w d/ds de/dv(f + s dz) with dz = sum_a g_a z_a, by the same
   differences of the exact de/dv along dz.
 
@@ -34,7 +34,7 @@ mat99 = wp.types.matrix((9, 9), wp.float64)
 
 @wp.func
 def without_negative_eigenvalues(h: mat99) -> mat99:
-    """The nearest positive semidefinite matrix to a symmetric one, by Jacobi's rotations."""
+    """Returns the nearest positive semidefinite matrix to a symmetric one, by Jacobi rotations."""
     v = wp.identity(n=9, dtype=wp.float64)
     total = wp.ddot(h, h)
     for _sweep in range(SWEEPS):
@@ -75,7 +75,7 @@ def without_negative_eigenvalues(h: mat99) -> mat99:
 
 @wp.func
 def write_blocks(hessian: mat99, clamp: bool, out: wp.array[wp.mat33d]):
-    """The six blocks of a second derivative, of which rows and columns go by column and row of F."""
+    """Writes the six blocks of a second derivative whose rows and columns are ordered by column and row of F."""
     hessian = HALF * (hessian + wp.transpose(hessian))
     if clamp:
         hessian = without_negative_eigenvalues(hessian)
@@ -90,7 +90,7 @@ def write_blocks(hessian: mat99, clamp: bool, out: wp.array[wp.mat33d]):
 
 @functools.cache
 def pointwise_kernels(density: Any) -> SimpleNamespace:
-    """Returns the kernels of a function, and its type of values."""
+    """Returns the kernels of an energy function, and the vector type of its values."""
     shape, vector = density.input_types.values()
     module = named_module(f"pointwise.{density.module.name}.{density.key}")
     # Unrolled, the loops below would take minutes to compile.
@@ -101,7 +101,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def local_step(
-        active: wp.array[int],  # (B) zero where nothing is to be done
+        active: wp.array[int],  # (B) zero: skip the environment
         nodes: wp.array2d[int],
         operators: wp.array2d[operator],
         weights: wp.array[wp.float64],  # (P) w
@@ -156,7 +156,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
 
 
 def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
-    """Returns the kernel of the tangent by a vector, one block."""
+    """Returns the tangent kernel for a vector, with one block."""
 
     @wp.kernel(module=module)
     def tangent(
@@ -200,7 +200,7 @@ def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any
 
 
 def _tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
-    """Returns the kernel of the tangent by a matrix, six blocks."""
+    """Returns the tangent kernel for a matrix, with six blocks."""
 
     @wp.kernel(module=module)
     def tangent(

@@ -10,11 +10,11 @@ wp.set_module_options({"enable_backward": False})
 ZERO = wp.float64(0.0)
 
 
-# The potential of a uniform gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2), and a chamber's faces
-# look into it: V = -sum_q w_q det F, F = [x, t1, t2].
+# The potential of a uniform gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2). The faces are oriented into
+# the chamber: V = -sum_q w_q det F, F = [x, t1, t2].
 @wp.kernel
 def local_step(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     weights: wp.array[wp.float64],  # (P) a third of the quadrature weight
@@ -38,7 +38,7 @@ def local_step(
 @wp.kernel
 def tangent(
     active: wp.array[int],
-    clamp: wp.array[int],  # (B) not zero: leave it out, as it has eigenvalues of both signs
+    clamp: wp.array[int],  # (B) non-zero: set to zero, as the eigenvalues have both signs
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     weights: wp.array[wp.float64],
@@ -48,7 +48,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Column k of cof F is the product of the next two columns of F."""
+    """Derivative of cof F, whose column k is the cross product of the next two columns of F."""
     b, p = wp.tid()
     if active[b] == 0:
         return

@@ -1,7 +1,7 @@
-"""Sums over an environment by one block of threads: one thread on a CPU, the launch's ``block_dim`` of them on a GPU.
+"""Reductions over an environment by one block of threads: one thread on a CPU, ``block_dim`` threads on a GPU.
 
-Threads stride over the vertices or points. The order of a sum depends on the device alone, never on timing. Every
-thread of the block has to come to a reduction, which is a barrier too.
+Threads stride over the vertices or points. The summation order depends only on the device, never on timing. Every
+thread of the block must reach a reduction, which is also a barrier.
 """
 
 import warp as wp
@@ -14,13 +14,13 @@ ZERO = wp.float64(0.0)
 
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
-    """Returns the sum over a block, in every thread of it."""
+    """Returns the sum over a block, in every thread."""
     return wp.tile_sum(wp.tile(value))[0]
 
 
 @wp.func
 def block_max(value: wp.float64) -> wp.float64:
-    """Returns the maximum over a block, in every thread of it."""
+    """Returns the maximum over a block, in every thread."""
     return wp.tile_max(wp.tile(value))[0]
 
 
@@ -52,7 +52,7 @@ def totals(
     size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
     norm_out: wp.array[wp.float64],  # (B) of the residual [N]
 ):
-    """What a line search and a test of convergence need of an evaluated potential."""
+    """Sums the energy and the norm of the residual, for the line search and the convergence test."""
     b, lane = wp.tid()
     energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):

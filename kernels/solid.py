@@ -1,4 +1,4 @@
-"""Elastic and viscous energy of a solid: local step, tangent and derivatives by its constants, for any material."""
+"""Elastic and viscous energy of a solid: local step, tangent and derivatives by the constants, for any material."""
 
 import functools
 from types import ModuleType, SimpleNamespace
@@ -44,7 +44,7 @@ def strain_adjoint(
 
 @functools.cache
 def solid_kernels(law: ModuleType) -> SimpleNamespace:
-    """Kernels for one of ``kernels.materials``."""
+    """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
@@ -57,7 +57,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def local_step(
-        active: wp.array[int],  # (B) zero where nothing is to be done
+        active: wp.array[int],  # (B) zero: skip the environment
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
@@ -132,7 +132,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             rest = c[1] * wp.trace(strain) - dilation_offset[b, p]
             stress = isotropic(c[0] * strain - strain_offset[b, p], rest, shape, bulk)
             if clamp[b] != 0:
-                # The stress part of the viscous Hessian may be indefinite: a clamped Hessian leaves it out.
+                # The stress part of the viscous Hessian may be indefinite and is dropped in a clamped Hessian.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
             add_viscous_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
 
@@ -162,7 +162,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         shape = wp.dot(mu_of, m)
         bulk = wp.dot(lambda_of, m)
         c = viscosity[b]
-        # A stiffness of zero has a derivative too (nu = 0): what is skipped depends on the volumes alone.
+        # A stiffness of zero (nu = 0) has a derivative too, so only the volumes decide what is skipped.
         result = -slopes(f, dz, m, carried[p])
         rise = wp.transpose(f) * dz
         rise = HALF * (rise + wp.transpose(rise))
@@ -170,7 +170,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         strain = green_strain(f)
         dilation = wp.trace(strain)
         by_shape, by_volume = ZERO, ZERO
-        if c[0] + c[1] > ZERO:  # Without viscosity nobody writes the offsets.
+        if c[0] + c[1] > ZERO:  # Without viscosity the offsets are not set.
             by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
             by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)

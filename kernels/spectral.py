@@ -1,8 +1,8 @@
-"""The tangent of an isotropic energy from its second derivatives by the singular values of F."""
+"""Tangent of an isotropic energy from its second derivatives by the singular values of F."""
 
 import warp as wp
 
-SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # below it, a tangent divides by this
+SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # lower bound of sums of stretches in denominators
 ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
 
@@ -22,9 +22,9 @@ def spectral_blocks(
     clamp: bool,
     out: wp.array[wp.mat33d],
 ):
-    """The six blocks; with `clamp`, of the nearest tangent without negative eigenvalues.
+    """Writes the six blocks, with `clamp` those of the nearest tangent without negative eigenvalues.
 
-    `flip` and `twist` are numbered by the axis that their pair leaves out.
+    The index of `flip` and `twist` is the axis that is not in their pair.
     """
     if clamp:
         q, e = wp.eig3(normal)

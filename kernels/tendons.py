@@ -1,9 +1,9 @@
-"""Tendons that slide without friction through guides: stress, tangent and derivatives by what pulls and where it runs.
+"""Frictionless tendons through guides: stress, tangent and derivatives by actuation and routing.
 
-A point is the piece of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one to
-the other, the two others how it changes as the guides move in the body along the tendon's two directions, by
-`OFFSET_UNIT` each. So a piece is F c, with c = (1, offsets in that unit). A tendon's tension is that commanded, and
-that of a spring that only pulls, stretched by what the tendon is longer than its winch leaves it.
+A point is the segment of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one
+guide to the next; the other two are its changes as the guides move in the body along the tendon's two offset
+directions, per `OFFSET_UNIT`. So a segment is F c, with c = (1, offsets in that unit). The tension is the commanded one
+plus that of a tension-only spring, stretched by the tendon's length in excess of its free length.
 """
 
 import warp as wp
@@ -14,13 +14,13 @@ from .points import deformation_gradient
 wp.set_module_options({"enable_backward": False})
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
-OFFSET_UNIT = 5e-3  # of the offsets [m], about the size of cells, so that the columns of F are of one size
+OFFSET_UNIT = 5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
 PER_UNIT_OFFSET = wp.float64(1.0 / OFFSET_UNIT)
 
 
 @wp.func
 def direction_of(line: wp.vec3d) -> wp.vec3d:
-    """The unit vector along a piece; zero for one without a length."""
+    """Returns the unit vector along a segment, or zero for a segment without length."""
     length = wp.length(line)
     result = wp.vec3d(ZERO, ZERO, ZERO)
     if length > ZERO:
@@ -30,23 +30,23 @@ def direction_of(line: wp.vec3d) -> wp.vec3d:
 
 @wp.kernel
 def pull(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
-    first: wp.array[int],  # (T + 1) pieces of each tendon
+    first: wp.array[int],  # (T + 1) first segment of each tendon
     rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
     first_offset: wp.array2d[wp.float64],  # (B, T) [m]
     second_offset: wp.array2d[wp.float64],
     commanded: wp.array2d[wp.float64],  # (B, T) tension [N]
     contraction: wp.array2d[wp.float64],  # (B, T) [m]
     stiffness: wp.array2d[wp.float64],  # (B, T) of the spring [N/m]
-    toe: wp.float64,  # over which the spring tightens [m]
+    toe: wp.float64,  # elongation at which the spring reaches its full stiffness [m]
     positions: wp.array2d[wp.vec3d],
     along_out: wp.array2d[wp.vec3d],  # (B, T) c
     tension_out: wp.array2d[wp.float64],  # (B, T) [N]
     spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force and slope of a spring of stiffness one [m^2, m, -]
 ):
-    """The tension of each tendon, and where it runs."""
+    """Computes the tension and the vector c of each tendon."""
     b, t = wp.tid()
     if active[b] == 0:
         return
@@ -63,21 +63,21 @@ def pull(
 
 @wp.kernel
 def local_step(
-    active: wp.array[int],  # (B) zero where nothing is to be done
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     first: wp.array[int],
     tendon: wp.array[int],  # (P)
     commanded: wp.array2d[wp.float64],
     stiffness: wp.array2d[wp.float64],
-    along: wp.array2d[wp.vec3d],  # (B, T) what `pull` wrote
+    along: wp.array2d[wp.vec3d],  # (B, T) c, from `pull` like the next two
     total: wp.array2d[wp.float64],
     spring: wp.array2d[wp.vec3d],
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """T L of the commanded tension, and the spring's energy with the first piece."""
+    """T L of the commanded tension; the spring's energy is added to the first segment."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -94,7 +94,7 @@ def local_step(
 @wp.kernel
 def tangent(
     active: wp.array[int],
-    clamp: wp.array[int],  # (B) of no effect: a tendon only pulls, so that no eigenvalue is negative
+    clamp: wp.array[int],  # (B) without effect: tension is not negative, so no eigenvalue is
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
     tendon: wp.array[int],
@@ -103,7 +103,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Block (i, j) is c_i c_j T / l (1 - u u^T), at a given tension; its change couples all pieces of a tendon."""
+    """Block (i, j) is c_i c_j T / l (1 - u u^T) at constant tension; its change, coupling segments, is low rank."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -132,7 +132,7 @@ def directions(
     positions: wp.array2d[wp.vec3d],
     direction_out: wp.array2d[wp.mat33d],  # (B, P)
 ):
-    """What lengthens a tendon: u c^T of its pieces, with the unit vectors u along them."""
+    """Derivative u c^T of the length of each segment by F, with the unit vector u along the segment."""
     b, p = wp.tid()
     c = along[b, tendon[p]]
     line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
@@ -149,11 +149,11 @@ def adjoint(
     total: wp.array2d[wp.float64],
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-    by_tension_out: wp.array2d[wp.float64],  # (B, P) -u . dZ c, dL/dT of this piece [m]
-    by_offset_out: wp.array2d[wp.vec2d],  # (B, P) dL/d offset at a given tension [N]
-    longer_out: wp.array2d[wp.vec2d],  # (B, P) how much longer than at rest an offset makes this piece
+    by_tension_out: wp.array2d[wp.float64],  # (B, P) -u . dZ c, this segment's part of dL/dT [m]
+    by_offset_out: wp.array2d[wp.vec2d],  # (B, P) dL/d offset at constant tension [N]
+    longer_out: wp.array2d[wp.vec2d],  # (B, P) derivative of the elongation relative to rest by the offsets
 ):
-    """What a displacement does to each piece, with F and dZ of the positions and of the displacement."""
+    """Derivatives of each segment by tension and offsets, with dZ = F of the displacement z."""
     b, p = wp.tid()
     t = tendon[p]
     c = along[b, t]

@@ -1,4 +1,4 @@
-"""Values of an energy at a point, each read from an array by part, by point, or common to all points."""
+"""Reading the values of an energy at a point, each from its own array: per part, per point, or shared by all points."""
 
 import functools
 from typing import Any
@@ -10,10 +10,10 @@ from .modules import named_module
 
 @functools.cache
 def value_reader(vector: Any) -> Any:
-    """Returns the function that reads a vector type's values at point p of environment b.
+    """Returns the function that reads the values at point p of environment b into a vector type.
 
-    Its arguments are the addresses of arrays (B, size) of float64, their sizes, and where in a row the values of each
-    point are, (n, P). So kernels take any number of values without a further argument, or a copy.
+    Its arguments are the addresses of float64 arrays (B, size), their sizes, and the column of each value at each point
+    (n, P), so that kernels take any number of values without further arguments or copies.
     """
 
     @wp.func(module=named_module(f"values.{vector._length_}"))

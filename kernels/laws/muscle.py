@@ -1,4 +1,4 @@
-"""A contractile fibre, ``sigma l + k s(l - 1 + c)``: a stress, and a spring that a contraction shortens."""
+"""Contractile fibre, ``sigma l + k s(l - 1 + c)``: active stress, and a spring shortened by a contraction."""
 
 import warp as wp
 
@@ -11,10 +11,10 @@ values = wp.types.vector(3, wp.float64)  # (sigma, c, k)
 
 @wp.func
 def pull(strain: wp.float64, toe: wp.float64):
-    """Energy s, force and slope of a fibre of stiffness one, whose slope rises as 3 t^2 - 2 t^3 over the toe.
+    """Returns energy s, force and slope of a fibre of stiffness one; the slope rises as 3 t^2 - 2 t^3 over the toe.
 
-    Smoother than `thread.pull`, with the same force past the toe: there are fibres at every strain in a solid, and
-    derivatives are compared with differences over all of them.
+    Smoother than `thread.pull`, with the same force beyond the toe: a solid has fibres at every strain, and derivatives
+    are compared with differences over all of them.
     """
     energy = ZERO
     force = ZERO
@@ -33,7 +33,7 @@ def pull(strain: wp.float64, toe: wp.float64):
 
 @wp.func
 def tension(length: wp.float64, toe: wp.float64, v: values):
-    """See ``kernels.laws``."""
+    """Implements ``kernels.laws``."""
     energy, force, slope = pull(length - ONE + v[1], toe)
     by_values = values(ONE, v[2] * slope, force)
     return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values

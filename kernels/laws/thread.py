@@ -1,4 +1,4 @@
-"""A thread that only pulls, ``k s(l - 1)``; and the function s, half the square of what is positive, rounded."""
+"""Tension-only thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a short toe."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ values = wp.types.vector(1, wp.float64)  # (k)
 
 @wp.func
 def pull(strain: wp.float64, toe: wp.float64):
-    """Energy s, force and slope of a thread of stiffness one: none below zero, linear in the strain past the toe."""
+    """Returns energy s, force and slope of a thread of stiffness one: zero in compression, linear beyond the toe."""
     energy = ZERO
     force = ZERO
     slope = ZERO
@@ -28,6 +28,6 @@ def pull(strain: wp.float64, toe: wp.float64):
 
 @wp.func
 def tension(length: wp.float64, toe: wp.float64, v: values):
-    """See ``kernels.laws``."""
+    """Implements ``kernels.laws``."""
     energy, force, slope = pull(length - ONE, toe)
     return v[0] * energy, v[0] * force, v[0] * slope, values(force)

@@ -17,7 +17,7 @@ moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
 
 @wp.func
 def response(f: wp.mat33d, m: moduli):
-    """Both terms are w/2 dist^2(F, manifold), so that P = w (F - its projection)."""
+    """Returns energy and stress; both terms are w/2 dist^2(F, manifold), so that P = w (F - projection of F)."""
     energy = ZERO
     stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     if m[0] > ZERO:
@@ -33,18 +33,18 @@ def response(f: wp.mat33d, m: moduli):
 
 @wp.func
 def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
-    """See ``kernels.materials``."""
-    derivatives = moduli(ZERO, ZERO)
+    """Implements ``kernels.materials``."""
+    result = moduli(ZERO, ZERO)
     if carried[0] != ZERO:
-        derivatives[0] = TWO * wp.ddot(f - polar_rotation(f), df)
+        result[0] = TWO * wp.ddot(f - polar_rotation(f), df)
     if carried[1] != ZERO:
-        derivatives[1] = wp.ddot(f - nearest_unimodular(f), df)
-    return derivatives
+        result[1] = wp.ddot(f - nearest_unimodular(f), df)
+    return result
 
 
 @wp.func
 def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.float64):
-    """Normal (3, 3), flip and twist by the index of the axis left out; d are the singular values of D."""
+    """Returns normal (3, 3), flip and twist (`spectral_blocks`); d are the singular values of D."""
     # D shares F's singular frame: s = d + m cof(d), prod d = 1. Differentiating both gives the 3x3 block of
     # dD as the projection on the surface's tangent plane in the metric I + m (d off the diagonal).
     cof = wp.vec3d(d[1] * d[2], d[0] * d[2], d[0] * d[1])
@@ -68,7 +68,7 @@ def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.f
 # -[R e_k]_x A^-1 [R e_n]_x.
 @wp.func
 def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
-    """The blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
+    """Writes the blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
     r = polar_rotation(f)
     stretch = f * wp.transpose(r)
     t = wp.trace(stretch)
@@ -88,7 +88,7 @@ def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
 
 @wp.func
 def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-    """By the singular values where a rotation does not do."""
+    """Writes the blocks of dP/dF, by singular values unless the rotation suffices."""
     if clamp or m[1] != ZERO or wp.determinant(f) < SMALLEST_STRETCH_SUM:
         u, s, v = signed_svd(f)
         d = s

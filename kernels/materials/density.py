@@ -1,8 +1,8 @@
-"""A law from energy densities that are Warp functions of F and of any number of parameters, linear in them or not.
+"""Material law from energy densities given as Warp functions of F and any number of parameters.
 
-The energy of a point is V_s W(F, p) + V_v U(F, p): W at the points of the shape term, U at the fewer ones of the
-volume term. Its "moduli" are (V_s, V_v, mu V_s, lambda V_v, p_1, ..., p_n); the third and fourth serve viscosity alone.
-How the derivatives follow, and how exact they are, is said in `kernels.pointwise`.
+The energy of a point is V_s W(F, p) + V_v U(F, p): W at the points of the shape term, U at the fewer points of the
+volume term. Its "moduli" are (V_s, V_v, mu V_s, lambda V_v, p_1, ..., p_n); the third and fourth serve viscosity.
+`kernels.pointwise` describes the derivatives and their accuracy.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..modules import named_module
 from ..pointwise import OFFSETS, SHARES, STEP, TWELVE, mat99, write_blocks
 
 ZERO = wp.float64(0.0)
-FIRST = 4  # moduli before the parameters
+FIRST = 4  # index of the first parameter among the moduli
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ def density_law(name: str, energy_density: Any, volume_energy: Any) -> Law:
     """Returns the law of two Warp functions of (F: mat33d, p: a vector of float64) [J/m^3].
 
     Args:
-        name: of the material.
+        name: name of the material.
         energy_density: W.
-        volume_energy: U; not asked for at points where the second modulus is zero.
+        volume_energy: U; not evaluated at points where the second modulus is zero.
     """
     vector = list(energy_density.input_types.values())[1]
     count = vector._length_
@@ -50,7 +50,7 @@ def density_law(name: str, energy_density: Any, volume_energy: Any) -> Law:
             p[k] = m[FIRST + k]
         return p
 
-    # Warp puts functions that differentiate after those that do not: they are called by kernels alone.
+    # Warp emits functions that use wp.grad after all others, so only kernels can call them.
     @wp.func(module=module)
     def response(f: wp.mat33d, m: moduli):
         p = parameters_of(m)

@@ -1,12 +1,12 @@
 """``-mu J_m / 2 ln(1 - x) + lambda / 2 (J - 1)^2``, x = (I1 - 3 - 2 (J - 1) + (J - 1)^2) / J_m.
 
-The rubber of Gent (Rubber Chemistry and Technology 69, 1996), made compressible as `stable_neo_hookean`, which it is
-for a large limit J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu.
+The rubber of Gent (Rubber Chemistry and Technology 69, 1996), made compressible like `stable_neo_hookean`, which is its
+limit for large J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu.
 """
 
 import warp as wp
 
-ROOM = wp.constant(wp.float64(0.95))  # of the limit, up to which the energy is Gent's
+ROOM = wp.constant(wp.float64(0.95))  # fraction of the limit above which the energy is extrapolated
 
 
 @wp.func

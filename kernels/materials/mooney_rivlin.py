@@ -1,9 +1,9 @@
 """``c10 ((I1 - 3) - 2 (J - 1) + (J - 1)^2) + c01 ((I2 - 3) - 4 (J - 1)) + lambda / 2 (J - 1)^2``.
 
 The rubber of Mooney (1940) and Rivlin (1948), with I1 = ||F||^2, I2 = ||cof F||^2 and J = det F, made compressible by
-polynomials of J that leave the rest shape free of stress and give the first two terms no volume stiffness for small
-strains: these are linear elasticity with mu = 2 (c10 + c01) and lambda. With c01 = 0 it is `stable_neo_hookean`, and as
-that one it stays finite where elements invert.
+polynomials of J for which the rest shape is free of stress and the first two terms have no volume stiffness at small
+strains: there the material is linear elasticity with mu = 2 (c10 + c01) and lambda. With c01 = 0 it is
+`stable_neo_hookean`; like that it stays finite where elements invert.
 """
 
 import warp as wp
@@ -26,7 +26,7 @@ def volume_slope(m: moduli, jac: wp.float64) -> wp.float64:
 
 @wp.func
 def response(f: wp.mat33d, m: moduli):
-    """The energy above and its derivative."""
+    """Returns the energy above and its derivative."""
     first = wp.ddot(f, f)
     cof = cofactor(f)
     jac = wp.determinant(f)
@@ -39,7 +39,7 @@ def response(f: wp.mat33d, m: moduli):
 
 @wp.func
 def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
-    """See ``kernels.materials``."""
+    """Implements ``kernels.materials``."""
     jac = wp.determinant(f)
     along = wp.ddot(cofactor(f), df)
     second = wp.ddot(f, f) * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)
@@ -50,7 +50,7 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
 # the flip of the pair (i, j) is 2 (s_k^2 - s_i s_j) and -g' s_k, its twist 2 (s_k^2 + s_i s_j) and g' s_k.
 @wp.func
 def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
-    """The blocks of the nearest tangent without negative eigenvalues."""
+    """Writes the blocks of the nearest tangent without negative eigenvalues."""
     u, s, v = signed_svd(f)
     cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
     slope = volume_slope(m, s[0] * s[1] * s[2])
@@ -72,7 +72,7 @@ def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
 # (2 f_k f_n^T - f_n f_k^T - C_kn I + [k = n] (I1 I - F F^T)) x, with C = F^T F.
 @wp.func
 def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-    """The blocks of dP/dF, by the equation above."""
+    """Writes the blocks of dP/dF, by the equation above."""
     if clamp:
         clamped_tangent(f, m, out)
         return

@@ -18,7 +18,7 @@ moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
 
 @wp.func
 def response(f: wp.mat33d, m: moduli):
-    """The energy above and its derivative."""
+    """Returns the energy above and its derivative."""
     energy = ZERO
     stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
     change = wp.determinant(f) - ONE
@@ -33,7 +33,7 @@ def response(f: wp.mat33d, m: moduli):
 
 @wp.func
 def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
-    """See ``kernels.materials``."""
+    """Implements ``kernels.materials``."""
     change = wp.determinant(f) - ONE
     along = wp.ddot(cofactor(f), df)
     return moduli(wp.ddot(f, df) + (change - ONE) * along, change * along)
@@ -41,7 +41,7 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
 
 @wp.func
 def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
-    """The blocks of the nearest tangent without negative eigenvalues."""
+    """Writes the blocks of the nearest tangent without negative eigenvalues."""
     u, s, v = signed_svd(f)
     jac = s[0] * s[1] * s[2]
     cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
@@ -62,7 +62,7 @@ def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
 
 @wp.func
 def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-    """The blocks of mu F + (mu (J - 2) + lambda (J - 1)) cof F."""
+    """Writes the blocks of the derivative of mu F + (mu (J - 2) + lambda (J - 1)) cof F."""
     if clamp:
         clamped_tangent(f, m, out)
         return

@@ -356,16 +356,16 @@ def test_directions_equal_the_bfgs_formula():
     minimiser.refactor(state)
     while min(map(len, pairs)) < 3 * memory:
         state = minimiser.advance(state)
-        waits = minimiser._counts["phase"] != kernels.NEED_DIRECTION
+        waits = minimiser._counts["phase"] != kernels.NEEDS_DIRECTION
         searches += int(waits.sum())
         for b in range(2):
             if waits[b]:
                 continue
             x, g = now(b)
-            wanted = -bfgs_inverse(inverse[b].flatten(), pairs[b][-memory:]) @ here[b][1]
+            expected = -bfgs_inverse(inverse[b].flatten(), pairs[b][-memory:]) @ here[b][1]
             moved = x - here[b][0]
-            share = float(moved @ wanted / (wanted @ wanted))
-            torch.testing.assert_close(moved, share * wanted, rtol=0.0, atol=1e-9 * float(moved.abs().max()))
+            share = float(moved @ expected / (expected @ expected))
+            torch.testing.assert_close(moved, share * expected, rtol=0.0, atol=1e-9 * float(moved.abs().max()))
             assert share > 0.0
             pairs[b].append((moved, g - here[b][1]))
             here[b] = (x, g)
@@ -373,9 +373,9 @@ def test_directions_equal_the_bfgs_formula():
 
 
 class OneVertex:
-    """Arrays of the kernels for one environment of one vertex, in the phase after a trial was evaluated.
+    """Kernel arrays of one environment with one vertex, after the evaluation of a trial.
 
-    Its energy is far below that before, so that the trial is taken.
+    The energy is far below the previous one, so that the trial is accepted.
     """
 
     def __init__(self, memory):
@@ -391,7 +391,7 @@ class OneVertex:
             setattr(self.evaluation, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
         self.evaluation.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
         self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
-        for name in ("stored", "newest", "order"):
+        for name in ("count", "newest", "order"):
             setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
         self.history.start = wp.zeros((1, 1), dtype=wp.vec3d, device="cpu")
         self.history.correction = wp.zeros((1, 3, 1), dtype=wp.vec3d, device="cpu")
@@ -401,7 +401,7 @@ class OneVertex:
         return warp_view(self.vectors[name], wp.vec3d)
 
     def accept(self):
-        self.progress.phase.fill_(kernels.LINE_SEARCH)
+        self.progress.phase.fill_(kernels.TRIAL)
         inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
         kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
         views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
@@ -441,27 +441,28 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
 
 
 @pytest.mark.parametrize(
-    ("iterations", "made", "clamped", "phase", "wanted"),
+    ("iterations", "factorisations", "clamped", "phase", "request"),
     [
-        (5, 0, False, kernels.NEED_DIRECTION, kernels.FACTOR),
-        (5, 1, False, kernels.NEED_DIRECTION, kernels.CLAMPED_FACTOR),
+        (5, 0, False, kernels.NEEDS_DIRECTION, kernels.FACTOR),
+        (5, 1, False, kernels.NEEDS_DIRECTION, kernels.CLAMPED_FACTOR),
         (5, 1, True, kernels.FAILED, 0),
         (10, 0, False, kernels.FAILED, 0),
         (10, 1, False, kernels.FAILED, 0),
     ],
 )
 @pytest.mark.parametrize("stalls", [0, 2])
-def test_a_line_search_that_gives_up(iterations, made, clamped, phase, wanted, stalls):
-    """It asks for a factor, and a clamped one, within the limit of iterations; and whether its residual is rounding."""
+def test_a_failed_line_search(iterations, factorisations, clamped, phase, request, stalls):
+    """It requests a factor, then a clamped one, within the limit of iterations, and a check for rounding."""
     one = OneVertex(3)
     one.tolerances.max_iterations = 10
-    for name, value in {"iterations": iterations, "made": made, "stalls": stalls, "wanted": 0, "asks": 0}.items():
+    start = {"iterations": iterations, "factorisations": factorisations, "stalls": stalls}
+    for name, value in {**start, "request": 0, "check_rounding": 0}.items():
         getattr(one.progress, name).fill_(value)
-    one.progress.halvings.fill_(kernels.MOST_HALVINGS - 1)
+    one.progress.halvings.fill_(kernels.MAX_HALVINGS - 1)
     one.progress.rounding.fill_(np.inf)
     one.evaluation.energy.fill_(np.nan)
     one.clamped.fill_(clamped)
     one.accept()
-    assert (one["phase"], one["wanted"], one["stalls"]) == (phase, wanted, stalls + 1)
-    assert one["asks"] == (stalls + 1 >= kernels.STALLS)
+    assert (one["phase"], one["request"], one["stalls"]) == (phase, request, stalls + 1)
+    assert one["check_rounding"] == (stalls + 1 >= kernels.STALLS_BEFORE_CHECK)
     assert one["step"] == 0.0

@@ -1,4 +1,4 @@
-"""State of a minimisation on its device, and the launches that advance it; the kernels are ``kernels.minimisation``."""
+"""State of a minimisation on its device, and the kernel launches that advance it (``kernels.minimisation``)."""
 
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -14,34 +14,44 @@ from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
 
-_COUNTS = ("phase", "wanted", "factored", "asks", "iterations", "since", "made", "halvings", "stalls")
-_SUMS = ("step", "slope", "energy", "scale", "relative", "smallest", "rounding", "force", "stiffness")
-_NUDGES = 7  # random draws of rounding units
+_COUNTS = (
+    "phase",
+    "request",
+    "factored",
+    "check_rounding",
+    "iterations",
+    "since_factor",
+    "factorisations",
+    "halvings",
+    "stalls",
+)
+_SUMS = ("step", "slope", "energy", "scale", "relative", "smallest_norm", "rounding", "force", "stiffness")
+_PERTURBATIONS = 7  # random sign patterns for rounding checks
 
 
 class Summary(NamedTuple):
-    """Counts of environments that the host acts on."""
+    """Numbers of environments in a batch."""
 
-    active: int  # neither converged nor failed
-    aiming: int  # need a direction
-    wanting: int  # need a factor before the direction
-    asking: int  # measure the rounding of their residual
+    active: int  # not converged or failed yet
+    directions: int  # in need of a direction
+    factors: int  # in need of a factorisation before that
+    checks: int  # with a residual that may be rounding error
 
 
 class Minimiser:
     """Buffers and launches of one batch.
 
     Args:
-        potential: minimised at its positions.
-        hessian: gives the factor for the directions.
-        dtype: of pairs and right-hand sides.
-        memory: pairs that L-BFGS keeps; 0 for Newton's method.
+        potential: potential to minimise, which holds the positions.
+        hessian: matrix of the global step.
+        dtype: dtype of L-BFGS pairs and right-hand sides.
+        memory: number of L-BFGS pairs; 0 for Newton's method.
         relative_tolerance: residual over balancing forces at which an environment has converged.
-        absolute_tolerance: residual at which an environment has converged in any case [N].
-        epsilon: of the states' type.
-        max_iterations: directions after which an environment fails.
-        refactor_after: directions of a solve above which the next solve gets a new factor; three times as many give a
-            new factor at once. 0 for a new factor at every iterate, None for never.
+        absolute_tolerance: residual at which it has converged in any case [N].
+        epsilon: machine epsilon of the states' dtype.
+        max_iterations: number of directions after which an environment has failed.
+        refactor_after: number of directions after which the next solve starts with a new factor, and three times of
+            which force a new factor within a solve; 0: always, None: never.
     """
 
     def __init__(
@@ -63,7 +73,7 @@ class Minimiser:
         self._gradient, self._direction, origin = (p.zeros(n, 3) for _ in range(3))
         self._right = torch.zeros(b, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
         summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
-        # Where the host reads it: the same memory on a CPU.
+        # A copy on the host; on a CPU the same memory.
         self._summary, self._seen = summary, summary if p.device.type == "cpu" else summary.cpu().pin_memory()
         self._shown = self._seen.numpy()
 
@@ -76,17 +86,17 @@ class Minimiser:
             setattr(progress, name, warp_view(values, wp.int32))
         for name, values in self._sums.items():
             setattr(progress, name, warp_view(values, wp.float64))
-        places = max(memory, 1)
-        self._renews = refactor_after is not None
-        self._recent = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
+        size = max(memory, 1)
+        self._refactors = refactor_after is not None
+        self._history_counts = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
         self._pair_counts = torch.zeros(b, device=p.device, dtype=torch.int32)
         pairs.count = warp_view(self._pair_counts, wp.int32)
         pairs.last = wp.zeros(b, dtype=int, device=str(p.device))
         pairs.s, pairs.y = (
-            warp_view(torch.zeros(b, places, n, 3, device=p.device, dtype=dtype), vector) for _ in range(2)
+            warp_view(torch.zeros(b, size, n, 3, device=p.device, dtype=dtype), vector) for _ in range(2)
         )
-        pairs.r = warp_view(p.zeros(places, places), wp.float64)
-        pairs.a, pairs.b = (warp_view(p.zeros(places), wp.float64) for _ in range(2))
+        pairs.r = warp_view(p.zeros(size, size), wp.float64)
+        pairs.a, pairs.b = (warp_view(p.zeros(size), wp.float64) for _ in range(2))
         evaluation.energy, evaluation.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
         evaluation.balance, evaluation.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
         evaluation.residual = warp_view(p.residual, wp.vec3d)
@@ -95,7 +105,7 @@ class Minimiser:
         tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
         history = kernels.History()
-        history.stored, history.newest, history.order = (warp_view(values, wp.int32) for values in self._recent)
+        history.count, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
         history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
@@ -104,37 +114,36 @@ class Minimiser:
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         beginning = [*loads, positions, tolerances, origin_view, progress, history]
         begin = p.record_blocks(kernels.begin, b, beginning, [])
-        chosen = [warp_view(flags, wp.int32) for flags in (p.tangent_active, p.clamp)]
-        self._choose = p.record(kernels.choose, (b,), [progress, *chosen, pairs.count], [])
-        aiming = [progress, pairs, vertex_at, gradient]
-        self._project = p.record_blocks(own.project, b, aiming, [right])
-        aim = p.record_blocks(own.aim, b, [*aiming, right, positions], [origin_view, direction])
+        masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
+        self._select = p.record(kernels.select_for_factorisation, (b,), [progress, *masks, pairs.count], [])
+        shared = [progress, pairs, vertex_at, gradient]
+        self._project = p.record_blocks(own.project, b, shared, [right])
+        set_direction = p.record_blocks(own.set_direction, b, [*shared, right, positions], [origin_view, direction])
         clamped = warp_view(hessian.clamped, wp.bool)
-        judging = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation, origin_view, direction]
-        judging += [clamped, positions, gradient, progress, pairs, history]
-        accept = p.record_blocks(own.accept, b, judging, [])
-        seen = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
-        summarise = p.record_blocks(kernels.summarise, 1, [progress], seen)
-        judge = [*p.evaluation, accept, summarise]
-        self._begin, self._aim, self._go_on = p.capture(begin, *judge), p.capture(aim, *judge), p.capture(*judge)
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_NUDGES, n, 3))
+        inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation, origin_view, direction]
+        accept = p.record_blocks(own.accept, b, [*inputs, clamped, positions, gradient, progress, pairs, history], [])
+        counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
+        summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
+        evaluate = [*p.evaluation, accept, summarise]
+        self._begin, self._evaluate = p.capture(begin, *evaluate), p.capture(*evaluate)
+        self._first_trial = p.capture(set_direction, *evaluate)
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
         kept = warp_view(p.zeros(n, 3), wp.vec3d)
-        nudge = p.record_blocks(kernels.nudge, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
-        compare = p.record_blocks(
-            kernels.compare, b, [progress, kept, gradient, evaluation.residual], [positions, history]
-        )
-        self._compare = p.capture(nudge, *p.evaluation, compare, summarise)
-        self._parts = SimpleNamespace(begin=begin, aim=aim, judge=judge)
+        perturb = p.record_blocks(kernels.perturb, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
+        compared = [progress, kept, gradient, evaluation.residual]
+        check = p.record_blocks(kernels.check_rounding, b, compared, [positions, history])
+        self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
+        self._parts = SimpleNamespace(begin=begin, set_direction=set_direction, evaluate=evaluate)
         self._loop: Launches | None = None
         if self._runs_on_device:
             self._record_loop()
 
     @property
     def _runs_on_device(self) -> bool:
-        """Whether factors need no host code and a graph may contain a loop (CUDA 12.4 and later)."""
+        """Whether a solve can be one graph of launches, with a loop and the factorisations (CUDA 12.4 and later)."""
         h, p = self._hessian, self._potential
-        able = p.device.type == "cpu" or bool(wp.is_conditional_graph_supported())
-        return isinstance(h, ExactHessian) and isinstance(h.linear, TiledSolver) and not p.couples_cells and able
+        loops = p.device.type == "cpu" or bool(wp.is_conditional_graph_supported())
+        return isinstance(h, ExactHessian) and isinstance(h.linear, TiledSolver) and not p.couples_cells and loops
 
     def _record_loop(self) -> None:
         p, h, parts = self._potential, self._hessian, self._parts
@@ -142,46 +151,50 @@ class Minimiser:
         assert isinstance(h.linear, TiledSolver)
         factors = RecordedFactors(p, h.assembly, h.linear, h.clamped, self._right)
         conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
-        active, aiming, wanting, asking = conditions
+        active, directions, requests, checks = conditions
 
         def factorise() -> None:
-            issue(self._choose)
+            issue(self._select)
             factors.factorise()
 
-        def aim() -> None:
+        def set_direction() -> None:
             issue(self._project)
             factors.solve()
-            issue(parts.aim)
+            issue(parts.set_direction)
 
         def advance() -> None:
-            wp.capture_if(wanting, factorise)
-            wp.capture_if(aiming, aim)
-            issue(*parts.judge)
-            wp.capture_if(asking, lambda: issue(self._compare))
+            wp.capture_if(requests, factorise)
+            wp.capture_if(directions, set_direction)
+            issue(*parts.evaluate)
+            wp.capture_if(checks, lambda: issue(self._check_rounding))
 
         def solve() -> None:
-            issue(parts.begin, *parts.judge)
+            issue(parts.begin, *parts.evaluate)
             wp.capture_while(active, advance)
 
-        commands = [parts.begin, *parts.judge, self._choose, self._project, parts.aim, self._compare]
-        self._loop = p.capture_calls(solve, [*commands, *factors.commands])
+        commands = [parts.begin, *parts.evaluate, self._select, self._project, parts.set_direction]
+        self._loop = p.capture_calls(solve, [*commands, self._check_rounding, *factors.commands])
 
     def minimise(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> None:
-        """Minimises the potential; on a GPU with tiled factors, without waiting for the end.
+        """Minimises the potential; on a GPU with tiled factors, without synchronisation.
 
         Args:
-            start: (B, N, 3) positions to which inertia alone would lead [m].
-            follows: (B,) environments that continue the last step: their start is extrapolated from the last solutions,
-                and factor and pairs are kept. None for none. A factor that is never renewed is kept for all, without
-                pairs.
+            start: (B, N, 3) where inertia alone would lead [m].
+            follows: (B,) environments that continue from the last solution: their starting point is extrapolated, and
+                factor and pairs are kept. None: no environment. The constant factor of projective dynamics is always
+                kept, its pairs are not.
         """
         p = self._potential
-        for values in self._recent[0], self._pair_counts, *((self._counts["factored"],) if self._renews else ()):
+        for counts in (
+            self._history_counts[0],
+            self._pair_counts,
+            *((self._counts["factored"],) if self._refactors else ()),
+        ):
             if follows is None:
-                values.zero_()
+                counts.zero_()
             else:
-                values.mul_(follows)
-        if not self._renews:  # Pairs from the end of a long solve do not help the next one.
+                counts.mul_(follows)
+        if not self._refactors:  # The last pairs of a long solve are of little use for the next one.
             self._pair_counts.zero_()
         if self._loop is not None:
             p.positions.copy_(start)
@@ -193,7 +206,7 @@ class Minimiser:
         try:
             state = self.begin(start)
             while state.active:
-                if state.wanting:
+                if state.factors:
                     self.refactor(state)
                 state = self.advance(state)
         finally:
@@ -204,36 +217,36 @@ class Minimiser:
         p = self._potential
         p.positions.copy_(start)
         p.launch(self._begin)
-        return self._look()
+        return self._check_and_read()
 
     def advance(self, state: Summary) -> Summary:
-        """Evaluates one trial of every environment: the first along a new direction, or the next of a line search."""
+        """Evaluates the next trial of every active environment, along a new direction where one is needed."""
         p = self._potential
-        if state.aiming:
+        if state.directions:
             p.launch(self._project)
             self._hessian.solve_in_place(self._right)
-            p.launch(self._aim)
+            p.launch(self._first_trial)
         else:
-            p.launch(self._go_on)
-        return self._look()
+            p.launch(self._evaluate)
+        return self._check_and_read()
 
     def refactor(self, state: Summary) -> None:
-        """Factorises for the environments that need it, at their iterates."""
+        """Factorises at the iterates of the environments that need it."""
         p = self._potential
-        p.launch(self._choose)
-        everyone = state.wanting == p.batch
-        self._hessian.refactor(p.clamp.bool(), None if everyone else p.tangent_active.bool())
+        p.launch(self._select)
+        all_environments = state.factors == p.batch
+        self._hessian.refactor(p.clamp.bool(), None if all_environments else p.tangent_active.bool())
 
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns (B,) iterations, last residual over balancing forces, convergence flags and factorisations."""
+        """Returns directions, last residual over balancing forces, convergence and factorisations, (B,) each."""
         counts = self._counts
-        converged = counts["phase"] == kernels.DONE
-        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["made"].long()
+        converged = counts["phase"] == kernels.CONVERGED
+        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["factorisations"].long()
 
-    def _look(self) -> Summary:
+    def _check_and_read(self) -> Summary:
         state = self._read()
-        if state.asking:
-            self._potential.launch(self._compare)
+        if state.checks:
+            self._potential.launch(self._check_rounding)
             state = self._read()
         return state
 

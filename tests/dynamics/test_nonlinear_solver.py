@@ -441,7 +441,7 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
 
 
 @pytest.mark.parametrize(
-    ("iterations", "factorisations", "clamped", "phase", "request"),
+    ("iterations", "factorisations", "clamped", "phase", "requested"),
     [
         (5, 0, False, kernels.NEEDS_DIRECTION, kernels.FACTOR),
         (5, 1, False, kernels.NEEDS_DIRECTION, kernels.CLAMPED_FACTOR),
@@ -451,7 +451,7 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
     ],
 )
 @pytest.mark.parametrize("stalls", [0, 2])
-def test_a_failed_line_search(iterations, factorisations, clamped, phase, request, stalls):
+def test_a_failed_line_search(iterations, factorisations, clamped, phase, requested, stalls):
     """It requests a factor, then a clamped one, within the limit of iterations, and a check for rounding."""
     one = OneVertex(3)
     one.tolerances.max_iterations = 10
@@ -463,6 +463,6 @@ def test_a_failed_line_search(iterations, factorisations, clamped, phase, reques
     one.evaluation.energy.fill_(np.nan)
     one.clamped.fill_(clamped)
     one.accept()
-    assert (one["phase"], one["request"], one["stalls"]) == (phase, request, stalls + 1)
+    assert (one["phase"], one["request"], one["stalls"]) == (phase, requested, stalls + 1)
     assert one["check_rounding"] == (stalls + 1 >= kernels.STALLS_BEFORE_CHECK)
     assert one["step"] == 0.0

@@ -9,7 +9,7 @@ from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_verti
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
 from warp_resphys.energies.materials import MATERIALS as ALL_MATERIALS
 from warp_resphys.energies.materials import DensityMaterial
-from warp_resphys.energies.placed import Placed
+from warp_resphys.energies.placed import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
 from warp_resphys.linalg.choice import make_linear_solver
@@ -38,7 +38,7 @@ GRADIENTS = np.concatenate(
 def potential_of(body, model, batch, device):
     solid = Solid(body.discretisation, MATERIALS[model]())
     fixed = torch.as_tensor(body.fixed_vertices, device=device)
-    return IncrementalPotential([Placed(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
+    return IncrementalPotential([PlacedEnergy(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
 
 
 def unit_potential(

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, MooneyRivlin, Simulator, SolverSettings, StableNeoHookean, box_hexahedra
-from warp_resphys.energies.placed import Placed
+from warp_resphys.energies.placed import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
 from warp_resphys.io.errors import InputError
@@ -30,7 +30,7 @@ def gradients():
 def potential_of(f):
     solid = Solid(TETRAHEDRON.discretisation, MooneyRivlin())
     fixed = torch.zeros(0, dtype=torch.int64)
-    sets = [Placed(solid, solid.points(TETRAHEDRON.mesh))]
+    sets = [PlacedEnergy(solid, solid.points(TETRAHEDRON.mesh))]
     p = IncrementalPotential(sets, 4, fixed, len(f), torch.device("cpu"))
     zeros = torch.zeros(len(f), 4, 3, dtype=torch.float64)
     values = {"stiffness": torch.as_tensor(MODULI).expand(len(f), 1, 3), "viscosity": zeros[:, 0, :2]}

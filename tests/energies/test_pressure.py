@@ -25,7 +25,7 @@ def noise(*shape, seed=0):
 
 
 def chambers_of(s, batch):
-    return s.held_energy("pressure", batch)
+    return s.explicit_energy("pressure", batch)
 
 
 def simulator(kind="hexahedron", material=SOFT, fibres=None, **options):
@@ -302,7 +302,7 @@ def test_bad_input():
     with pytest.raises(InputError, match=r"Unknown input .*This body accepts external_force"):
         bare.step(bare.rest_state(), Inputs(pressure=zeros))
     with pytest.raises(InputError, match="Unknown input pressure"):
-        bare.held_energy("pressure", 1)
+        bare.explicit_energy("pressure", 1)
     for angles, toe in (((), 1e-3), ((90.0,), 1e-3), ((0.0,), 0.0)):
         with pytest.raises(InputError, match="fibre"):
             Fibres([chamber], angles, toe)

@@ -255,7 +255,7 @@ def test_forces_are_reconstructed_beside_a_tendon():
 
 def test_a_tendon_cannot_be_held():
     with pytest.raises(InputError, match="it cannot be held"):
-        simulator(route(0.018)).held_energy("tendon_tension", 1)
+        simulator(route(0.018)).explicit_energy("tendon_tension", 1)
 
 
 def test_a_tendon_cannot_push():

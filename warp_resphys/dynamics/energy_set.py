@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from ..energies.base import BoundEnergy, EnergySite, Memory, Term
-from ..energies.placed import Placed
+from ..energies.placed import PlacedEnergy
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..stepping.constants import Constants, Mass
@@ -43,7 +43,7 @@ class EnergySet:
 
     def __init__(
         self,
-        energies: Sequence[Placed],
+        placed: Sequence[PlacedEnergy],
         body: Body,
         rest_positions: torch.Tensor,
         method: Integrator,
@@ -86,7 +86,7 @@ class EnergySet:
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
     @property
-    def _pairs(self) -> Iterable[tuple[Placed, BoundEnergy]]:
+    def _pairs(self) -> Iterable[tuple[PlacedEnergy, BoundEnergy]]:
         return zip(self.placed, self._bound, strict=True)
 
     def acting(self, constants: Constants, inputs: Inputs, batch: int) -> dict[str, torch.Tensor | None]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch.autograd import forward_ad
 from typing_extensions import override
 
-from ..energies.placed import Placed
+from ..energies.placed import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..io.errors import ConvergenceError
 from ..linalg.choice import make_linear_solver
@@ -46,7 +46,7 @@ class Workspace:
 
     def __init__(
         self,
-        energies: Sequence[Placed],
+        energies: Sequence[PlacedEnergy],
         n_vertices: int,
         fixed: NDArray[np.int64],
         held: NDArray[np.int64],

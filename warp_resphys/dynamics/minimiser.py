@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..energies.launcher import Launches, issue, warp_view
+from ..energies.launcher import CapturedGraph, issue, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
 from ..linalg.tiled import TiledSolver
@@ -134,7 +134,7 @@ class Minimiser:
         check = p.record_blocks(kernels.check_rounding, b, compared, [positions, history])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
         self._parts = SimpleNamespace(begin=begin, set_direction=set_direction, evaluate=evaluate)
-        self._loop: Launches | None = None
+        self._loop: CapturedGraph | None = None
         if self._runs_on_device:
             self._record_loop()
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..energies.base import Energy
-from ..energies.explicit import HeldEnergy
+from ..energies.explicit import ExplicitEnergy
 from ..energies.materials import Corotated, Material
-from ..energies.placed import Placed
+from ..energies.placed import PlacedEnergy
 from ..energies.potential import StepTerms
 from ..energies.rigid import PointInertia, rigid_energies
 from ..energies.solid import solids_of
@@ -269,7 +269,7 @@ class Simulator:
                 "implicit."
             )
         self._workspaces: dict[int, Workspace] = {}
-        self._held_energies: dict[tuple[int, str], HeldEnergy] = {}
+        self._explicit_energies: dict[tuple[int, str], ExplicitEnergy] = {}
         self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
 
@@ -278,9 +278,9 @@ class Simulator:
         """Materials by the name of their region or body; an empty name for one material of the whole body."""
         return {"": self.material} if isinstance(self.material, Material) else _flat(self.material)
 
-    def _place_energies(self) -> list[Placed]:
-        """Returns the energies of all bodies: solids, rigid parts, actuators and loads."""
-        whole, placed = self.body, list[Placed]()
+    def _place_energies(self) -> list[PlacedEnergy]:
+        """Returns the energies of all bodies: their solids, their rigid parts, and what acts in or on them."""
+        whole, placed = self.body, list[PlacedEnergy]()
         for name, body, first in whole.members:
             begin = f"{name}_" if name else ""
             material = _material_of(self.material, name)
@@ -292,9 +292,9 @@ class Simulator:
             ]
             acting = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
             pairs += [(energy, points, begin) for energy, points in acting]
-            placed += [Placed.on(whole, body, first, energy, points, prefix) for energy, points, prefix in pairs]
+            placed += [PlacedEnergy.of(whole, body, first, energy, points, prefix) for energy, points, prefix in pairs]
         if whole.coordinates:
-            placed.append(Placed(PointInertia(whole.coordinates.points), (whole.coordinates.points,), _DEPENDENT))
+            placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), _DEPENDENT))
         return placed
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -353,14 +353,14 @@ class Simulator:
             self._set.placed, n, fixed, self._held, self._pattern, batch, torch.device(self.device), self.dtype
         )
 
-    def held_energy(self, name: str, batch: int) -> HeldEnergy:
-        """Returns the energy with an input of that name, to be evaluated by itself in a given state.
+    def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
+        """The energy with an input of that name, by itself in a given state.
 
         Raises:
             InputError: no energy of the body has that input.
         """
-        if (batch, name) not in self._held_energies:
-            acting = [placed for placed in self._set.placed if name in placed.input_names]
+        if (batch, name) not in self._explicit_energies:
+            acting = [each for each in self._set.placed if name in each.input_names]
             if not acting:
                 accepted = ", ".join(self.inputs) or "none"
                 raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
@@ -368,8 +368,8 @@ class Simulator:
             if energy.implicit_only:
                 raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             device = torch.device(self.device)
-            self._held_energies[batch, name] = HeldEnergy(energy, points, self.body.n_vertices, batch, device)
-        return self._held_energies[batch, name]
+            self._explicit_energies[batch, name] = ExplicitEnergy(energy, points, self.body.n_vertices, batch, device)
+        return self._explicit_energies[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
         """Returns the undeformed body at rest.
@@ -516,7 +516,7 @@ class Simulator:
             for name in (name for placed in self._set.placed if placed.energy.is_load for name in placed.input_names):
                 value = values[name]
                 assert value is not None
-                force = force + self.held_energy(name, batch).force(state.q, value)
+                force = force + self.explicit_energy(name, batch).force(state.q, value)
                 values[name] = torch.zeros_like(value)
         target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
         inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)

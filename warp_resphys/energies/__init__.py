@@ -1,4 +1,4 @@
-"""The energies of a body and the incremental potential of a step that they add up to.
+"""Energies of a body, and their sum, the incremental potential of a step.
 
-From outside: `material.Material`, `potential.IncrementalPotential`.
+Public: `materials.Material`, `potential.IncrementalPotential`.
 """

@@ -1,16 +1,15 @@
-"""The contract of an energy: its points, parameters, inputs and memory, its kernels and their derivatives.
+"""Interface of an energy: points, parameters, inputs, memory, kernels and derivatives.
 
-=================  =========  ===============================================================================
-class              lives      what it does
-=================  =========  ===============================================================================
-`Energy`           host       declares parameters (constants that may be identified) and inputs (loads and
-                              actuation over time), and makes the other two
-`BoundEnergy`      simulator  turns parameters into values, begins and ends a step, declares its memory
-`Term`             batch      kernels on the points, and their arguments
-=================  =========  ===============================================================================
+=================  =============  ===========================================================================
+class              one per        purpose
+=================  =============  ===========================================================================
+`Energy`           body           declares parameters (constants that can be identified) and inputs (functions
+                                  of time), and makes the other two
+`BoundEnergy`      simulator      turns parameters into values, begins and ends a step, declares its memory
+`Term`             batch          kernels on the points, and their arguments
+=================  =============  ===========================================================================
 
-Simulator, solver, adjoint, tape, gradient check, identification and configuration know this contract and no energy by
-name.
+Simulator, solver, adjoint, tape, gradient check, identification and configuration use only this interface.
 """
 
 from abc import ABC, abstractmethod
@@ -22,8 +21,6 @@ import numpy as np
 import scipy.sparse
 import torch
 import warp as wp
-from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..fem.body import Body
 from ..fem.elements import Points
@@ -39,26 +36,24 @@ from .launcher import Launcher, warp_view
 Values = Mapping[str, torch.Tensor | None]
 
 
+def value_of(values: Values, name: str) -> torch.Tensor:
+    """Returns a value that is never None."""
+    value = values[name]
+    assert value is not None
+    return value
+
+
 @dataclass(frozen=True)
 class Memory:
-    """A tensor that an energy carries from one step to the next, in `State.memory`."""
+    """A memory variable: a tensor that an energy carries from step to step, in `State.memory`."""
 
     name: str
     unit: str
-    shape: tuple[int, ...]  # without the environments
-    per: str  # what its first axis counts, such as ``string``
+    shape: tuple[int, ...]  # without the batch axis
+    per: str  # meaning of the first axis, such as ``string``
 
     def check(self, values: Any, batch: int, like: torch.Tensor) -> None:
-        """Checks shape, type, device and finiteness of values.
-
-        Args:
-            values: values of the memory.
-            batch: environments B.
-            like: a tensor on the device and of the type of the simulator.
-
-        Raises:
-            InputError: values that do not fit.
-        """
+        """Raises InputError for a wrong shape, dtype or device, or values that are not finite."""
         shape = (batch, *self.shape)
         if isinstance(values, torch.Tensor) and tuple(values.shape) != shape:
             raise InputError(
@@ -69,42 +64,33 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class PartPoints(Points):
-    """Points with a weight, each of which belongs to one part of an energy, such as a chamber or a tendon."""
-
-    part: NDArray[np.int64]  # (P,) number of the part
-    weights: NDArray[np.float64]  # (P,) factor of the point's energy: a volume, an area, a length, or one
-
-
-@dataclass(frozen=True)
 class EnergySite:
-    """Data of the simulator that an energy is bound to, whose vertices may belong to several bodies."""
+    """The simulator as an energy sees it; its vertices may belong to several bodies."""
 
     body: Body  # body of the energy
-    first: int  # number of that body's first vertex
-    points: tuple[Points, ...]  # points of the energy, by the simulator's vertices
-    rest_positions: torch.Tensor  # (N, 3) of all bodies [m], on the simulator's device and of its type
+    first: int  # index of that body's first vertex
+    points: tuple[Points, ...]  # points of the energy, with the simulator's vertex numbers
+    rest_positions: torch.Tensor  # (N, 3) of all bodies [m], with the simulator's device and dtype
     method: Integrator
     time_step: float  # h [s]
 
     @property
     def mass_volume(self) -> scipy.sparse.csc_array:
-        """Volume (N, M) of the body's elements that the vertices carry as mass [m^3]."""
+        """(N, M) `Body.mass_volume`, with rows for all vertices [m^3]."""
         return self._padded(self.body.mass_volume)
 
     @property
     def load_volume(self) -> scipy.sparse.csc_array:
-        """Volume (N, M) of the body's elements whose weight acts on the vertices [m^3]."""
+        """(N, M) `Body.load_volume`, with rows for all vertices [m^3]."""
         return self._padded(self.body.load_volume)
 
     def _padded(self, matrix: scipy.sparse.csr_array) -> scipy.sparse.csc_array:
-        """Returns a matrix (N', M) of the body's vertices with rows for all."""
         coo = matrix.tocoo()
         shape = (len(self.rest_positions), matrix.shape[1])
         return scipy.sparse.csc_array((coo.data, (coo.row + self.first, coo.col)), shape)
 
     def tensor(self, values: Any) -> torch.Tensor:
-        """Returns values on the simulator's device, in its type."""
+        """Returns values with the simulator's device and dtype."""
         return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
 
 
@@ -112,41 +98,41 @@ class EnergySite:
 class EnergyStep:
     """One time step, as an energy sees it."""
 
-    state: State  # start of the step
-    stage: ImplicitStage  # implicit solve of the integrator
+    state: State  # state at the start
+    stage: ImplicitStage  # the implicit solve of the step
     inputs: Inputs
     constants: Constants
-    term: "Term"  # term of the energy in the state's batch
+    term: "Term"  # term of the energy for the state's batch
 
 
 class PointSet:
-    """Points of one set on a launcher's device.
+    """A set of points on a launcher's device.
 
     Attributes:
         source: the points on the host.
-        part: slice of the points of all energies.
-        own: slice of the points of their own energy.
+        part: range of these points among the points of all energies.
+        own: range of these points among those of their energy.
         cells: C.
         points_per_cell: Q.
         nodes_per_cell: K.
         n_points: P = C Q.
         n_vertices: N.
         nodes: (C, K).
-        width: components of an operator: 3, or 1 where the energy is a function of a vector, see ``kernels.points``.
+        width: components of an operator: 3, or 1 if the energy is a function of a vector (``kernels.points``).
         gradients: (P, K) operators.
         start: (N + 1) first entry of each vertex in ``incident``.
-        incident: cell K + local node of every cell that a vertex belongs to.
+        incident: cell K + local node, for every cell of a vertex.
     """
 
     def __init__(self, launcher: Launcher, points: Points, n_vertices: int, part: slice, own: slice) -> None:
         self.source, self.part, self.own, self.n_points = points, part, own, points.n_points
         self.n_vertices = n_vertices
         self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
-        owner = points.nodes.ravel()
-        # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
+        vertex = points.nodes.ravel()
+        # Padded nodes have a zero gradient.
         entries = np.flatnonzero(np.abs(points.gradients).sum(axis=(1, 3)).ravel() > 0.0)
-        order = entries[np.argsort(owner[entries], kind="stable")]
-        start = np.searchsorted(owner[order], np.arange(n_vertices + 1))
+        order = entries[np.argsort(vertex[entries], kind="stable")]
+        start = np.searchsorted(vertex[order], np.arange(n_vertices + 1))
         self.nodes = launcher.upload(points.nodes.astype(np.int32), int)
         shape = (-1, self.nodes_per_cell) if self.width == 1 else (-1, self.nodes_per_cell, 3)
         self.gradients = launcher.upload(points.gradients.reshape(shape), wp.float64 if self.width == 1 else wp.vec3d)
@@ -155,7 +141,7 @@ class PointSet:
 
     @property
     def blocks(self) -> int:
-        """3 x 3 blocks of a point's tangent."""
+        """Number of 3 x 3 blocks in a point's tangent."""
         return 1 if self.width == 1 else 6
 
     def stress_view(self, stress: torch.Tensor) -> Any:
@@ -167,9 +153,9 @@ class Energy(ABC):
     """One energy of a body.
 
     Attributes:
-        inputs: loads and actuation over time, with `count` values.
-        is_load: whether its forces count as loads in the scale of a step's residual.
-        implicit_only: whether it acts at the end of a step for every coupling of the simulator's loads.
+        inputs: inputs of the energy, with `count` values each.
+        is_load: whether it is a load, which counts among the balancing forces in the convergence test.
+        implicit_only: whether it is a follower load, for which `Simulator.coupling` must be ``implicit``.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = ()
@@ -178,12 +164,12 @@ class Energy(ABC):
 
     @property
     def parameters(self) -> tuple[Quantity, ...]:
-        """Constants of the energy."""
+        """Parameters of the energy."""
         return ()
 
     @property
     def count(self) -> int:
-        """Number of parts (chambers, tendons) with an input or a parameter value of their own."""
+        """Number of parts (chambers, tendons), each with its own value of an input or a parameter."""
         return 1
 
     @property
@@ -204,26 +190,26 @@ class Energy(ABC):
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "Term":
         """Returns the energy's kernels for a batch."""
 
-    def bind(self, placement: EnergySite) -> "BoundEnergy":
-        """Returns the energy in a simulator; an energy that depends on the start of a step has a class of its own."""
-        return BoundEnergy(self, placement)
+    def bind(self, site: EnergySite) -> "BoundEnergy":
+        """Returns the energy on a simulator's device; overridden by energies with memory or values of a step."""
+        return BoundEnergy(self, site)
 
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Returns the values for the energy's terms, computed once a roll-out from the constants.
+        """Returns the values that follow from the parameters, computed once per roll-out.
 
         Args:
-            constants: (1 or B, 1 or n) tensors of all energies, by name.
+            constants: (1 or B, 1 or n) parameters of all energies by name.
 
         Raises:
-            InputError: a number of values other than `count`.
+            InputError: another number of values than `count`.
         """
         return {quantity.name: self.per_part(quantity, constants[quantity.name]) for quantity in self.parameters}
 
     def per_part(self, quantity: Quantity, values: torch.Tensor) -> torch.Tensor:
-        """Returns (1 or B, `count`) values of a parameter, or an array (1 or B, *shape) as it is.
+        """Returns (1 or B, `count`) values of a parameter, or an array parameter (1 or B, *shape) unchanged.
 
         Raises:
-            InputError: a number of values other than one or `count`.
+            InputError: another number of values.
         """
         if quantity.shape:
             return values
@@ -236,27 +222,27 @@ class Energy(ABC):
 
 
 class BoundEnergy:
-    """An energy over the steps of a simulator; the base class is an energy without memory.
+    """An energy in a simulator; this base class has no memory and no values that depend on the step.
 
     Args:
-        energy: the energy to bind.
-        placement: its points in the simulator.
+        energy: the energy.
+        site: the simulator as the energy sees it.
 
     Attributes:
-        memory: quantities carried from step to step.
+        memory: memory variables.
     """
 
     memory: tuple[Memory, ...] = ()
 
-    def __init__(self, energy: Energy, placement: EnergySite) -> None:
-        self.energy, self.placement = energy, placement
+    def __init__(self, energy: Energy, site: EnergySite) -> None:
+        self.energy, self.site = energy, site
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
-        """Returns the values that follow from the parameters, computed once a roll-out."""
+        """Returns the values that follow from the parameters, computed once per roll-out (`Energy.prepare`)."""
         return dict(self.energy.prepare(parameters))
 
     def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass | None:
-        """Returns the mass of the energy's matter, or None."""
+        """Returns the mass of the energy's material, or None."""
         del parameters
         return None
 
@@ -266,24 +252,24 @@ class BoundEnergy:
         return {}
 
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns the values of `begin_step` for an equilibrium, where nothing moves."""
+        """Returns these values for a static equilibrium."""
         del batch
         return {}
 
     def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
-        """Returns a force (1 or B, N, 3) that does not depend on the positions [N].
+        """Returns a dead load (1 or B, N, 3), independent of the positions [N], or None.
 
         Args:
-            inputs: of the step.
-            constants: of the roll-out.
-            batch: environments B.
-            static: whether the force is for an equilibrium instead of a step.
+            inputs: inputs of the step.
+            constants: constants of the roll-out.
+            batch: number of environments B.
+            static: whether it is for an equilibrium instead of a step.
         """
         del inputs, constants, batch, static
         return None
 
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the memory (B, ...) after a step, by name.
+        """Returns the memory variables (B, ...) after a step, by name.
 
         Args:
             step: the step.
@@ -295,16 +281,16 @@ class BoundEnergy:
 
 
 class Term(ABC):
-    """An energy's kernels on the points of a batch.
+    """An energy's kernels for a batch.
 
-    The step's values are tensors (B, *shape) by name: buffers that recorded launches read.
+    The values of a step are tensors (B, *shape) by name: buffers that recorded launches read.
 
     Args:
-        launcher: of the potential.
-        sets: its points.
+        launcher: launcher of the potential.
+        sets: points of the energy.
 
     Attributes:
-        couples_cells: whether it may have `low_rank` columns.
+        couples_cells: whether the term may have `low_rank` columns.
     """
 
     couples_cells = False
@@ -316,20 +302,20 @@ class Term(ABC):
     @property
     @abstractmethod
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """Shapes of the step's values by name, without the batch."""
+        """Shape of every value of a step, without the batch, by name."""
 
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        """Returns the sum (B,) of a solid's moduli times volumes [J], the scale of its energy's rounding error."""
+        """Returns the sum (B,) of a solid's moduli times volumes, the scale of its energy's rounding error [J]."""
         del values
         return None
 
     def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
-        """Returns launches that must run before the kernels of `step` and `tangent`."""
+        """Returns launches to be made before the kernels of `step` and `tangent`, at the same positions."""
         del values, positions, active
         return []
 
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        """Returns columns C (B, 3 N, r) of the tangent's low-rank part C C^T, which couples vertices of many cells."""
+        """Returns columns C (B, 3 N, r) of the part C C^T of the Hessian that couples many cells, or None."""
         del values, positions
         return None
 
@@ -343,146 +329,16 @@ class Term(ABC):
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:
-        """Returns an upper bound (1 or B, P) of the tangent's eigenvalues for small strains, times the volume [J]."""
+        """Returns an upper bound (1 or B, P) of the tangent's eigenvalues at small strains, times the volume [J]."""
 
     @abstractmethod
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """Returns a function that computes -z . d residual / d value, by name, at the positions x for z = direction.
+        """Returns a function that computes -z . d residual / d value at positions x, by name, from the buffers.
 
         Args:
-            values: the buffers.
+            values: buffers of the values.
             positions: (B, N, 3) buffer of x [m].
             direction: (B, N, 3) buffer of z [m].
         """
-
-
-class PartTerm(Term):
-    """A term on `PartPoints` with one value for every part.
-
-    Args:
-        launcher: of the potential.
-        sets: one set of points.
-        value: the name of the step's value, (B, count).
-        count: number of parts.
-    """
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], value: str, count: int) -> None:
-        super().__init__(launcher, sets)
-        (s,) = sets
-        assert isinstance(s.source, PartPoints)
-        self.value, self.count = value, count
-        self.weights = launcher.upload(s.source.weights, wp.float64)
-        self.part = launcher.upload(s.source.part.astype(np.int32), int)
-        own = np.eye(count)[s.source.part]
-        self._own = torch.as_tensor(own, device=launcher.device)  # (P, count) one in its part
-        self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
-        self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
-
-    @property
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        """One value a part."""
-        return {self.value: (self.count,)}
-
-    def views(self, values: Values) -> list[Any]:
-        """Returns the step's values as Warp arrays, in the order of `shapes`."""
-        own = [values[name] for name in self.shapes]
-        return [warp_view(value, wp.float64) for value in own if value is not None]
-
-    def sum_parts(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns sums (B, count) of values (B, P) over the points of each part, in a fixed order."""
-        return values @ self._own
-
-
-class ReadingTerm(Term):
-    """A term on `PartPoints` whose kernels read any number of values at each point; see ``kernels.values``.
-
-    Args:
-        launcher: of the potential.
-        sets: one set of points.
-        kernels: ``local_step``, ``tangent`` and ``adjoint``, and the vector type ``values``.
-        shapes: of the values, in the order of the vector: (count,) or (count, n) for values by part, (P,) for values by
-            point.
-        count: number of parts.
-        own: names of the values by point.
-        arrays: names of arrays, of any shape, that every point reads as a whole.
-        extra: arguments of the kernels after the values.
-    """
-
-    def __init__(
-        self,
-        launcher: Launcher,
-        sets: Sequence[PointSet],
-        kernels: Any,
-        shapes: Mapping[str, tuple[int, ...]],
-        count: int,
-        own: Sequence[str] = (),
-        arrays: Sequence[str] = (),
-        extra: Sequence[Any] = (),
-    ) -> None:
-        super().__init__(launcher, sets)
-        (s,) = sets
-        assert isinstance(s.source, PartPoints)
-        self._kernels, self._shapes, self._extra = kernels, dict(shapes), extra
-        self._point_values, self._arrays = frozenset(own), frozenset(arrays)
-        self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
-        self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
-        self._own = torch.as_tensor(np.eye(count)[s.source.part], device=launcher.device)  # (P, count) one in its part
-        self._weights = launcher.upload(s.source.weights, wp.float64)
-        self._places = {name: self._places_of(name, s.source.part) for name in self._shapes}
-        self._place = launcher.upload(np.concatenate(list(self._places.values())).astype(np.int32), int)
-        sizes = [int(np.prod(shape)) for name, shape in self._shapes.items() for _ in self._places[name]]
-        self._sizes = launcher.upload(np.array(sizes, dtype=np.int32), int)
-
-    def _places_of(self, name: str, part: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Returns the columns (n, P) of every point's values in its array."""
-        if name in self._arrays:
-            return np.tile(np.arange(int(np.prod(self._shapes[name])))[:, None], len(part))
-        columns = int(np.prod(self._shapes[name][1:]))
-        first = np.arange(len(part)) if name in self._point_values else part
-        return np.stack([first * columns + k for k in range(columns)])
-
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return self._shapes
-
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        tensors = [values[name] for name in self._shapes for _ in self._places[name]]
-        addresses = np.array([tensor.data_ptr() for tensor in tensors if tensor is not None], dtype=np.uint64)
-        read = [self.launcher.upload(addresses, wp.uint64), self._sizes, self._place]
-        return [s.nodes, s.gradients, self._weights, *read, *self._extra, s.points_per_cell, positions]
-
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.tangent, self._arguments(s, values, positions)
-
-    @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
-        own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points, self._kernels.values._length_)
-        inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
-        view = warp_view(out, self._kernels.values)
-        command = own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, [view])
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            slopes, first = {}, 0
-            for name, shape in self._shapes.items():
-                slope = out[..., first : first + len(self._places[name])]
-                if name in self._arrays:
-                    slope = slope.sum(1)
-                elif name not in self._point_values:
-                    slope = torch.einsum("bpn,pc->bcn", slope, self._own)
-                slopes[name] = slope.reshape(own.batch, *shape).clone()
-                first += len(self._places[name])
-            return slopes
-
-        return differentiate

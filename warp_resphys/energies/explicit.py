@@ -1,7 +1,8 @@
-"""Value and force of one energy in a given state, for explicit coupling: the force is held during a step.
+"""Value and force of a single energy at given positions, for explicit coupling and for measurements.
 
-The implicit coupling of an energy is part of the incremental potential. The derivative of an energy by an input is the
-input's conjugate quantity, such as the volume of a chamber for its pressure.
+In implicit coupling an energy is part of the incremental potential; in explicit coupling its force is constant during a
+step. The derivative of an energy by an input is the work-conjugate quantity, such as the volume of a chamber for its
+pressure.
 """
 
 from typing import Any
@@ -11,28 +12,29 @@ import warp as wp
 from typing_extensions import override
 
 from ..fem.elements import Points
-from .base import Energy, PartTerm, PointSet
+from .base import Energy, PointSet
 from .launcher import Launcher, warp_view
+from .part_terms import PartTerm
 
 
-class HeldEnergy(Launcher):
-    """One energy of a body with a value for each of its parts, differentiable by positions and values.
+class ExplicitEnergy(Launcher):
+    """One energy with one value per part, differentiable by positions and values.
 
     Args:
-        energy: such as `pressure.Pressure`.
-        points: of the energy.
+        energy: the energy, such as `pressure.Pressure`.
+        points: points of the energy.
         n_vertices: N.
-        batch: environments B.
-        device: of every tensor.
+        batch: number of environments B.
+        device: device of every tensor.
     """
 
     def __init__(self, energy: Energy, points: Points, n_vertices: int, batch: int, device: torch.device) -> None:
         super().__init__(batch, device)
-        everything = slice(0, points.n_points)
-        self._set = PointSet(self, points, n_vertices, everything, everything)
+        all_points = slice(0, points.n_points)
+        self._set = PointSet(self, points, n_vertices, all_points, all_points)
         term = energy.term(self, [self._set])
         assert isinstance(term, PartTerm)
-        self.term = term
+        self.term, (self._value,) = term, term.shapes
 
     def force(self, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Returns the force (B, N, 3) [N] at positions (B, N, 3) [m] for values (B, count)."""
@@ -40,16 +42,16 @@ class HeldEnergy(Launcher):
         return force
 
     def conjugates(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns minus the derivatives (B, count) of the energy by the values: volumes [m^3] for pressures."""
+        """Returns minus the derivatives of the energy by the values, (B, count): for pressure, volumes [m^3]."""
         conjugates: torch.Tensor = _Conjugates.apply(self, positions)
         return conjugates
 
     def evaluate(self, positions: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the energy of every part (B, count) [J] and the force (B, N, 3) [N], without gradients."""
+        """Returns the energy of each part (B, count) [J] and the force (B, N, 3) [N], without gradients."""
         positions, values = positions.double(), values.double()
         s = self._set
         stress, energy = self.zeros(s.n_points, 3, s.width), self.zeros(s.n_points)
-        kernel, inputs = self.term.step(s, {self.term.value: values.contiguous()}, self._view(positions))
+        kernel, inputs = self.term.step(s, {self._value: values.contiguous()}, self._view(positions))
         view, active = s.stress_view(stress), warp_view(self.active, wp.int32)
         step = self.record(kernel, (self.batch, s.n_points), [active, *inputs], [view, warp_view(energy, wp.float64)])
         force = torch.zeros_like(positions)
@@ -59,33 +61,33 @@ class HeldEnergy(Launcher):
     def force_adjoint(
         self, positions: torch.Tensor, values: torch.Tensor, adjoint: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Transposed derivatives of `force` by positions and values, applied to (B, N, 3): (B, N, 3) and (B, count)."""
+        """Returns vector-Jacobian products of `force` by positions, (B, N, 3), and by values, (B, count)."""
         positions, values, adjoint = positions.double(), values.double(), adjoint.double()
-        s, held = self._set, {self.term.value: values.contiguous()}
+        s, named = self._set, {self._value: values.contiguous()}
         view = s.stress_view(self.zeros(s.n_points, 3, s.width))
         tangent = warp_view(self.zeros(s.n_points, s.blocks, 3, 3), wp.mat33d)
-        masks = [warp_view(flags, wp.int32) for flags in (self.active, torch.zeros_like(self.active))]
-        kernel, inputs = self.term.tangent(s, held, self._view(positions))
+        masks = [warp_view(mask, wp.int32) for mask in (self.active, torch.zeros_like(self.active))]
+        kernel, inputs = self.term.tangent(s, named, self._view(positions))
         out = torch.zeros_like(positions)
         self.launch(
             self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]),
-            # The second derivative of an energy is symmetric: it is its own transpose.
+            # The Hessian is symmetric, so its product is its own transpose.
             self.product(s, tangent, self._view(adjoint), view),
             self.gather(s, view, out),
         )
-        slopes = self.term.adjoint(held, positions.contiguous(), adjoint.contiguous())()
-        return out.neg_(), slopes[self.term.value]
+        slopes = self.term.adjoint(named, positions.contiguous(), adjoint.contiguous())()
+        return out.neg_(), slopes[self._value]
 
     def _view(self, field: torch.Tensor) -> Any:
         return warp_view(field.contiguous(), wp.vec3d)
 
 
 class _Conjugates(torch.autograd.Function):
-    """-dE/dp of an energy that is linear in p: for a loss with gradient w, the gradient by x is the force at p = w."""
+    """-dE/dp of an energy linear in p; its vector-Jacobian product with w is the force for p = w."""
 
     @override
     @staticmethod
-    def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, held: ExplicitEnergy, positions: torch.Tensor) -> torch.Tensor:
         ctx.held = held
         ctx.save_for_backward(positions)
         volumes = -held.evaluate(positions.detach(), held.zeros(held.term.count) + 1.0)[0]
@@ -104,7 +106,7 @@ class _Force(torch.autograd.Function):
 
     @override
     @staticmethod
-    def forward(ctx: Any, held: HeldEnergy, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, held: ExplicitEnergy, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         ctx.held = held
         ctx.save_for_backward(positions, values)
         return held.evaluate(positions.detach(), values.detach())[1].to(positions.dtype)

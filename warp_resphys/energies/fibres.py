@@ -1,7 +1,7 @@
-"""Threads wound around chambers, in their surface.
+"""Inextensible fibres wound around chambers, in their surface.
 
-A point's operator g_a is the derivative of a shape function along a fibre, so that sum_a g_a x_a is the deformed fibre
-and its length the stretch.
+The operator g_a of a point is the derivative of a shape function along a fibre, so that sum_a g_a x_a is the deformed
+unit fibre and its length the stretch.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,36 +20,32 @@ from ..kernels.laws import thread as law
 from ..mesh.chambers import Chamber, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PartPoints, PointSet, ReadingTerm, Values
+from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher
+from .part_terms import PartPoints, ReadingTerm
 
-_CAP = 0.7  # cosine between a face's normal and the chamber's axis from which on the face is an end, without fibres
-_ALIGNED = 0.8  # cosine between a chamber's axis and the direction that fibres are wound around, at least
+_CAP = 0.7  # cosine between face normal and chamber axis above which a face is an end cap, without fibres
+_ALIGNED = 0.8  # smallest cosine between a chamber's principal direction and the given axis
 _LARGEST_ANGLE = 85.0  # degrees
 
 
 @dataclass(frozen=True)
 class Fibres(Energy):
-    """Inextensible thread wound around every chamber, in its surface, which keeps the chamber from widening.
+    """Inextensible fibres wound around every chamber, in its surface, against radial expansion.
 
-    The energy of an area of the surface is ``k s(lambda - 1)`` for each family of windings, lambda being the stretch
-    along it and k the stiffness of one thread [N] over the distance of its turns [m]. A thread cannot push: s(x) is
-    zero for x < 0, and its derivative, the force, reaches its full slope at the strain `toe`.
+    The energy per area of the surface is ``k s(lambda - 1)`` for each family of windings, with the stretch lambda along
+    the fibre and k the stiffness of one fibre [N] over the spacing of its turns [m]. Fibres carry no compression: s(x)
+    is zero for x < 0, and its derivative, the force, reaches its full slope at the strain `toe`.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)
 
-    chambers: Sequence[Chamber]  # wound with thread
-    # (A,) angle of each family of windings to the direction around the chamber [degrees]; two opposite angles make
-    # a double helix
-    angles: Sequence[float] = (0.0,)
-    toe: float = 1e-3  # strain over which a thread tightens
-    # approximate direction of the chambers, which are wound around their principal direction nearest to it; None for
-    # the principal direction of their largest extent
+    chambers: Sequence[Chamber]  # chambers with fibres
+    angles: Sequence[float] = (0.0,)  # (A,) angle of each family to the circumference [deg]; +a and -a: double helix
+    toe: float = 1e-3  # strain at which a fibre reaches its full stiffness
+    # fibres are wound around the principal direction of a chamber nearest to this axis; None: around its longest one
     axis: Sequence[float] | None = None
-    # k [N/m], the parameter ``fibre_stiffness``: a number, (C,) values with one for each chamber, (B, 1), or (B,
-    # C)
-    stiffness: Parameter = 0.0
+    stiffness: Parameter = 0.0  # k [N/m], parameter ``fibre_stiffness``: a number, (C,), (B, 1) or (B, C) values
 
     def __post_init__(self) -> None:
         """Checks the values.
@@ -82,10 +78,10 @@ class Fibres(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """Returns the quadrature points of the energy; the ends of chambers have none.
+        """Returns the integration points, with zero weight on the end caps.
 
         Raises:
-            MeshError: a chamber that has no direction near that of the fibres.
+            MeshError: a chamber without a principal direction near `axis`.
         """
         shape, (points, weights) = face_rule(self.chambers, 2)
         _, gradients = shape(points)
@@ -112,8 +108,8 @@ class Fibres(Energy):
         families = len(self.angles)
         nodes = np.concatenate([np.tile(chamber.faces, (families, 1)) for chamber in self.chambers])
         counts = [families * len(c.faces) * len(weights) for c in self.chambers]
-        numbers = np.repeat(np.arange(len(self.chambers)), counts)
-        return (PartPoints(nodes, np.concatenate(operators)[..., None], numbers, np.concatenate(areas).ravel()),)
+        part = np.repeat(np.arange(len(self.chambers)), counts)
+        return (PartPoints(nodes, np.concatenate(operators)[..., None], part, np.concatenate(areas).ravel()),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
@@ -122,17 +118,15 @@ class Fibres(Energy):
 
 
 class FibreTerm(ReadingTerm):
-    """Kernels of the thread around every chamber."""
+    """Kernels of the fibres around every chamber."""
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        stiffness = values["fibre_stiffness"]
-        assert stiffness is not None
-        return self.weight * stiffness[:, self.part_of]
+        return self.weight * value_of(values, "fibre_stiffness")[:, self.part_of]
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:
-    """Returns the principal direction (3,) of a chamber nearest to a given one, or of its largest extent."""
+    """Returns the principal direction (3,) of a chamber nearest to an axis, or its longest one."""
     vertices = mesh.vertices[chamber.vertices]
     directions: NDArray[np.float64] = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
     if near is None:

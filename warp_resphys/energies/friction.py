@@ -1,17 +1,17 @@
-r"""Friction along lines by bristles (Dahl 1968): the hysteresis of braids, sleeves and cables that slide.
+r"""Bristle friction along lines (Dahl 1968), for the hysteresis of sliding braids, sleeves and cables.
 
-A line between two vertices changes its length by the slide s. Bristles of the deflection z resist it by F_c z / z_c,
+A line between two vertices changes its length by the slide s. Bristles with the deflection z resist with F_c z / z_c,
 
     dz/ds = 1 - sgn(ds) z / z_c,
 
-so that the force approaches the friction force F_c over the bristle length z_c, in both directions; it does not depend
-on the speed. From the deflection z_0 at the start of a step this is solved exactly:
+so that the force approaches the friction force F_c over the bristle length z_c, in both directions and independent of
+the speed. From the deflection z_0 at the start of a step this is solved exactly:
 
     z(s) = sgn(s) z_c + (z_0 - sgn(s) z_c) exp(-|s| / z_c),
     F_c / z_c int z ds = F_c (|s| + (sgn(s) z_0 - z_c) (1 - exp(-|s| / z_c))),
 
-a convex function of s that a step minimises with everything else. Its second derivative jumps where the slide turns.
-After many cycles of the amplitude A the loop of force over slide has the area 4 F_c (A - z_c tanh(A / z_c)).
+a convex function of s that is part of the incremental potential. Its second derivative jumps where the slide reverses.
+After many cycles of amplitude A the force-slide loop has the area 4 F_c (A - z_c tanh(A / z_c)).
 
 P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)-1, 1968.
 """
@@ -29,16 +29,16 @@ from ..io.errors import InputError
 from ..kernels.friction import bristle_energy
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import PartPoints
+from .part_terms import PartPoints
 from .pointwise import PointwiseEnergy, between
 
 
 @dataclass(frozen=True)
 class BristleFriction(PointwiseEnergy):
-    """Dahl friction against changes of the lengths of lines, see the module.
+    """Dahl friction against changes in the lengths of lines (equations in the module's docstring).
 
-    Its parameters are ``friction_force`` F_c [N] and ``bristle_length`` z_c [m], its memory is ``bristle_deflection``
-    z [m]; each has a value for every line.
+    Parameters are ``friction_force`` F_c [N] and ``bristle_length`` z_c [m], memory is ``bristle_deflection`` z [m],
+    with one value per line.
 
     Raises:
         InputError: no line, a line from a vertex to itself, or a value out of range.
@@ -53,9 +53,9 @@ class BristleFriction(PointwiseEnergy):
     density: ClassVar = bristle_energy
     size: ClassVar[float] = 1e-4
 
-    pairs: ArrayLike  # (L, 2) vertices that each line leads between
-    friction_force: Parameter  # F_c [N]: a number, (L,) values with one for each line, (B, 1), or (B, L)
-    bristle_length: Parameter  # z_c [m], the same
+    pairs: ArrayLike  # (L, 2) end vertices of each line
+    friction_force: Parameter  # F_c [N]: a number, (L,), (B, 1) or (B, L) values
+    bristle_length: Parameter  # z_c [m]: likewise
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -75,8 +75,8 @@ class BristleFriction(PointwiseEnergy):
         return (between(self.pairs, np.arange(self.count)),)
 
     @override
-    def begin_step(self, seen: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Mapping[str, torch.Tensor]:
-        return {"deflection": values["bristle_deflection"], "length": seen.norm(dim=-1)}
+    def begin_step(self, start: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Mapping[str, torch.Tensor]:
+        return {"deflection": values["bristle_deflection"], "length": start.norm(dim=-1)}
 
     @override
     def end_step(

@@ -1,4 +1,4 @@
-"""Warp launches on torch's memory, recorded once and repeated."""
+"""Recorded Warp launches on torch's memory."""
 
 from collections.abc import Callable, Iterable
 from threading import Lock
@@ -13,30 +13,29 @@ from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
 from ..kernels.modules import launch_stream, shareable
 
-# Warp captures launches of all threads: only one thread may work while a simulator is new.
-_CAPTURES = Lock()
-BLOCK = 128  # threads of a block on a GPU, equal for all kernels: Warp compiles a module for every block size
+_CAPTURES = Lock()  # A capture records launches of all threads: only one thread may use Warp during the first step.
+BLOCK = 128  # threads per block on a GPU; the same for all kernels, as Warp compiles a module once per block size
 
-ensure_kernel_cache()  # Before Warp is first used, by this package or by who imports it.
+ensure_kernel_cache()  # before Warp is first used
 
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
-    """Returns a Warp array on a tensor's memory, without a gradient."""
+    """Returns a Warp array on a tensor's memory, without gradient."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
 class Launcher:
-    """Buffers of float64 and launches for a batch, on one device.
+    """Buffers of float64 and kernel launches for a batch, on one device.
 
     Args:
-        batch: environments B.
-        device: of every buffer.
+        batch: number of environments B.
+        device: device of every buffer.
 
     Attributes:
         active: (B,) zero for environments that kernels skip, such as converged ones during a solve.
     """
 
-    by_cells = False  # whether every node or pair of nodes of a cell has a thread of its own, as on a GPU
+    by_cells = False  # whether there is one thread per node or pair of nodes of a cell, as on a GPU
 
     def __init__(self, batch: int, device: torch.device) -> None:
         self.batch, self.device = batch, device
@@ -51,50 +50,46 @@ class Launcher:
         """Returns a Warp array with a copy of the values."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
 
-    def points_view(self, tensor: torch.Tensor, part: slice, dtype: Any) -> Any:
-        """Returns a Warp array on the points of one set."""
-        return warp_view(tensor[:, part], dtype)
-
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
-        """Returns a recorded launch for `launch`."""
+        """Returns a recorded launch, for `launch`."""
         options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
             return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options)
 
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
-        """Returns a recorded launch by cooperating blocks of threads; on a CPU a block is one thread."""
+        """Returns a recorded launch with cooperating blocks of threads (one thread per block on a CPU)."""
         options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
             return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
-        """Returns a launch that adds the nodal forces of a set's stress, see `PointSet.stress_view`, to (B, N, 3).
+        """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
 
-        Two launches on a GPU, where a cell's threads read its stress once for all of its nodes.
+        With ``by_cells`` there are two launches, so that the threads of a cell read its stress once for all nodes.
         """
-        to, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
+        outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
         if not self.by_cells:
             inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
-            return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, to)
+            return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, outputs)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]
         cells, active = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.active, wp.int32)
-        return Several(
+        return LaunchSequence(
             self.record(kernels.cell_forces, cells, [active, s.gradients, s.points_per_cell, stress], forces),
-            self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], to),
+            self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], outputs),
         )
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
-        """Returns a launch: stress of a set from its tangent (B, P, blocks) mat33 and a direction (B, N) vec3."""
+        """Returns a launch that computes a set's stress from its tangent (B, P, blocks) and a direction (B, N)."""
         inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
         kernel = points.line_tangent_product if s.width == 1 else points.tangent_product
         return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 
-    def capture(self, *commands: Any) -> "Launches":
-        """Returns recorded launches as one graph, on a CPU too, at a sixth of the cost of single launches."""
+    def capture(self, *commands: Any) -> "CapturedGraph":
+        """Returns recorded launches as one graph, also on a CPU, where it costs a sixth of the single launches."""
         return self.capture_calls(lambda: issue(*commands), commands)
 
-    def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "Launches":
-        """Returns recorded launches as one graph, in the order and under the conditions of a function.
+    def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "CapturedGraph":
+        """Returns a graph of the launches that a function makes.
 
         Args:
             calls: makes the launches, by `issue`, ``wp.capture_while`` and ``wp.capture_if``.
@@ -102,42 +97,42 @@ class Launcher:
         """
         with _CAPTURES, wp.ScopedCapture(device=str(self.device)) as capture:
             calls()
-        return Launches(capture.graph, tuple(commands))
+        return CapturedGraph(capture.graph, tuple(commands))
 
     def launch(self, *commands: Any) -> None:
-        """Makes recorded launches, on torch's stream."""
+        """Launches recorded launches and graphs on torch's stream."""
         stream = launch_stream(self.device)
         for command in commands:
             command.launch(stream)
 
 
 def issue(*commands: Any) -> None:
-    """Makes recorded or captured launches one by one, as into a graph that is being captured."""
+    """Launches one by one, with graphs expanded, into the graph that is being captured."""
     for command in commands:
-        if isinstance(command, Launches | Several):
+        if isinstance(command, CapturedGraph | LaunchSequence):
             issue(*command.commands)
         else:
             command.launch()
 
 
-class Launches:
-    """Captured launches, with the interface of a recorded launch."""
+class CapturedGraph:
+    """A graph of launches, with the interface of a recorded launch."""
 
     def __init__(self, graph: Any, commands: tuple[Any, ...]) -> None:
-        self._graph, self.commands = graph, commands  # Keeps the arrays of the launches alive.
+        self._graph, self.commands = graph, commands  # keeps the arrays of the launches alive
 
     def launch(self, stream: Any = None) -> None:
-        """Makes all launches in their order."""
+        """Launches the graph."""
         wp.capture_launch(self._graph, stream)
 
 
-class Several:
+class LaunchSequence:
     """Several recorded launches, with the interface of one."""
 
     def __init__(self, *commands: Any) -> None:
         self.commands = commands
 
     def launch(self, stream: Any = None) -> None:
-        """Makes all launches in their order."""
+        """Launches them in order."""
         for command in self.commands:
             command.launch(stream)

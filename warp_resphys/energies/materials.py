@@ -1,16 +1,16 @@
-r"""Isotropic elastic materials and their constants.
+r"""Isotropic elastic materials.
 
 =======================  ==================================================  ====================================
 material                 shape terms                                         volume term
 =======================  ==================================================  ====================================
 `Corotated`              ``mu ||F - R(F)||^2``                               ``lambda / 2 ||F - D(F)||^2``
 `StableNeoHookean`       ``mu/2 (||F||^2 - 3) - mu (J - 1) + mu/2 (J-1)^2``  ``lambda / 2 (J - 1)^2``
-`MooneyRivlin`           that with c10 = mu/2, ``c01 ((I2 - 3) - 4 (J-1))``  ``lambda / 2 (J - 1)^2``
-`Gent`                   that W by ``-J_m mu / 2 ln(1 - 2 W / (J_m mu))``    ``lambda / 2 (J - 1)^2``
+`MooneyRivlin`           W_s (mu = 2 c10) ``+ c01 ((I2 - 3) - 4 (J-1))``     ``lambda / 2 (J - 1)^2``
+`Gent`                   ``-J_m mu / 2 ln(1 - 2 W_s / (J_m mu))``            ``lambda / 2 (J - 1)^2``
 =======================  ==================================================  ====================================
 
-R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F. The equations and
-their sources are in ``kernels.materials``. Shape and volume terms may be integrated at different points.
+R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F, W_s the shape terms of
+`StableNeoHookean`. Sources are in ``kernels.materials``. Shape and volume terms may be integrated at different points.
 """
 
 import re
@@ -30,7 +30,7 @@ from ..stepping.quantity import Parameter, Quantity
 
 
 def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: Any) -> Any:
-    """Returns a dataclass field for a constant of a material; common constants, such as `density`, are keywords."""
+    """Returns a dataclass field for a material constant; `common` ones, such as `density`, are keyword-only."""
     common = more.pop("common", False)
     quantity = Quantity(name, unit, lower, **{"per": "element", **more})
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
@@ -42,31 +42,30 @@ PRONY_TIME = Quantity("prony_time", "s", 0.0)
 
 @dataclass(frozen=True)
 class Material(ABC):
-    """Constants of an elastic material with Rayleigh damping and relaxation.
+    """An elastic material with Rayleigh damping and relaxation.
 
-    The elastic constants and the density are numbers, (M,) tensors with a value for each element, (B, 1) tensors with a
-    value for each environment of a batch, or (B, M) tensors; the damping constants are numbers or (B,) tensors. Tensors
-    that require gradients receive them from every simulated quantity.
+    Elastic constants and density are numbers, (M,) tensors with one value per element, (B, 1) tensors with one value
+    per environment, or (B, M) tensors; damping constants are numbers or (B,) tensors. Every simulated quantity is
+    differentiable by them.
     """
 
-    law: ClassVar[Any]  # the module of ``kernels.materials``, or a law with the same attributes
-    # for each modulus of the law, whether it belongs to the ``shape`` or the ``volume`` rule of integration, or is a
-    # ``mean`` over the volume of a point
+    law: ClassVar[Any]  # module of ``kernels.materials``, or an object with the same attributes
+    # integration of each modulus of the law: ``shape`` or ``volume`` rule, or ``mean`` over the volume of a point
     rules: ClassVar[tuple[str, ...]]
-    # for each modulus, an upper bound of what it adds to the tangent's eigenvalues for small strains
+    # upper bound of each modulus' contribution to the tangent's eigenvalues at small strains
     curvature: ClassVar[tuple[float, ...]]
 
     density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
-    # force -alpha M v [1/s]
+    # alpha [1/s] of the force -alpha M v
     mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
-    # Kelvin-Voigt viscosity of retardation time beta [s]; for small strains the force -beta K v
+    # Kelvin-Voigt retardation time beta [s]; at small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
-    # generalised Maxwell (Prony) branches (ratio, time): shear modulus over the long-term mu, and relaxation time
-    # [s]; see `energies.viscosity`
+    # generalised Maxwell (Prony) branches: ratio of the shear modulus to the long-term modulus mu, and relaxation time
+    # [s] (`energies.viscosity`)
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Checks every constant; raises InputError for a constant outside its physical range."""
+        """Raises InputError for a constant outside its physical range."""
         if not all(isinstance(branch, Sequence) and len(branch) == 2 for branch in self.prony):
             raise InputError(f"prony is {self.prony!r}: give a (ratio, time) for each branch, - and s.")
         constants = self.constants
@@ -75,16 +74,14 @@ class Material(ABC):
 
     @classmethod
     def own_quantities(cls) -> dict[str, Quantity]:
-        """Returns the material's constants by name, those of the law first, without Prony branches."""
-        quantities = {field.name: field.metadata["quantity"] for field in fields(cls) if field.metadata}
-        common = [field.name for field in fields(cls) if field.kw_only]
-        return {name: quantities[name] for name in sorted(quantities, key=common.__contains__)}
+        """Returns the constants by name without Prony branches, those of the law first."""
+        own = sorted((f for f in fields(cls) if f.metadata), key=lambda f: bool(f.kw_only))
+        return {f.name: f.metadata["quantity"] for f in own}
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """The material's constants by name: those of the law first, ``prony_ratio_1``, ``prony_time_1``, ... last."""
-        branches = [replace(q, name=name) for name, q in self._branches]
-        return {**self.own_quantities(), **{quantity.name: quantity for quantity in branches}}
+        """Constants by name: those of the law first, ``prony_ratio_1``, ``prony_time_1``, ... last."""
+        return {**self.own_quantities(), **{name: replace(q, name=name) for name, q in self._branches}}
 
     @property
     def _branches(self) -> list[tuple[str, Quantity]]:
@@ -93,19 +90,19 @@ class Material(ABC):
 
     @property
     def constants(self) -> dict[str, Parameter]:
-        """Values of the constants, by name."""
+        """Values of the constants by name."""
         branches = zip(self._branches, chain.from_iterable(self.prony), strict=True)
         own = {name: getattr(self, name) for name in self.own_quantities()}
         return {**own, **{name: value for (name, _), value in branches}}
 
     @abstractmethod
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the law's moduli [Pa], of shape (1 or B, 1 or M), from constants of that shape."""
+        """Returns the law's moduli [Pa], (1 or B, 1 or M) each, from constants of that shape."""
 
 
 @dataclass(frozen=True)
 class _Hookean(Material):
-    """A material that is given by Young's modulus and Poisson's ratio."""
+    """A material with Young's modulus and Poisson's ratio as constants."""
 
     rules: ClassVar[tuple[str, ...]] = ("shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (2.0, 1.0)
@@ -122,9 +119,9 @@ class _Hookean(Material):
 
 @dataclass(frozen=True)
 class Corotated(_Hookean):
-    """The material of projective dynamics: for small strains, linear elasticity with lambda / 3.
+    """The material of projective dynamics: at small strains, linear elasticity with lambda / 3.
 
-    It bends a little less stiffly than its nominal constants: nu 0.45 acts as 0.375, nu 0.499 as 0.497.
+    The effective Poisson's ratio is lower than the nominal one: 0.375 for 0.45, 0.497 for 0.499.
     """
 
     law = corotated
@@ -132,21 +129,21 @@ class Corotated(_Hookean):
 
 @dataclass(frozen=True)
 class StableNeoHookean(_Hookean):
-    """A neo-Hookean solid that stays finite where elements invert, and is linear elasticity for small strains."""
+    """A neo-Hookean material, finite for inverted elements, and linear elasticity at small strains."""
 
     law = stable_neo_hookean
 
 
 @dataclass(frozen=True)
 class MooneyRivlin(Material):
-    """Rubber with two elastic constants and a bulk modulus; for small strains mu is 2 (c10 + c01)."""
+    """Rubber with two elastic constants and a bulk modulus; at small strains mu is 2 (c10 + c01)."""
 
     law = mooney_rivlin
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
-    c10: Parameter = constant(36e3, "c10", "Pa")  # of the first invariant [Pa]
-    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)  # of the second [Pa]
+    c10: Parameter = constant(36e3, "c10", "Pa")  # coefficient of the first invariant [Pa]
+    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)  # coefficient of the second invariant [Pa]
     bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # [Pa]
 
     @override
@@ -158,21 +155,21 @@ class MooneyRivlin(Material):
 
 @dataclass(frozen=True)
 class DensityMaterial(Material):
-    """A material whose energy is a Warp function of F and of the material's own constants, in their order [J/m^3].
+    """A material given by Warp functions of F and the material's own constants, in their order [J/m^3].
 
-    The function may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking:
-    terms that make a material nearly incompressible belong there.
+    The functions may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking: the
+    term that makes a material nearly incompressible belongs there.
 
     Attributes:
         energy_density: W(F: mat33d, p: a vector of float64).
-        volume_energy: U, with the same arguments; None for none.
+        volume_energy: U, likewise; may be None.
     """
 
     energy_density: ClassVar[Any]
     volume_energy: ClassVar[Any] = None
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Makes the law of the functions."""
+        """Builds the law from the functions."""
         super().__init_subclass__(**more)
         cls.law = density_law(cls.__name__, cls.energy_density, cls.volume_energy or cls.energy_density)
         count = len(cls.law.LAME) - 4
@@ -181,12 +178,12 @@ class DensityMaterial(Material):
 
     @abstractmethod
     def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the Lame constants mu and lambda of small strains [Pa], of constants of shape (1 or B, 1 or M)."""
+        """Returns the Lame constants at small strains, mu and lambda [Pa], from constants (1 or B, 1 or M)."""
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns one for both volumes, the Lame constants, and the constants of the functions."""
-        own = [constants[field.name] for field in fields(self) if field.metadata and not field.kw_only]
+        """Returns ones for both volumes, the Lame constants, and the constants of the functions."""
+        own = [constants[f.name] for f in fields(self) if f.metadata and not f.kw_only]
         volume = torch.ones_like(own[0])
         under_integrated = volume if self.volume_energy else torch.zeros_like(volume)
         return volume, under_integrated, *self.lame(constants), *own
@@ -194,17 +191,17 @@ class DensityMaterial(Material):
 
 @dataclass(frozen=True)
 class Gent(DensityMaterial):
-    """Rubber that stiffens without bound as its chains reach their full length (Gent 1996).
+    """Rubber that stiffens without bound as its chains approach their full length (Gent 1996).
 
-    With a large limit J_m it is `StableNeoHookean`. Past 95 % of the limit the energy continues as a parabola, so
-    that a line search may pass through strains that a real specimen would not survive.
+    For a large limit J_m it is `StableNeoHookean`. Beyond 95 % of the limit the energy is continued as a parabola, so
+    that iterates of a search may exceed the limit.
     """
 
     energy_density: ClassVar[Any] = gent.energy_density
     volume_energy: ClassVar[Any] = gent.volume_energy
 
     shear_modulus: Parameter = constant(90e3, "shear_modulus", "Pa")  # mu [Pa]
-    limit: Parameter = constant(30.0, "limit", "")  # J_m, of I1 - 3
+    limit: Parameter = constant(30.0, "limit", "")  # J_m, limit of I1 - 3
     bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # K [Pa]
 
     @override
@@ -226,11 +223,11 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
     """Returns the named material.
 
     Raises:
-        InputError: an unknown name, a constant that the material does not have, or one out of range.
+        InputError: an unknown name, a constant that the material does not have, or a value out of range.
     """
     if model not in MATERIALS:
         raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    quantities = MATERIALS[model].own_quantities()
+    own = MATERIALS[model].own_quantities()
     branches = {name: value for name, value in constants.items() if re.fullmatch(r"prony_(ratio|time)_[1-9]\d*", name)}
     count = len(branches) // 2
     names = [(f"{PRONY_RATIO.name}_{k}", f"{PRONY_TIME.name}_{k}") for k in range(1, 1 + count)]
@@ -240,8 +237,8 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
             "its prony_time_."
         )
     for name in constants:
-        if name not in quantities and name not in branches:
-            some = ", ".join((*quantities, "prony_ratio_1, prony_time_1, ..."))
-            raise InputError(f"{model} has no constant {name!r}: it has {some}")
-    own = {name: value for name, value in constants.items() if name in quantities}
-    return MATERIALS[model](**own, prony=[(branches[ratio], branches[time]) for ratio, time in names])
+        if name not in own and name not in branches:
+            names_text = ", ".join((*own, "prony_ratio_1, prony_time_1, ..."))
+            raise InputError(f"{model} has no constant {name!r}: it has {names_text}")
+    values = {name: value for name, value in constants.items() if name in own}
+    return MATERIALS[model](**values, prony=[(branches[ratio], branches[time]) for ratio, time in names])

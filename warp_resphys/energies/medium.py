@@ -1,13 +1,13 @@
-r"""A medium around a body: drag on its surface, the mass that moves with it, and buoyancy.
+r"""Surrounding medium: drag, added mass and buoyancy.
 
-The force on an area with the normal n that moves with the velocity v is, for the density rho of the medium,
+The force per area on a surface with normal n and velocity v is, for the density rho of the medium,
 
     -c v - rho / 2 (C_n |v . n| (v . n) n + C_t |v_t| v_t) - rho l (n . dv/dt) n,     v_t = v - (v . n) n
 
-(the resistive part of Taylor, Proc. R. Soc. A 214, 1952, for what swims, and a reactive one; Lighthill 1971). c is the
-linear drag of creeping flow [N s/m^3], C_n and C_t are drag coefficients across and along the surface, and l is the
-thickness of the layer of the medium that is pushed along [m]. Each acts at the end of an implicit stage, with areas and
-normals of its start, so that it is the derivative of a convex potential, and never sheds energy that is not there.
+(the resistive force of Taylor, Proc. R. Soc. A 214, 1952, for swimming, and a reactive one; Lighthill 1971). c is the
+linear drag of creeping flow [N s/m^3], C_n and C_t are normal and tangential drag coefficients, and l is the thickness
+of the layer of medium that moves with the surface [m]. The force acts at the end of an implicit stage, with areas and
+normals of its start, so that it derives from a convex potential and drag is dissipative.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ from ..mesh.mesh import Mesh, boundary_faces
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 
 
@@ -36,19 +36,19 @@ from .launcher import Launcher, warp_view
 class FacePoints(Points):
     """Points on faces of a surface."""
 
-    slopes: NDArray[np.float64]  # (Q, K, 2) derivatives of a face's shape functions
+    slopes: NDArray[np.float64]  # (Q, K, 2) derivatives of the shape functions of a face
     weights: NDArray[np.float64]  # (Q,)
 
 
 @dataclass(frozen=True)
 class Medium(Energy):
-    """Drag, added mass and buoyancy on the surface of a body; see the module.
+    """Drag, added mass and buoyancy on the surface of a body (equation in the module's docstring).
 
-    Its parameters are ``medium_density`` [kg/m^3], ``drag_linear`` [N s/m^3], ``drag_normal``, ``drag_tangential`` and
+    Parameters are ``medium_density`` [kg/m^3], ``drag_linear`` [N s/m^3], ``drag_normal``, ``drag_tangential`` and
     ``added_layer`` [m].
 
     Raises:
-        InputError: a value out of range, or faces that are not on the surface.
+        InputError: a value out of range, or faces that do not belong to the surface.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (
@@ -59,13 +59,13 @@ class Medium(Energy):
         Quantity("added_layer", "m", 0.0, closed=True),
     )
 
-    density: Parameter  # rho [kg/m^3]: a number, or (B, 1) values
-    linear: Parameter = 0.0  # c [N s/m^3], the same
-    normal: Parameter = 0.0  # C_n, the same
-    tangential: Parameter = 0.0  # C_t, the same
-    layer: Parameter = 0.0  # l [m], the same
-    buoyancy: bool = True  # whether the displaced medium carries the body
-    faces: NDArray[np.int64] | None = None  # (F, n) faces of `boundary_faces` that the medium acts on; all by default
+    density: Parameter  # rho [kg/m^3]: like all parameters, a number or (B, 1) values
+    linear: Parameter = 0.0  # c [N s/m^3]
+    normal: Parameter = 0.0  # C_n
+    tangential: Parameter = 0.0  # C_t
+    layer: Parameter = 0.0  # l [m]
+    buoyancy: bool = True  # whether buoyancy acts
+    faces: NDArray[np.int64] | None = None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -80,12 +80,12 @@ class Medium(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:
-        """Points of a rule that integrates quadratic fields over the faces."""
+        """Returns the points of a rule that integrates quadratic fields over the faces."""
         surface = boundary_faces(mesh)
         faces = surface if self.faces is None else np.asarray(self.faces)
-        known = {tuple(sorted(face)) for face in surface.tolist()}
-        if not len(faces) or not all(tuple(sorted(face)) in known for face in faces.tolist()):
-            raise InputError("the faces that a medium acts on are none of the body's surface: take some of it.")
+        boundary = {tuple(sorted(face)) for face in surface.tolist()}
+        if not len(faces) or not all(tuple(sorted(face)) in boundary for face in faces.tolist()):
+            raise InputError("the faces that a medium acts on must belong to the body's surface (boundary_faces).")
         face = FACES[faces.shape[1]]
         places, weights = face.rule(2)
         values, slopes = face.shape(places)
@@ -97,22 +97,22 @@ class Medium(Energy):
         return MediumTerm(launcher, sets)
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundMedium":
-        return BoundMedium(self, placement)
+    def bind(self, site: EnergySite) -> "BoundMedium":
+        return BoundMedium(self, site)
 
 
 class BoundMedium(BoundEnergy):
-    """A medium over the steps of a simulator: surface positions and normals at the step's start, and buoyancy."""
+    """A medium in a simulator: reference positions, areas and normals of a step, and buoyancy."""
 
-    def __init__(self, medium: Medium, placement: EnergySite) -> None:
-        super().__init__(medium, placement)
-        (points,) = placement.points
+    def __init__(self, medium: Medium, site: EnergySite) -> None:
+        super().__init__(medium, site)
+        (points,) = site.points
         assert isinstance(points, FacePoints)
-        self._nodes = torch.as_tensor(points.nodes, device=placement.rest_positions.device)  # (F, K)
-        self._shares = placement.tensor(points.gradients[0, :, :, 0])  # (Q, K) of the vertices in the points
-        self._slopes = placement.tensor(points.slopes)  # (Q, K, 2)
-        self._weights = placement.tensor(points.weights)  # (Q,)
-        volume = placement.tensor(placement.load_volume.sum(axis=1))  # (N,) [m^3]
+        self._nodes = torch.as_tensor(points.nodes, device=site.rest_positions.device)  # (F, K)
+        self._shape_values = site.tensor(points.gradients[0, :, :, 0])  # (Q, K)
+        self._slopes = site.tensor(points.slopes)  # (Q, K, 2)
+        self._weights = site.tensor(points.weights)  # (Q,)
+        volume = site.tensor(site.load_volume.sum(axis=1))  # (N,) [m^3]
         self._volume = volume if medium.buoyancy else None
 
     @override
@@ -143,7 +143,7 @@ class BoundMedium(BoundEnergy):
 
     @override
     def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
-        """Returns buoyancy: the weight of the medium that the body displaces, upwards."""
+        """Returns the buoyancy, minus the weight of the displaced medium."""
         del inputs, batch, static
         if self._volume is None:
             return None
@@ -151,12 +151,12 @@ class BoundMedium(BoundEnergy):
         return -displaced[..., None] * constants.gravity[:, None]
 
     def _at_points(self, field: torch.Tensor) -> torch.Tensor:
-        """Returns (B, P, 3) of (B, N, 3) values at the vertices."""
-        return torch.einsum("qk,bfki->bfqi", self._shares, field[:, self._nodes]).flatten(1, 2)
+        """Interpolates a vertex field (B, N, 3) to the points (B, P, 3)."""
+        return torch.einsum("qk,bfki->bfqi", self._shape_values, field[:, self._nodes]).flatten(1, 2)
 
 
 class MediumTerm(Term):
-    """Kernels of a medium over a stage."""
+    """Kernels of the medium."""
 
     @property
     @override
@@ -165,9 +165,8 @@ class MediumTerm(Term):
         return {**places, "medium_coefficients": (1, 4)}
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        *places, coefficients = (values[name] for name in self.shapes)
-        views = [warp_view(place, wp.vec3d) for place in places if place is not None]
-        assert coefficients is not None
+        *places, coefficients = (value_of(values, name) for name in self.shapes)
+        views = [warp_view(place, wp.vec3d) for place in places]
         return [s.nodes, s.gradients, *views, warp_view(coefficients, wp.vec4d), s.points_per_cell, positions]
 
     @override
@@ -180,32 +179,29 @@ class MediumTerm(Term):
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        area, coefficients = values["medium_area"], values["medium_coefficients"]
-        assert area is not None
-        assert coefficients is not None
+        area, coefficients = value_of(values, "medium_area"), value_of(values, "medium_coefficients")
         return area.norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
 
     @override
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
-        """Returns the function of `Term.adjoint`; torch differentiates the energy twice."""
+        """Implements `Term.adjoint` by differentiating the energy twice in torch."""
         (s,) = self.sets
         nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)
-        shares = torch.as_tensor(s.source.gradients[..., 0], device=self.launcher.device)  # (F, Q, K)
+        shape_values = torch.as_tensor(s.source.gradients[..., 0], device=self.launcher.device)  # (F, Q, K)
 
         def at_points(field: torch.Tensor) -> torch.Tensor:
-            return torch.einsum("fqk,bfki->bfqi", shares, field[:, nodes]).flatten(1, 2)
+            return torch.einsum("fqk,bfki->bfqi", shape_values, field[:, nodes]).flatten(1, 2)
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
-                given = {name: values[name] for name in self.shapes}
-                leaves = {name: value.detach().requires_grad_() for name, value in given.items() if value is not None}
+                leaves = {name: value_of(values, name).detach().requires_grad_() for name in self.shapes}
                 x = at_points(positions).requires_grad_()
                 (slope,) = torch.autograd.grad(_energy(x, *leaves.values()), x, create_graph=True)
                 loss = -(slope * at_points(direction)).sum()
-                gradients = torch.autograd.grad(loss, list(leaves.values()))
-            return dict(zip(leaves, gradients, strict=True))
+                slopes = torch.autograd.grad(loss, list(leaves.values()))
+            return dict(zip(leaves, slopes, strict=True))
 
         return differentiate
 
@@ -213,7 +209,7 @@ class MediumTerm(Term):
 def _energy(
     x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
 ) -> torch.Tensor:
-    """Returns the energy of `kernels.medium`, summed over all points."""
+    """Returns the sum of the energy in `kernels.medium` over all points."""
     size = area.norm(dim=-1)
     n = area / size[..., None].clamp_min(1e-30)
     d, inertial = x - reference, ((x - target) * n).sum(-1)
@@ -222,5 +218,5 @@ def _energy(
     linear, normal, tangential, mass = coefficients.unbind(-1)
     squares = 0.5 * (linear * d.square().sum(-1) + mass * inertial.square())
     slip = torch.where(along > 0.0, along.clamp_min(1e-300).sqrt(), 0.0)
-    # Not a third power, for whose second derivative torch loads its compiler, for seconds.
+    # No third powers: for their second derivative torch loads its compiler, which takes seconds.
     return (size * (squares + (normal * across.square() * across.abs() + tangential * along * slip) / 3.0)).sum()

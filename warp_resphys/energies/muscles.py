@@ -1,14 +1,13 @@
-r"""Contractile fibres (muscles) along a direction in chosen cells of a solid.
+r"""Muscles: contractile fibres along a direction in some cells of a solid.
 
-At a point with the unit direction a the fibre has the stretch lambda = |F a|, and the energy of a volume is
+At a point with the fibre direction a the stretch is lambda = |F a|, and the energy per volume is
 
     sigma lambda + k s(lambda - 1 + c),     tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
 
-an active stress sigma, and a fibre of stiffness k that an active contraction c shortens, s being half the square of
-what is positive, rounded over a short strain (`kernels.laws.muscle`). A negative stress pushes, as an inflated
-chamber does whose walls are not modelled. Without an input, fibres of a stiffness are a
-reinforcement: the solid is stiffer along them where it is stretched (Spencer, Continuum Theory of the Mechanics of
-Fibre-Reinforced Composites, 1984), and as it was where it is compressed.
+with an active stress sigma, and a tension-only fibre of stiffness k shortened by an active contraction c; s(e) is
+max(e, 0)^2 / 2, smoothed over a short strain (`kernels.laws.muscle`). A negative stress pushes, like an inflated
+chamber whose walls are not modelled. Without inputs the fibres are a reinforcement that stiffens the solid in tension
+(Spencer, Continuum Theory of the Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,16 +26,12 @@ from ..kernels.axial import axial_kernels
 from ..kernels.laws import muscle as law
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PartPoints, PointSet, ReadingTerm, Values
+from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher
+from .part_terms import PartPoints, ReadingTerm
 
 STRESS = Quantity(
-    *("muscle_stress", "Pa"),
-    per="muscle",
-    typical=1e4,
-    words="stress",
-    shown_unit="kPa",
-    shown_factor=1e-3,
+    *("muscle_stress", "Pa"), per="muscle", typical=1e4, words="stress", shown_unit="kPa", shown_factor=1e-3
 )
 CONTRACTION = Quantity(
     *("muscle_contraction", ""), per="muscle", typical=0.05, words="contraction", shown_unit="%", shown_factor=1e2
@@ -45,12 +40,12 @@ CONTRACTION = Quantity(
 
 @dataclass(frozen=True)
 class Muscle:
-    """Fibres of one activation.
+    """A muscle, with one activation.
 
     Attributes:
-        cells: (M',) numbers of the cells that they run through.
-        direction: (3,) along which they run, of any length, or (M', 3) one for each cell.
-        name: of the muscle.
+        cells: (M',) indices of its cells.
+        direction: (3,) fibre direction, of any length, or (M', 3) one per cell.
+        name: name of the muscle.
     """
 
     cells: ArrayLike
@@ -60,10 +55,10 @@ class Muscle:
 
 @dataclass(frozen=True)
 class Muscles(Energy):
-    """Contractile fibres, see the module.
+    """Contractile fibres (equation in the module's docstring).
 
-    Its inputs are ``muscle_stress`` [Pa] and ``muscle_contraction`` (a share of the fibres' length), its parameter
-    ``muscle_stiffness`` [Pa]; each has a value for every muscle.
+    Inputs are ``muscle_stress`` [Pa] and ``muscle_contraction`` (a fraction of the fibres' length), the parameter is
+    ``muscle_stiffness`` [Pa], with one value per muscle.
 
     Raises:
         InputError: no muscle, one without cells, a direction that is zero, not finite or of another shape, or a
@@ -76,9 +71,8 @@ class Muscles(Energy):
     implicit_only: ClassVar[bool] = True
 
     muscles: Sequence[Muscle]
-    # k [Pa], the parameter ``muscle_stiffness``: a number, (A,) values with one for each muscle, (B, 1), or (B, A)
-    stiffness: Parameter = 0.0
-    toe: float = 1e-3  # strain over which a fibre tightens
+    stiffness: Parameter = 0.0  # k [Pa], parameter ``muscle_stiffness``: a number, (A,), (B, 1) or (B, A) values
+    toe: float = 1e-3  # strain at which a fibre reaches its full stiffness
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -120,10 +114,10 @@ class Muscles(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """Returns the quadrature points of the cells; a cell that two muscles cross has its points twice.
+        """Returns the quadrature points of the cells, once for every muscle of a cell.
 
         Raises:
-            InputError: a cell number out of range.
+            InputError: a cell that the mesh does not have.
         """
         points, weights = mesh.element.rule
         nodes, operators, volumes, numbers = [], [], [], []
@@ -144,7 +138,7 @@ class Muscles(Energy):
         return (PartPoints(*map(np.concatenate, (nodes, operators, numbers, volumes))),)
 
     def lines(self, mesh: Mesh) -> dict[str, NDArray[np.float64]]:
-        """Returns a line (2, 3) through the middle of every muscle, as long as the extent of its cells [m], by name."""
+        """Returns a line (2, 3) through the centre of each muscle, over the extent of its cells [m], by name."""
         lines = {}
         for name, muscle in zip(self.names, self.muscles, strict=True):
             corners = mesh.vertices[np.unique(mesh.cells[np.asarray(muscle.cells)])]
@@ -166,7 +160,5 @@ class MuscleTerm(ReadingTerm):
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        stress, stiffness = values["muscle_stress"], values["muscle_stiffness"]
-        assert stress is not None
-        assert stiffness is not None
+        stress, stiffness = value_of(values, "muscle_stress"), value_of(values, "muscle_stiffness")
         return self.weight * (stress.clamp_min(0.0) + stiffness)[:, self.part_of]

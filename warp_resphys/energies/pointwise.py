@@ -1,4 +1,4 @@
-"""An energy that is one Warp function: its kernels, its values over a step and its memory follow from it.
+"""Energies given as one Warp function, from which kernels, values of a step and memory follow.
 
 For example::
 
@@ -9,9 +9,9 @@ For example::
         def points(self, mesh):
             return (between(self.pairs),)
 
-The function gets what a point sees, a vector (a place, a difference of places) or a matrix (a deformation gradient),
-and the values there: parameters, inputs, and values of the step, in the order in which they are declared. How exact
-the derivatives are is said in `kernels.pointwise`.
+The function takes the kinematic variable of a point, a vector (a position, a difference of positions) or a matrix (a
+deformation gradient), and the values at the point: parameters, inputs, and values of the step, in the order of their
+declaration. `kernels.pointwise` describes the accuracy of the derivatives.
 """
 
 from abc import abstractmethod
@@ -29,22 +29,23 @@ from ..io.errors import InputError
 from ..kernels.pointwise import pointwise_kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PartPoints, PointSet, ReadingTerm, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values
 from .launcher import Launcher
+from .part_terms import PartPoints, ReadingTerm
 
 
 class PointwiseEnergy(Energy):
-    """Sum over points of a weight times a function of the point's operator value and its values.
+    """The sum over points of a weight times a function of the point's kinematic variable and values.
 
-    A parameter's value where a simulation is given no other is the attribute of its name. Energies that remember
-    something declare `memory`, one number a point, which is zero for a body that has been at rest for long.
+    The default value of a parameter is the attribute of its name. Energies with memory declare `memory`, one number per
+    point, which is zero for a body long at rest.
 
     Attributes:
         density: the Warp function e(f, v) [J over the unit of the weight], of a ``wp.vec3d`` or a ``wp.mat33d`` and a
             vector of float64.
-        size: about the size of f, for the step of differences.
-        memory: what a point carries from step to step.
-        step_values: names of what `begin_step` returns; those of the memory where left out.
+        size: typical size of f, for the step of finite differences.
+        memory: memory variables of a point.
+        step_values: names of the results of `begin_step`; those of the memory if empty.
     """
 
     implicit_only: ClassVar[bool] = True
@@ -57,16 +58,16 @@ class PointwiseEnergy(Energy):
     @abstractmethod
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """Returns the points, such as those of `at_vertices`, `between` or `in_cells`, as a tuple of one set."""
+        """Returns a tuple with one set of points, from `at_vertices`, `between` or `in_cells` for example."""
 
-    def begin_step(self, seen: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Mapping[str, torch.Tensor]:
-        """Returns the values (B, P) that hold during a step, by `step_values`; the memory itself where not overridden.
+    def begin_step(self, start: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Mapping[str, torch.Tensor]:
+        """Returns the values (B, P) of a step, by the names in `step_values`; by default, the memory.
 
         Args:
-            seen: (B, P, 3) or (B, P, 3, 3), what the points see at the start of the step.
+            start: (B, P, 3) or (B, P, 3, 3) kinematic variable at the start of the step.
             values: (1 or B, P) parameters, inputs and memory by name.
         """
-        del seen
+        del start
         return {quantity.name: values[quantity.name] for quantity in self.memory}
 
     def end_step(
@@ -75,8 +76,8 @@ class PointwiseEnergy(Energy):
         """Returns the memory (B, P) after a step, by name.
 
         Args:
-            start: what the points see at the start of the step, as in `begin_step`.
-            end: what they see at its end.
+            start: kinematic variable at the start of the step, as in `begin_step`.
+            end: kinematic variable at the end of the step.
             values: (1 or B, P) parameters, inputs and memory at the start, by name.
         """
         raise NotImplementedError(f"{type(self).__name__} has memory, but no end_step.")
@@ -88,15 +89,15 @@ class PointwiseEnergy(Energy):
 
     @property
     def value_names(self) -> tuple[str, ...]:
-        """Names of the values of `density`; those of a step begin with the energy's class."""
-        return (*(q.name for q in (*self.parameters, *self.inputs)), *map(self.own_name, self._of_step))
+        """Names of the values of `density`; values of a step have the energy's class as prefix."""
+        return (*(q.name for q in (*self.parameters, *self.inputs)), *map(self.own_name, self._step_names))
 
     @property
-    def _of_step(self) -> tuple[str, ...]:
+    def _step_names(self) -> tuple[str, ...]:
         return self.step_values or tuple(quantity.name for quantity in self.memory)
 
     def own_name(self, name: str) -> str:
-        """Returns the name, among those of all energies, of a value of a step."""
+        """Returns the full name of a value of a step."""
         return f"{type(self).__name__}.{name}"
 
     @override
@@ -104,27 +105,27 @@ class PointwiseEnergy(Energy):
         return PointwiseTerm(launcher, sets, self)
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundPointwise":
-        return BoundPointwise(self, placement)
+    def bind(self, site: EnergySite) -> "BoundPointwise":
+        return BoundPointwise(self, site)
 
 
 class BoundPointwise(BoundEnergy):
-    """A pointwise energy over the steps of a simulator."""
+    """A pointwise energy in a simulator."""
 
-    def __init__(self, energy: PointwiseEnergy, placement: EnergySite) -> None:
-        super().__init__(energy, placement)
-        (points,) = placement.points
+    def __init__(self, energy: PointwiseEnergy, site: EnergySite) -> None:
+        super().__init__(energy, site)
+        (points,) = site.points
         assert isinstance(points, PartPoints)
         self._pointwise = energy
-        self._nodes = torch.as_tensor(points.nodes, device=placement.rest_positions.device)
-        self._operators = placement.tensor(points.gradients)  # (C, Q, K, 1 or 3)
-        self._part = torch.as_tensor(points.part, device=placement.rest_positions.device)
+        self._nodes = torch.as_tensor(points.nodes, device=site.rest_positions.device)
+        self._operators = site.tensor(points.gradients)  # (C, Q, K, 1 or 3)
+        self._part = torch.as_tensor(points.part, device=site.rest_positions.device)
         self.memory = tuple(Memory(q.name, q.unit, (points.n_points,), q.per or "point") for q in energy.memory)
 
-    def _seen(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the operator values of the points at positions (B, N, 3)."""
-        seen = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes]).flatten(1, 2)
-        return seen[..., 0] if seen.shape[-1] == 1 else seen
+    def _kinematics(self, q: torch.Tensor) -> torch.Tensor:
+        """Returns the kinematic variable at the points for positions (B, N, 3)."""
+        f = torch.einsum("cqkw,bcki->bcqiw", self._operators, q[:, self._nodes]).flatten(1, 2)
+        return f[..., 0] if f.shape[-1] == 1 else f
 
     def _values(self, step: EnergyStep) -> dict[str, torch.Tensor]:
         """Returns parameters, inputs and memory at the points, by name."""
@@ -142,21 +143,21 @@ class BoundPointwise(BoundEnergy):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         energy = self._pointwise
-        if not energy._of_step:
+        if not energy._step_names:
             return {}
-        values = energy.begin_step(self._seen(step.state.q), self._values(step))
-        return {energy.own_name(name): values[name].expand(step.state.batch, -1) for name in energy._of_step}
+        values = energy.begin_step(self._kinematics(step.state.q), self._values(step))
+        return {energy.own_name(name): values[name].expand(step.state.batch, -1) for name in energy._step_names}
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
         energy = self._pointwise
-        return {energy.own_name(name): self._zeros(batch) for name in energy._of_step}
+        return {energy.own_name(name): self._zeros(batch) for name in energy._step_names}
 
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         if not self.memory:
             return {}
-        return dict(self._pointwise.end_step(self._seen(step.state.q), self._seen(q), self._values(step)))
+        return dict(self._pointwise.end_step(self._kinematics(step.state.q), self._kinematics(q), self._values(step)))
 
 
 class PointwiseTerm(ReadingTerm):
@@ -171,36 +172,36 @@ class PointwiseTerm(ReadingTerm):
                 f"the density of {type(energy).__name__} takes {kernels.values._length_} values, but the energy has "
                 f"{values}: {', '.join(names)}."
             )
-        acting = len(energy.parameters) + len(energy.inputs)
-        own, count = names[acting:], energy.count
-        shapes: dict[str, tuple[int, ...]] = {name: arrays.get(name, (count,)) for name in names[:acting]}
-        shapes |= dict.fromkeys(own, (sets[0].n_points,))
-        super().__init__(launcher, sets, kernels, shapes, count, own, list(arrays), [wp.float64(energy.size)])
+        first, count = len(energy.parameters) + len(energy.inputs), energy.count
+        per_point = names[first:]
+        shapes: dict[str, tuple[int, ...]] = {name: arrays.get(name, (count,)) for name in names[:first]}
+        shapes |= dict.fromkeys(per_point, (sets[0].n_points,))
+        super().__init__(launcher, sets, kernels, shapes, count, per_point, list(arrays), [wp.float64(energy.size)])
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        """Returns zero: the constant matrix of projective dynamics leaves these energies to L-BFGS."""
+        """Returns zero: the constant matrix of projective dynamics does not contain these energies."""
         del values
         return torch.zeros_like(self.weight)[None]
 
 
 def at_vertices(vertices: ArrayLike, part: ArrayLike = 0) -> PartPoints:
-    """Returns points of weight one whose operator gives the positions of vertices (P,).
+    """Returns points of weight one at vertices (P,); the kinematic variable is the position.
 
     Args:
-        vertices: their numbers.
-        part: part number of every point, or of all points.
+        vertices: vertex numbers.
+        part: part of each point, or of all.
     """
     nodes = np.asarray(vertices, dtype=np.int64).reshape(-1, 1)
     return _unweighted(nodes, np.ones((len(nodes), 1, 1, 1)), part)
 
 
 def between(pairs: ArrayLike, part: ArrayLike = 0) -> PartPoints:
-    """Returns points of weight one whose operator gives the vectors between the vertices of pairs (P, 2).
+    """Returns points of weight one for pairs of vertices (P, 2); the kinematic variable is the vector between them.
 
     Args:
-        pairs: numbers of the vertices.
-        part: part number of every point, or of all points.
+        pairs: vertex numbers.
+        part: part of each point, or of all.
     """
     nodes = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
     return _unweighted(nodes, np.tile(np.array([-1.0, 1.0])[:, None], (len(nodes), 1, 1, 1)), part)
@@ -211,11 +212,11 @@ def _unweighted(nodes: NDArray[np.int64], operators: NDArray[np.float64], part: 
 
 
 def in_cells(mesh: Mesh, cells: ArrayLike) -> PartPoints:
-    """Returns quadrature points of some cells; operators give the deformation gradient, weights are volumes [m^3].
+    """Returns the quadrature points of cells, weighted by volume [m^3]; the variable is the deformation gradient.
 
     Args:
         mesh: the rest shape.
-        cells: (M',) numbers of the cells.
+        cells: (M',) cell indices.
     """
     points, weights = mesh.element.rule
     nodes = mesh.cells[np.asarray(cells, dtype=np.int64)]

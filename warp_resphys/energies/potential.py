@@ -4,8 +4,8 @@ One time step of every integrator, and a static equilibrium too, is the minimum 
 
     sum_i k_i / 2 |x_i - y_i|^2 - f . x + sum_e E_e(x)
 
-with k the mass over the square of the effective time step, y the positions to which inertia alone would lead, f the
-loads, and E_e the energies: elastic and dissipative energy of the solids, and others such as -p V of chambers.
+with the mass over the square of the effective time step k, the inertial target y, the loads f, and the energies E_e:
+those of the solid, elastic and dissipative, and others such as -p V of chambers under pressure.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,58 +18,56 @@ import warp as wp
 from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import PointSet, Term
-from .launcher import Launcher, Launches, warp_view
-from .placed import Placed
+from .launcher import CapturedGraph, Launcher, warp_view
+from .placed import PlacedEnergy
 
 
 @dataclass(frozen=True)
 class StepTerms:
-    """Terms of a step's potential, as in the equation of the module."""
+    """The data of a step in the incremental potential (equation in the module's docstring)."""
 
     target: torch.Tensor  # (B, N, 3) y [m]
     inertia: torch.Tensor  # (B, N) k [N/m]
     force: torch.Tensor  # (B, N, 3) f [N]
-    # values of the energies' terms by name, (1 or B, *shape) as of `Term.shapes`; None where another value makes one
-    # unnecessary
+    # values of the energies' terms by name (`Term.shapes`), with a first axis of 1 or B; None if not needed
     values: dict[str, torch.Tensor | None] = field(default_factory=dict)
 
 
 class IncrementalPotential(Launcher):
-    """Energy, residual, Hessian and adjoint products of a batch of one body.
+    """Energy, residual, Hessian and adjoint products for a batch.
 
-    Holds the buffers that its recorded kernel launches work on. Evaluations refer to the last `set_terms`.
+    Holds the buffers of its recorded kernel launches. Evaluations refer to the last `set_terms`.
 
     Args:
-        energies: of the body.
+        energies: energies of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
-        batch: environments B.
-        device: of every buffer.
+        batch: number of environments B.
+        device: device of every buffer.
 
     Attributes:
         energies: terms of the energies.
-        own_values: buffers of the values of every term, by the energy's own names.
-        stiffness: (B,) sum of the solids' moduli times volumes [J], the scale of the energy's rounding error.
-        sets: point sets of all terms.
+        own_values: buffers of the current values of each energy, by its own names.
+        stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding error [J].
+        sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
-        evaluation: launches that set ``residual`` and the following sums at ``positions``.
-        energy: (B,) of the last evaluation [J].
-        energy_size: (B,) sum of the absolute values of the energy's terms [J].
+        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
+        energy: (B,) [J].
+        energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
         residual_norm: (B,) norm of the residual [N].
-        low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian is `tangents` plus C C^T. None for
-            none.
-        tangent_active: (B,) zero for environments whose tangent stays as it is.
-        clamp: (B,) not zero for environments whose tangent has its eigenvalues clamped at zero.
+        low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian has C C^T besides `tangents`. Or None.
+        tangent_active: (B,) zero for environments whose tangent is not updated.
+        clamp: (B,) non-zero for environments with eigenvalues clamped at zero.
         all_active: whether the last `update_tangent` was for all environments.
-        tangent_launches: launches that set `tangents`.
+        tangent_launches: launches that set `tangents`, available after their first use.
     """
 
-    tangent_launches: Launches
+    tangent_launches: CapturedGraph
 
     def __init__(
         self,
-        energies: Sequence[Placed],
+        energies: Sequence[PlacedEnergy],
         n_vertices: int,
         fixed: torch.Tensor,
         batch: int,
@@ -83,14 +81,14 @@ class IncrementalPotential(Launcher):
         first = 0
         self._placed = tuple(energies)
         for placed in energies:
-            energy, start, mine = placed.energy, first, list[PointSet]()
+            energy, start, sets = placed.energy, first, list[PointSet]()
             for points in placed.points:
                 part = slice(first, first + points.n_points)
                 own = slice(part.start - start, part.stop - start)
-                mine.append(PointSet(self, points, n_vertices, part, own))
+                sets.append(PointSet(self, points, n_vertices, part, own))
                 first = part.stop
-            self.energies.append(energy.term(self, mine))
-            self.sets += mine
+            self.energies.append(energy.term(self, sets))
+            self.sets += sets
             self._loads.append(energy.is_load)
         self._n_points = first
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
@@ -137,7 +135,7 @@ class IncrementalPotential(Launcher):
             commands += term.before(values, self._position_view, active)
             for s in term.sets:
                 stress = s.stress_view(next(stresses))
-                outputs = [stress, self.points_view(self._point_energy, s.part, wp.float64)]
+                outputs = [stress, warp_view(self._point_energy[:, s.part], wp.float64)]
                 kernel, inputs = term.step(s, values, self._position_view)
                 commands += [
                     self.record(kernel, (b, s.n_points), [active, *inputs], outputs),
@@ -154,7 +152,7 @@ class IncrementalPotential(Launcher):
         self._evaluation = self.capture(*self.evaluation)
 
     def set_terms(self, terms: StepTerms) -> None:
-        """Copies a step's terms into the buffers; fixed vertices get neither inertia nor load."""
+        """Copies a step's terms into the buffers, with zero inertia and load at fixed vertices."""
         own = self.terms
         own.target.copy_(terms.target.detach())
         torch.mul(terms.inertia.detach(), self.free_mask, out=own.inertia)
@@ -179,7 +177,7 @@ class IncrementalPotential(Launcher):
         return self.terms.inertia
 
     def evaluate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns energy (B,) [J] and norm of inertia less loads (B,) [N] at ``positions``; sets ``residual`` [N].
+        """Returns the energy (B,) [J] and `balance` (B,) [N] at ``positions``; sets ``residual`` [N].
 
         The residual is the potential's gradient, zero at fixed vertices.
         """
@@ -190,8 +188,8 @@ class IncrementalPotential(Launcher):
         """Computes dP/dF at ``positions``.
 
         Args:
-            clamp: (B,) environments whose eigenvalues are clamped at zero; none where left out.
-            active: (B,) environments whose tangent is computed; all where left out.
+            clamp: (B,) environments whose eigenvalues are clamped at zero; None: no environment.
+            active: (B,) environments whose tangent is computed; None: all.
         """
         self._prepare_tangents()
         self.all_active = active is None
@@ -199,8 +197,8 @@ class IncrementalPotential(Launcher):
         self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
         pairs = zip(self.energies, self.own_values, strict=True)
-        blocks = [term.low_rank(values, self._position_view) for term, values in pairs]
-        columns = [block for block in blocks if block is not None]
+        parts = (term.low_rank(values, self._position_view) for term, values in pairs)
+        columns = [part for part in parts if part is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
 
     @property
@@ -210,11 +208,11 @@ class IncrementalPotential(Launcher):
 
     @property
     def tangents(self) -> list[torch.Tensor]:
-        """Tangents dP/dF (B, P, blocks, 3, 3) of `sets` [J] from the last `update_tangent`; see ``kernels``."""
+        """Blocks of dP/dF (B, P, blocks, 3, 3) [J] for each of `sets` (``kernels``), from the last `update_tangent`."""
         return self._prepare_tangents()
 
     def _prepare_tangents(self) -> list[torch.Tensor]:
-        """Makes buffers and launches of second derivatives at their first use, and returns the buffers."""
+        """Returns the tangents, whose buffers and launches are made at the first use."""
         if not self._tangents:
             self._tangents = [self.zeros(s.n_points, s.blocks, 3, 3) for s in self.sets]
             self._record_tangents(iter(self._tangents))
@@ -239,9 +237,9 @@ class IncrementalPotential(Launcher):
         self.tangent_launches, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:
-        """Returns the product (B, N, 3) of the stiffness with a displacement, fixed vertices included [N].
+        """Returns the product (B, N, 3) of the stiffness with a displacement, at all vertices [N].
 
-        Uses the last `update_tangent`.
+        The stiffness, of the last `update_tangent`, is the Hessian without inertia.
         """
         self._direction.copy_(direction)
         self._product.zero_()
@@ -253,7 +251,7 @@ class IncrementalPotential(Launcher):
         return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns -z . d residual / d value (B, *shape) at ``positions`` for the values of `set_terms`, by name.
+        """Returns -z . d residual / d value, (B, *shape), at ``positions`` for every value of the terms, by name.
 
         Args:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
@@ -266,7 +264,7 @@ class IncrementalPotential(Launcher):
         return slopes
 
     def prepare_adjoint(self) -> None:
-        """Makes buffers and launches of `value_adjoint` at their first use."""
+        """Makes buffers and launches of `value_adjoint`, unless they exist."""
         if not self._adjoints:
             pairs = zip(self.energies, self.own_values, strict=True)
             self._adjoints = [t.adjoint(values, self.positions, self._direction) for t, values in pairs]

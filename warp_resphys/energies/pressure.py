@@ -1,9 +1,9 @@
 """Follower pressure in closed chambers.
 
-A point of a chamber's surface has an operator g_a for each node of its face that holds the shape function and its two
-reference gradients, so that F = sum_a x_a g_a^T has the columns x, t1 and t2, the place and the tangents of the
-deformed face. The enclosed volume is the sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces look into the chamber,
-and the potential of a gauge pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
+The operators g_a of a surface point hold the shape functions of its face and their two reference gradients, so that
+F = sum_a x_a g_a^T has the columns x, t1 and t2: position and tangents of the deformed face. The enclosed volume is the
+sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces are oriented into the chamber, and the potential of a gauge
+pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 """
 
 from collections.abc import Callable, Sequence
@@ -20,8 +20,9 @@ from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity
-from .base import Energy, PartPoints, PartTerm, PointSet, Values
+from .base import Energy, PointSet, Values
 from .launcher import Launcher, warp_view
+from .part_terms import PartPoints, PartTerm
 
 PRESSURE = Quantity(
     *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
@@ -30,7 +31,7 @@ PRESSURE = Quantity(
 
 @dataclass(frozen=True)
 class Pressure(Energy):
-    """-p V of every chamber; its input ``pressure`` has a gauge pressure [Pa] for each.
+    """-p V of every chamber, with the gauge pressures as the input ``pressure`` [Pa].
 
     Raises:
         InputError: no chamber.
@@ -58,7 +59,7 @@ class Pressure(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """The points at which the volume of the chambers is integrated, exactly.
+        """Returns points at which the volume of the chambers is integrated exactly.
 
         Raises:
             MeshError: an open chamber.
@@ -68,13 +69,13 @@ class Pressure(Energy):
         values, gradients = shape(points)
         nodes = np.concatenate([chamber.faces for chamber in self.chambers])
         operator = np.concatenate([values[..., None], gradients], axis=2)  # (Q, K, 3)
-        everywhere = np.broadcast_to(operator, (len(nodes), *operator.shape)).copy()
-        owner = np.repeat(np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers])
-        return (PartPoints(nodes, everywhere, owner, np.tile(weights / 3.0, len(nodes))),)
+        operators = np.broadcast_to(operator, (len(nodes), *operator.shape)).copy()
+        part = np.repeat(np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers])
+        return (PartPoints(nodes, operators, part, np.tile(weights / 3.0, len(nodes))),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PressureTerm":
-        return PressureTerm(launcher, sets, "pressure", self.count)
+        return PressureTerm(launcher, sets, {"pressure": (self.count,)}, self.count)
 
 
 class PressureTerm(PartTerm):
@@ -100,12 +101,12 @@ class PressureTerm(PartTerm):
         del values
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points)
-        views = [warp_view(vectors, wp.vec3d) for vectors in (positions, direction)]
+        views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, *views]
         command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(command)
-            return {self.value: self.sum_parts(out)}
+            return {"pressure": self.sum_parts(out)}
 
         return differentiate

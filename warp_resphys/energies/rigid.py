@@ -1,13 +1,13 @@
-r"""Rigid parts as affine bodies, and inertia of vertices that others determine.
+r"""Rigid parts as affine bodies, and inertia of dependent vertices.
 
-A part that covers cells of the mesh is moved by four of its vertices r_c (`fem.coordinates`), and has one deformation
-gradient F (Lan et al., Affine Body Dynamics, 2022). The energy kappa V |F - R(F)|^2 keeps F close to a rotation. The
-part's mass acts through
+A rigid part, a region of the mesh, is controlled by four of its vertices r_c (`fem.coordinates`) and has a single
+deformation gradient F (Lan et al., Affine Body Dynamics, 2022). The energy kappa V |F - R(F)|^2 keeps F close to a
+rotation. The inertial energy of the part is
 
     1 / 2 integral rho |x - y|^2 dV = rho / 2 sum_p |sum_c L_cp (r_c - y_c)|^2,      L L^T = integral w w^T dV,
 
-w being the barycentric coordinates: the mass and the tensor of inertia of the cells are exact, and for a rotation the
-motion is that of a rigid body.
+with the barycentric coordinates w: mass and inertia tensor of the cells are exact, and for a rotation F the motion is
+that of a rigid body.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +30,7 @@ from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import Corotated
 from .solid import VISCOUS, SolidTerm
@@ -38,7 +38,7 @@ from .solid import VISCOUS, SolidTerm
 
 @dataclass(frozen=True)
 class PointInertia(Energy):
-    """Inertia of points; their values are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m] of a step."""
+    """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
 
     own_points: Points
 
@@ -51,23 +51,23 @@ class PointInertia(Energy):
         return PointInertiaTerm(launcher, sets)
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundInertia":
-        return BoundInertia(self, placement)
+    def bind(self, site: EnergySite) -> "BoundInertia":
+        return BoundInertia(self, site)
 
 
 class BoundInertia(BoundEnergy):
-    """Inertia of vertices that others determine; the simulator gives its values in every step."""
+    """Inertia of dependent vertices in a simulator, which sets the values of a step."""
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        (points,) = self.placement.points
-        zeros = self.placement.rest_positions.new_zeros(batch, points.n_points)
+        (points,) = self.site.points
+        zeros = self.site.rest_positions.new_zeros(batch, points.n_points)
         return {"inertia": zeros, "target": zeros[..., None].expand(-1, -1, 3)}
 
 
 @dataclass(frozen=True)
 class RigidInertia(PointInertia):
-    """Inertia and weight of a rigid part; the parameter is its ``density`` [kg/m^3]."""
+    """Inertia and weight of a rigid part, with the parameter ``density`` [kg/m^3]."""
 
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("density", "kg/m^3", 0.0),)
 
@@ -80,20 +80,20 @@ class RigidInertia(PointInertia):
         return {"density": self.density}
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundRigidInertia":
-        return BoundRigidInertia(self, placement)
+    def bind(self, site: EnergySite) -> "BoundRigidInertia":
+        return BoundRigidInertia(self, site)
 
 
 class BoundRigidInertia(BoundInertia):
-    """A rigid part's mass over the steps of a simulator."""
+    """The mass of a rigid part in a simulator."""
 
-    def __init__(self, part: RigidInertia, placement: EnergySite) -> None:
-        super().__init__(part, placement)
-        like = placement.rest_positions
-        self._controls = torch.as_tensor(placement.points[0].nodes[0], device=like.device)
-        self._factor = placement.tensor(part.own_points.gradients[0, :, :, 0])  # (P, 4) L^T
-        volume = placement.load_volume[:, part.cells].sum(axis=1)
-        self._volume = placement.tensor(volume)  # (N,) of which the weight acts at each vertex [m^3]
+    def __init__(self, part: RigidInertia, site: EnergySite) -> None:
+        super().__init__(part, site)
+        like = site.rest_positions
+        self._controls = torch.as_tensor(site.points[0].nodes[0], device=like.device)
+        self._factor = site.tensor(part.own_points.gradients[0, :, :, 0])  # (P, 4) L^T
+        volume = site.load_volume[:, part.cells].sum(axis=1)
+        self._volume = site.tensor(volume)  # (N,) volume whose weight acts at each vertex [m^3]
 
     @override
     def mass(self, parameters: Mapping[str, torch.Tensor]) -> Mass:
@@ -116,10 +116,7 @@ class PointInertiaTerm(Term):
         return {"inertia": (self.n_points,), "target": (self.n_points, 3)}
 
     def _views(self, values: Values) -> list[Any]:
-        inertia, target = values["inertia"], values["target"]
-        assert inertia is not None
-        assert target is not None
-        return [warp_view(inertia, wp.float64), warp_view(target, wp.vec3d)]
+        return [warp_view(value_of(values, "inertia"), wp.float64), warp_view(value_of(values, "target"), wp.vec3d)]
 
     @override
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -132,9 +129,7 @@ class PointInertiaTerm(Term):
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        inertia = values["inertia"]
-        assert inertia is not None
-        return inertia
+        return value_of(values, "inertia")
 
     @override
     def adjoint(
@@ -158,7 +153,7 @@ class PointInertiaTerm(Term):
 class Rigidity(Energy):
     """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a rotation."""
 
-    own_points: SolidPoints  # the one point of the part, with its volume
+    own_points: SolidPoints  # a single point with the volume of the part
     stiffness: float  # kappa [Pa]
 
     @override
@@ -171,12 +166,12 @@ class Rigidity(Energy):
         return SolidTerm(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundRigidity":
-        return BoundRigidity(self, placement)
+    def bind(self, site: EnergySite) -> "BoundRigidity":
+        return BoundRigidity(self, site)
 
 
 class BoundRigidity(BoundEnergy):
-    """The rigidity of a part over the steps of a simulator."""
+    """The rigidity of a part in a simulator."""
 
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
@@ -184,12 +179,12 @@ class BoundRigidity(BoundEnergy):
         rigidity = self.energy
         assert isinstance(rigidity, Rigidity)
         scale = rigidity.stiffness * float(rigidity.own_points.shape_volume.sum())
-        return {"stiffness": self.placement.tensor([[[scale, 0.0]]])}
+        return {"stiffness": self.site.tensor([[[scale, 0.0]]])}
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        still = self.placement.rest_positions.new_zeros(batch, 2)
-        return dict(zip(VISCOUS, (still, None, None), strict=True))
+        no_viscosity = self.site.rest_positions.new_zeros(batch, 2)
+        return dict(zip(VISCOUS, (no_viscosity, None, None), strict=True))
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
@@ -197,10 +192,10 @@ class BoundRigidity(BoundEnergy):
 
 
 def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
-    """Returns the energies of a rigid part of a body: its rigidity and its inertia."""
+    """Returns rigidity and inertia of a rigid part."""
     cells, controls = body.mesh.region(name), body.controls[name]
     corners = body.mesh.vertices[controls]
-    # The gradients of barycentric coordinates do not depend on the order of the corners.
+    # The gradients of barycentric coordinates do not depend on the orientation of the corners.
     gradients = np.linalg.inv(np.vstack([corners.T, np.ones(4)]))[:, :3]
     moments, volume = _moments(body.mesh, cells, corners)
     carried = scipy.sparse.csr_array(np.array([[volume]]))
@@ -211,7 +206,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
 
 
 def _moments(mesh: Mesh, cells: NDArray[np.int64], corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Returns the integral (4, 4) of w w^T over cells [m^3] and their volume, w being barycentric coordinates."""
+    """Returns the integral (4, 4) of w w^T over cells, with barycentric coordinates w, and their volume [m^3]."""
     simplex = mesh.element.faces.shape[1] in (3, 6)
     points, weights = conical_simplex(4) if simplex else gauss_box(4)
     values, reference = mesh.element.shape(points)

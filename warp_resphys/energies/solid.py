@@ -1,4 +1,4 @@
-"""The solid: elastic energy of a material, and its viscosity (Kelvin-Voigt and generalised Maxwell)."""
+"""Energy of a solid: elasticity, and viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import PRONY_RATIO, PRONY_TIME, Material
 from .viscosity import Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
-VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step, see `energies.viscosity`
+VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step (`energies.viscosity`)
 
 
 def device_matrix(matrix: scipy.sparse.sparray, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
-    """Returns a sparse matrix on a device."""
+    """Converts a SciPy matrix to a torch COO matrix on a device."""
     coo = matrix.tocoo()
     indices = torch.as_tensor(np.stack([coo.row, coo.col]).astype(np.int64))
     tensor = torch.sparse_coo_tensor(indices, torch.as_tensor(coo.data), coo.shape, check_invariants=False)
@@ -37,7 +37,7 @@ def device_matrix(matrix: scipy.sparse.sparray, device: torch.device, dtype: tor
 
 
 def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Returns (1 or B, rows) products of a sparse operator (rows, M) with element values (1 or B, 1 or M).
+    """Returns the product (1 or B, rows) of a sparse (rows, M) operator with (1 or B, 1 or M) element values.
 
     Raises:
         InputError: values for another number of elements.
@@ -53,16 +53,16 @@ def spread(operator: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Solid(Energy):
-    """Energy of a material in a body or in one of its regions.
+    """The energy of a material in a body or in a region of it.
 
-    The step's values are ``stiffness`` (B, P, T), the moduli times the points' volumes [J]; and, see
-    `energies.viscosity`, ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; and ``dilation_offset``
-    (B, P), w. Its memory is ``viscous_strain`` (B, K, P, 3, 3), the strain of every Prony branch.
+    Values of a step are ``stiffness`` (B, P, T), the moduli times the points' volumes [J], and those of
+    `energies.viscosity`: ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; ``dilation_offset`` (B, P),
+    w. Memory is ``viscous_strain`` (B, K, P, 3, 3), the strain in each Prony branch.
 
     Args:
-        discretisation: of the body, or of some of its cells.
-        material: its law and constants.
-        cells: (M,) numbers of these cells; None for all of them.
+        discretisation: discretisation of the body, or of some of its cells.
+        material: the material.
+        cells: (M,) indices of these cells; None: all cells.
     """
 
     discretisation: Discretisation
@@ -87,7 +87,7 @@ class Solid(Energy):
     @property
     @override
     def names(self) -> tuple[str, ...]:
-        return ()  # Nobody asks for the constants of one cell by name.
+        return ()  # Cells have no names.
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
@@ -95,30 +95,24 @@ class Solid(Energy):
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "SolidTerm":
-        own = self.discretisation.point_sets
-        carried = np.concatenate([np.stack([v.sum(axis=1) for v in _volumes(s, self.material)], 1) for s in own])
-        return SolidTerm(launcher, sets, self.material, carried)
+        shares = [_shares(points) for points in self.discretisation.point_sets]
+        columns = [np.stack([by_rule[rule].sum(axis=1) for rule in self.material.rules], 1) for by_rule in shares]
+        return SolidTerm(launcher, sets, self.material, np.concatenate(columns))
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundSolid":
-        return BoundSolid(self, placement)
-
-
-def _volumes(points: SolidPoints, material: Material) -> list[scipy.sparse.csr_array]:
-    """Returns the (P, M) volumes that points carry of the cells for each modulus of a material [m^3]."""
-    by_rule = _shares(points)
-    return [by_rule[rule] for rule in material.rules]
+    def bind(self, site: EnergySite) -> "BoundSolid":
+        return BoundSolid(self, site)
 
 
 def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[tuple[Solid, str]]:
-    """Returns the solid of a body with the prefix of its names, or one for each region that has a material.
+    """Returns the solid of a body, or one solid per region with a material, each with the prefix of its names.
 
     Args:
-        body: of which the rigid parts have no material.
-        material: of the whole body, or by region.
+        body: the body; its rigid parts have no material.
+        material: material of the whole body, or materials by region.
 
     Raises:
-        InputError: the regions with a material do not cover the cells of no rigid part once each.
+        InputError: a cell outside the rigid parts belongs to no region with a material, or to several.
     """
     if isinstance(material, Material):
         cells = body.soft_cells
@@ -126,8 +120,8 @@ def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[t
             return []
         return [(Solid(body.discretisation if cells is None else body.discretised(cells), material, cells), "")]
     regions = {name: body.mesh.region(name) for name in material}
-    numbers = [*regions.values(), *map(body.mesh.region, body.rigid), np.zeros(0, dtype=np.int64)]
-    owners = np.bincount(np.concatenate(numbers), minlength=len(body.mesh.cells))
+    assigned = [*regions.values(), *map(body.mesh.region, body.rigid), np.zeros(0, dtype=np.int64)]
+    owners = np.bincount(np.concatenate(assigned), minlength=len(body.mesh.cells))
     if (owners != 1).any():
         without, several = int((owners == 0).sum()), int((owners > 1).sum())
         raise InputError(
@@ -138,28 +132,27 @@ def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[t
 
 
 def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
-    """Returns the (P, M) shares of the cells in the points by the rule of a modulus: volumes [m^3], or of a mean."""
-    whole = points.shape_volume + points.volume_volume
-    mean = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / whole.sum(axis=1)) @ whole)
+    """Returns (P, M) matrices from cells to points, by the rule of a modulus: volumes [m^3], or weights of a mean."""
+    total = points.shape_volume + points.volume_volume
+    mean = scipy.sparse.csr_array(scipy.sparse.diags_array(1.0 / total.sum(axis=1)) @ total)
     return {"shape": points.shape_volume, "volume": points.volume_volume, "mean": mean}
 
 
 class BoundSolid(BoundEnergy):
-    """A solid over the steps of a simulator: stiffness, mass and viscous strain."""
+    """A solid in a simulator: stiffness, mass, and viscous strain."""
 
-    def __init__(self, solid: Solid, placement: EnergySite) -> None:
-        super().__init__(solid, placement)
+    def __init__(self, solid: Solid, site: EnergySite) -> None:
+        super().__init__(solid, site)
         self._solid = solid
-        like, sets = placement.rest_positions, solid.discretisation.point_sets
+        like, sets = site.rest_positions, solid.discretisation.point_sets
         shares = [_shares(s) for s in sets]
         self._shares = {
-            rule: device_matrix(scipy.sparse.vstack([share[rule] for share in shares]), like.device, like.dtype)
+            rule: device_matrix(scipy.sparse.vstack([by_rule[rule] for by_rule in shares]), like.device, like.dtype)
             for rule in set(solid.material.rules)
         }
         cells = slice(None) if solid.cells is None else solid.cells
         self._mass_volume, self._load_volume = (
-            device_matrix(matrix[:, cells], like.device, like.dtype)
-            for matrix in (placement.mass_volume, placement.load_volume)
+            device_matrix(matrix[:, cells], like.device, like.dtype) for matrix in (site.mass_volume, site.load_volume)
         )
         shape = (len(solid.material.prony), sum(s.n_points for s in sets), 3, 3)
         self.memory = (Memory(VISCOUS_STRAIN, "strain", shape, "branch"),) if shape[0] else ()
@@ -175,10 +168,10 @@ class BoundSolid(BoundEnergy):
             ratio, time = (torch.cat(torch.broadcast_tensors(*(parameters[n] for n in own)), 1) for own in names)
             if not (ratio.requires_grad or bool((ratio > 0).any())):
                 ratio = time = None
-        acting = damping.requires_grad or bool((damping > 0).any())
+        damped = damping.requires_grad or bool((damping > 0).any())
         return {
             "stiffness": torch.stack(spreads, dim=-1),
-            "stiffness_damping": damping if acting else None,
+            "stiffness_damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,
         }
@@ -190,9 +183,8 @@ class BoundSolid(BoundEnergy):
 
     def _viscosity(self, constants: Constants) -> Viscosity:
         damping, ratio, time = (constants.values[name] for name in ("stiffness_damping", "prony_ratio", "prony_time"))
-        acts = damping is not None
-        still = self.placement.rest_positions.new_zeros(1)
-        return Viscosity(still if damping is None else damping, acts, ratio, time)
+        zero = self.site.rest_positions.new_zeros(1)
+        return Viscosity(zero if damping is None else damping, damping is not None, ratio, time)
 
     def _values(self, *values: torch.Tensor | None) -> dict[str, torch.Tensor | None]:
         return dict(zip(VISCOUS, values, strict=True))
@@ -201,11 +193,11 @@ class BoundSolid(BoundEnergy):
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         carried = step.state.memory.get(VISCOUS_STRAIN)
         viscosity, strain = self._viscosity(step.constants), partial(GreenStrain.apply, step.term)
-        return self._values(*viscosity.step_values(strain, step.state.q, carried, step.stage, self.placement.time_step))
+        return self._values(*viscosity.step_values(strain, step.state.q, carried, step.stage, self.site.time_step))
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        return self._values(self.placement.rest_positions.new_zeros(batch, 2), None, None)
+        return self._values(self.site.rest_positions.new_zeros(batch, 2), None, None)
 
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -213,17 +205,17 @@ class BoundSolid(BoundEnergy):
         if viscosity.ratio is None:
             return {}
         strain, carried = partial(GreenStrain.apply, step.term), step.state.memory.get(VISCOUS_STRAIN)
-        return {VISCOUS_STRAIN: viscosity.relax(strain, step.state.q, carried, q, self.placement.time_step)}
+        return {VISCOUS_STRAIN: viscosity.relax(strain, step.state.q, carried, q, self.site.time_step)}
 
 
 class SolidTerm(Term):
-    """Kernels of a material, on the points of all its sets.
+    """Kernels of a solid.
 
     Args:
-        launcher: of the potential.
-        sets: the solid's points.
-        material: gives the law.
-        carried: (P, T) volumes that the points carry for each modulus [m^3].
+        launcher: launcher of the potential.
+        sets: points of the solid.
+        material: the material.
+        carried: (P, T) volume of the points for each modulus [m^3].
     """
 
     def __init__(
@@ -244,17 +236,13 @@ class SolidTerm(Term):
         return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
 
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        """Returns the arguments that all kernels of this energy share."""
-        own, (stiffness, viscosity, strain, dilation) = self.launcher, (values[name] for name in self.shapes)
-        assert stiffness is not None
-        assert viscosity is not None
-        assert strain is not None
-        assert dilation is not None
+        """Returns the arguments that the kernels share."""
+        stiffness, viscosity, strain, dilation = (value_of(values, name) for name in self.shapes)
         views = [
-            own.points_view(stiffness, s.own, self._vector),
+            warp_view(stiffness[:, s.own], self._vector),
             warp_view(viscosity, wp.vec2d),
-            own.points_view(strain, s.own, wp.mat33d),
-            own.points_view(dilation, s.own, wp.float64),
+            warp_view(strain[:, s.own], wp.mat33d),
+            warp_view(dilation[:, s.own], wp.float64),
         ]
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
 
@@ -268,15 +256,11 @@ class SolidTerm(Term):
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        stiffness = values["stiffness"]
-        assert stiffness is not None
-        return stiffness @ self._curvature
+        return value_of(values, "stiffness") @ self._curvature
 
     @override
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        stiffness = values["stiffness"]
-        assert stiffness is not None
-        return stiffness[..., self._curvature > 0.0].flatten(1).sum(1)
+        return value_of(values, "stiffness")[..., self._curvature > 0.0].flatten(1).sum(1)
 
     @override
     def adjoint(
@@ -290,12 +274,12 @@ class SolidTerm(Term):
             carried = own.upload(self._carried[s.own], self._vector)
             inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), carried]
             inputs.append(warp_view(direction, wp.vec3d))
-            outputs = [own.points_view(out[name], s.own, kind) for name, kind in types.items()]
+            outputs = [warp_view(out[name][:, s.own], kind) for name, kind in types.items()]
             commands.append(own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, outputs))
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(*commands)
-            return {name: values.sum(1) if name == "viscosity" else values.clone() for name, values in out.items()}
+            return {name: slope.sum(1) if name == "viscosity" else slope.clone() for name, slope in out.items()}
 
         return differentiate
 
@@ -305,19 +289,19 @@ class SolidTerm(Term):
         out = own.zeros(self.n_points, 3, 3)
         for s in self.sets:
             inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
-            outputs = [own.points_view(out, s.own, wp.mat33d)]
+            outputs = [warp_view(out[:, s.own], wp.mat33d)]
             own.launch(own.record(kernels.strain, (own.batch, s.n_points), inputs, outputs))
         return out
 
     def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
-        """Returns the transposed derivative (B, N, 3) of `strain`, applied to (B, P, 3, 3)."""
+        """Returns the vector-Jacobian product (B, N, 3) of `strain` with (B, P, 3, 3)."""
         own = self.launcher
         out, stress = torch.zeros_like(positions), own.zeros(self.n_points, 3, 3)
         adjoint = adjoint.contiguous()
         for s in self.sets:
             inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
-            inputs.append(own.points_view(adjoint, s.own, wp.mat33d))
-            view = own.points_view(stress, s.own, wp.mat33d)
+            inputs.append(warp_view(adjoint[:, s.own], wp.mat33d))
+            view = warp_view(stress[:, s.own], wp.mat33d)
             launch = own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view])
             own.launch(launch, own.gather(s, view, out))
         return out

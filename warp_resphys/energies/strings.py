@@ -1,18 +1,18 @@
 r"""Weights on strings: masses that swing below a body and pull on it only when their strings are taut.
 
 A string of length L and compliance c (inextensible for c = 0) is tied to a, the mean of some vertices, and carries a
-mass m. In an implicit stage of effective length h, in which inertia and gravity alone would take the mass to y, its
-place p minimises m/(2 h^2) |p - y|^2 and the string's energy together. It lies on the line from a to y, so that it can
-be eliminated: the body sees a spring from a to y that only pulls,
+mass m. In an implicit stage of effective length h, in which inertia and gravity alone would move the mass to y, its
+position p minimises the sum of m/(2 h^2) |p - y|^2 and the string's energy. As p lies on the line from a to y, it can
+be eliminated, which leaves a tension-only spring from a to y for the body,
 
     E(a) = k s(|a - y| - L),     k = M / (1 + c M),     M = m / h^2,
 
-with s half the square of the positive part, rounded over a short distance as in `tendons`; and the mass goes to
+with s(e) = max(e, 0)^2 / 2, smoothed over a short distance (`kernels.laws.thread`), and moves the mass to
 
     p = y + (k / M) s'(|a - y| - L) (a - y) / |a - y| .
 
-So the body's solve has no further unknown, whatever hangs on it. A string that tightens takes the difference of the
-speeds along it away, as in a perfectly inelastic impact.
+So weights add no unknowns to the solve. A string that tightens removes the relative velocity along it, as in a
+perfectly inelastic impact.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,8 +33,9 @@ from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PartPoints, PointSet, ReadingTerm, Values
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher
+from .part_terms import PartPoints, ReadingTerm
 
 PAYLOAD = Quantity(
     "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
@@ -45,11 +46,11 @@ PAYLOAD = Quantity(
 class Strings(Energy):
     """Weights on strings.
 
-    Its input is ``payload`` [kg], constant during a motion, its parameters are ``string_length`` [m] and
-    ``string_compliance`` [m/N]; all have one value for every string.
+    The input is ``payload`` [kg], constant during a motion; parameters are ``string_length`` [m] and
+    ``string_compliance`` [m/N]; all with one value per string.
 
     Raises:
-        InputError: no string, one that is tied to nothing, or a length or compliance out of range.
+        InputError: no string, a string without vertices, or a length or compliance out of range.
     """
 
     parameters: ClassVar[tuple[Quantity, ...]] = (
@@ -58,10 +59,10 @@ class Strings(Energy):
     )
     inputs: ClassVar[tuple[Quantity, ...]] = (PAYLOAD,)
 
-    tied_to: Sequence[NDArray[np.int64]]  # vertices of every string, which is tied to their mean
-    length: Parameter  # L [m]: a number, (S,) values with one for each string, (B, 1), or (B, S)
-    compliance: Parameter = 0.0  # c [m/N], the same
-    toe: float = 1e-5  # elongation at which a string is fully taut [m]
+    tied_to: Sequence[NDArray[np.int64]]  # vertices of each string, which is tied to their mean
+    length: Parameter  # L [m]: a number, (S,), (B, 1) or (B, S) values
+    compliance: Parameter = 0.0  # c [m/N], likewise
+    toe: float = 1e-5  # elongation at which a string reaches its full stiffness [m]
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -87,7 +88,7 @@ class Strings(Energy):
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
-        """One a string, whose operators are the shares of its vertices.
+        """Returns one point per string, whose operators average over its vertices.
 
         Raises:
             InputError: a vertex that the mesh does not have.
@@ -96,10 +97,8 @@ class Strings(Energy):
         for number, vertices in enumerate(self.tied_to, 1):
             if not (np.min(vertices) >= 0 and np.max(vertices) < count):
                 raise InputError(f"string {number} is tied to a vertex that is not among the {count} of the mesh.")
-        # What pads a list repeats its first vertex with a zero share, which contributes nothing.
-        nodes = np.array(
-            [np.pad(vertices, (0, most - len(vertices)), constant_values=vertices[0]) for vertices in self.tied_to]
-        )
+        # Lists are padded with their first vertex and a zero operator.
+        nodes = np.array([np.pad(v, (0, most - len(v)), constant_values=v[0]) for v in self.tied_to])
         operator = np.zeros((self.count, 1, most, 1))
         for row, vertices in zip(operator, self.tied_to, strict=True):
             row[0, : len(vertices)] = 1.0 / len(vertices)
@@ -111,24 +110,24 @@ class Strings(Energy):
         return StringTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
 
     @override
-    def bind(self, placement: EnergySite) -> "BoundStrings":
-        return BoundStrings(self, placement)
+    def bind(self, site: EnergySite) -> "BoundStrings":
+        return BoundStrings(self, site)
 
 
 class BoundStrings(BoundEnergy):
-    """The weights of strings over the steps of a simulator: where they are, how they act in a step, where they go.
+    """Weights on strings in a simulator.
 
-    The memory is ``payload_position`` [m] and ``payload_velocity`` [m/s], (B, S, 3), and for a method that looks back
-    the same one step earlier. Where a state has none, the weights are below where they are tied, on taut strings.
+    Memory is ``payload_position`` [m] and ``payload_velocity`` [m/s], (B, S, 3), and for BDF2 both one step earlier. If
+    a state has none, the weights hang at rest on taut strings.
     """
 
-    def __init__(self, strings: Strings, placement: EnergySite) -> None:
-        super().__init__(strings, placement)
+    def __init__(self, strings: Strings, site: EnergySite) -> None:
+        super().__init__(strings, site)
         self._strings = strings
-        (points,) = placement.points
-        shares = np.zeros((strings.count, len(placement.rest_positions)))
-        np.add.at(shares, (np.arange(strings.count)[:, None], points.nodes), points.gradients[:, 0, :, 0])
-        self._shares = placement.tensor(shares)  # (S, N) of the vertices in the place that each string is tied to
+        (points,) = site.points
+        averages = np.zeros((strings.count, len(site.rest_positions)))
+        np.add.at(averages, (np.arange(strings.count)[:, None], points.nodes), points.gradients[:, 0, :, 0])
+        self._averages = site.tensor(averages)  # (S, N) matrix from vertices to the mean of each string's vertices
         shape = (strings.count, 3)
         self.memory = tuple(
             Memory(f"payload_{when}{what}", unit, shape, "string")
@@ -137,16 +136,16 @@ class BoundStrings(BoundEnergy):
         )
 
     def _masses(self, inputs: Inputs, batch: int) -> torch.Tensor:
-        """Returns the masses (B, S) [kg]; nothing hangs where none are given."""
-        given = inputs.actuation.get(PAYLOAD.name)
-        return self._shares.new_zeros(batch, self._strings.count) if given is None else given
+        """Returns the masses (B, S), zero without the input [kg]."""
+        payload = inputs.actuation.get(PAYLOAD.name)
+        return self._averages.new_zeros(batch, self._strings.count) if payload is None else payload
 
     @override
     def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
         if not static:
             return None
         gravity = constants.gravity.expand(batch, 3)
-        return torch.einsum("bs,sn,bc->bnc", self._masses(inputs, batch), self._shares, gravity)
+        return torch.einsum("bs,sn,bc->bnc", self._masses(inputs, batch), self._averages, gravity)
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
@@ -156,58 +155,58 @@ class BoundStrings(BoundEnergy):
 
     @override
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns values of strings that do nothing: what they pull at rest is a load."""
-        zeros = self._shares.new_zeros(batch, self._strings.count)
+        """Returns values of strings without force: at rest their pull is a dead load."""
+        zeros = self._averages.new_zeros(batch, self._strings.count)
         return {"string_target": zeros[..., None].expand(-1, -1, 3), "string_stiffness": zeros}
 
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         weights = self._weights(step)
         free = self._free(self._stage(weights), step.constants)
-        tied = torch.einsum("sn,bnc->bsc", self._shares, x)
+        tied = torch.einsum("sn,bnc->bsc", self._averages, x)
         at = self._pulled(tied, free, self._inertia(step), step.constants)
-        new = self.placement.method.finish(weights, at, self.placement.time_step)
+        new = self.site.method.finish(weights, at, self.site.time_step)
         values = (new.q, new.v, *(new.previous or ()))
         return {memory.name: value for memory, value in zip(self.memory, values, strict=False)}
 
     def _inertia(self, step: EnergyStep) -> torch.Tensor:
-        """Returns M = m / h^2 (B, S) [N/m]."""
+        """Returns M = m / h^2, (B, S) [N/m]."""
         return self._masses(step.inputs, step.state.batch) / step.stage.step**2
 
     def _weights(self, step: EnergyStep) -> State:
         """Returns the state of the weights, (B, S, 3), at the start of a step.
 
-        Without gravity nothing tightens a string, and a weight is where it is tied.
+        Without memory they hang at rest on taut strings, or are at a without gravity.
         """
         state, constants = step.state, step.constants
-        remembered = [state.memory[memory.name] for memory in self.memory if memory.name in state.memory]
-        if len(remembered) >= 2:
-            previous = (remembered[2], remembered[3]) if len(remembered) == 4 else None
-            return State(remembered[0], remembered[1], previous)
+        stored = [state.memory[memory.name] for memory in self.memory if memory.name in state.memory]
+        if len(stored) >= 2:
+            previous = (stored[2], stored[3]) if len(stored) == 4 else None
+            return State(stored[0], stored[1], previous)
         gravity = constants.gravity.expand(state.batch, 3)[:, None]
         size = gravity.norm(dim=-1, keepdim=True)
         pull = self._masses(step.inputs, state.batch) * size[..., 0]
         length = constants.value("string_length") + constants.value("string_compliance") * pull
         length = length + 0.5 * self._strings.toe
         down = torch.where(size > 0.0, gravity / size, 0.0)
-        tied = [torch.einsum("sn,bnc->bsc", self._shares, field) for field in (state.q, state.v)]
+        tied = [torch.einsum("sn,bnc->bsc", self._averages, field) for field in (state.q, state.v)]
         return State(tied[0] + length[..., None] * down, tied[1])
 
     def _stage(self, weights: State) -> ImplicitStage:
-        return self.placement.method.stage(weights, self.placement.time_step)
+        return self.site.method.stage(weights, self.site.time_step)
 
     def _free(self, stage: ImplicitStage, constants: Constants) -> torch.Tensor:
-        """Returns where inertia and gravity alone take the weights (B, S, 3) [m]."""
+        """Returns y (B, S, 3), where inertia and gravity alone move the weights [m]."""
         return stage.target + stage.step**2 * constants.gravity[:, None]
 
     def _pulled(self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, constants: Constants) -> torch.Tensor:
-        """Returns where the weights go in a stage (B, S, 3) [m].
+        """Returns the positions p (B, S, 3) of the weights at the end of a stage [m].
 
         Args:
-            tied: (B, S, 3) a, where the strings are tied at its end [m].
-            free: (B, S, 3) y, where the weights would go without strings [m].
+            tied: (B, S, 3) a at the end of the stage [m].
+            free: (B, S, 3) y [m].
             mass: (B, S) M [N/m].
-            constants: of the roll-out.
+            constants: constants of the roll-out.
         """
         line, toe = tied - free, self._strings.toe
         distance = line.norm(dim=-1)
@@ -219,10 +218,8 @@ class BoundStrings(BoundEnergy):
 
 
 class StringTerm(ReadingTerm):
-    """Kernels of the springs that strings with weights are for a body in a stage."""
+    """Kernels of the springs that replace strings and weights in a stage."""
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        stiffness = values["string_stiffness"]
-        assert stiffness is not None
-        return stiffness
+        return value_of(values, "string_stiffness")

@@ -1,21 +1,20 @@
 r"""Tendons (cables) that slide without friction through guides in a body.
 
-A tendon is taut between its guides, so that its length L is the sum of their distances; its ends are its first and its
-last guide. A commanded tension T has the potential T L. A commanded contraction c acts through a spring that only
-pulls, of stiffness k, on what is left of the length at rest L_0:
+A tendon is straight between its guides, so that its length L is the sum of their distances; it ends at its first and
+last guide. A commanded tension T has the potential T L. A commanded contraction c acts through a tension-only spring of
+stiffness k, relative to the length at rest L_0:
 
     E = T L + k s(L - L_0 + c),     tension  T + k s'(L - L_0 + c),
 
-s being half the square of what is positive, rounded over a short distance so that a slack tendon tightens smoothly. So
-a tendon commanded by tension has k = 0, one commanded by length has T = 0, and a passive cable has neither.
+with s(e) = max(e, 0)^2 / 2, smoothed over a short distance so that a slack tendon tightens smoothly. A tendon commanded
+by tension has k = 0, one commanded by length has T = 0, and a passive cable has T = 0 and c = 0.
 
-The tension is one number for all pieces of a tendon: its change, k s'' g g^T with the gradient g of the length, couples
-every vertex near it with every other. That is a correction of low rank to a Hessian that stays as sparse as the mesh.
+The tension is the same in all segments of a tendon: its change, k s'' g g^T with the gradient g of the length, couples
+all vertices near the tendon. It is a low-rank correction to a Hessian that stays as sparse as the mesh.
 
-Where a tendon runs may be a parameter, too: its guides move in the undeformed body along up to two given directions,
-each by an offset, from X to X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a are
-continued linearly from where the guide was put, so that offsets are to be small beside the cells. L_0 is that of the
-tendon where it runs.
+The routing may be a parameter, too: the guides move in the undeformed body along up to two given directions, from X to
+X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a are extrapolated linearly from X, so that
+offsets must be small compared with the cells. L_0 is the length of the offset tendon.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,13 +32,14 @@ from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PartPoints, PartTerm, PointSet, Values
+from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
+from .part_terms import PartPoints, PartTerm
 
 
 @dataclass(frozen=True)
 class TendonPoints(PartPoints):
-    """Pieces of tendons between their guides, tendon after tendon; the operators give the F of ``kernels.tendons``."""
+    """Segments of tendons between guides, tendon after tendon, with the operators of F (`kernels.tendons`)."""
 
     rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
 
@@ -54,11 +54,10 @@ OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) 
 
 @dataclass(frozen=True)
 class Tendons(Energy):
-    """T L, or a spring on the length, of every tendon.
+    """Tendons (energy in the module's docstring).
 
-    Its inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m], its parameters ``tendon_stiffness`` [N/m] and,
-    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero by default. All have one value for
-    every tendon.
+    Inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m]; parameters are ``tendon_stiffness`` [N/m] and,
+    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero by default; all with one value per tendon.
 
     Raises:
         InputError: no tendon, one with fewer than two guides, guides that are not finite, a negative stiffness, or
@@ -69,15 +68,14 @@ class Tendons(Energy):
     is_load: ClassVar[bool] = True
     implicit_only: ClassVar[bool] = True
 
-    routes: Sequence[ArrayLike]  # (G, 3) places of each tendon's guides on the undeformed body, in their order [m]
-    # k [N/m], the parameter ``tendon_stiffness``: a number, (T,) values with one for each tendon, (B, 1), or (B, T);
-    # zero for tendons whose tension is commanded
+    routes: Sequence[ArrayLike]  # (G, 3) guides of each tendon on the undeformed body, in order [m]
+    # k [N/m], parameter ``tendon_stiffness``: a number, (T,), (B, 1) or (B, T) values; zero for commanded tension
     stiffness: Parameter = 0.0
-    toe: float = 1e-4  # elongation at which a tendon is fully taut [m]
-    reach: float = 1e-3  # largest distance of a guide outside of the body [m]
-    labels: Sequence[str] = ()  # of the tendons; numbers where left out
-    # one or two directions for each tendon, the same number for all, along which its guides may be off: (3,) for all of
-    # its guides, or (G, 3) for each; per metre of offset, so that a direction of length one is an offset of the guide
+    toe: float = 1e-4  # elongation at which the spring reaches its full stiffness [m]
+    reach: float = 1e-3  # largest distance of a guide from the body [m]
+    labels: Sequence[str] = ()  # names of the tendons; numbered if empty
+    # offset directions of each tendon, one or two for all tendons: (3,) for all guides of a tendon, or (G, 3) one per
+    # guide; displacement of the guide per metre of offset
     directions: Sequence[Sequence[ArrayLike]] = ()
 
     def __post_init__(self) -> None:
@@ -103,11 +101,11 @@ class Tendons(Energy):
             return
         if len(self.directions) != self.count:
             raise InputError(f"{len(self.directions)} tendons have directions of offsets, but there are {self.count}.")
-        counts = [len(directions) for directions in self.directions]
+        counts = [len(own) for own in self.directions]
         if set(counts) not in ({1}, {2}):
             raise InputError(f"the tendons have {counts} directions of offsets: give each one, or each two.")
-        for number, (route, own_directions) in enumerate(zip(self.guides, self.directions, strict=True), 1):
-            for given in own_directions:
+        for number, (route, own) in enumerate(zip(self.guides, self.directions, strict=True), 1):
+            for given in own:
                 try:
                     direction = np.asarray(given, dtype=np.float64)
                 except (TypeError, ValueError):
@@ -121,21 +119,21 @@ class Tendons(Energy):
                     raise InputError(f"tendon {number} has a direction of offsets that is zero or not finite.")
 
     def rerouted(self, offsets: ArrayLike) -> "Tendons":
-        """Returns the tendons with their guides moved by offsets, and without directions of offsets.
+        """Returns tendons with the guides moved by offsets, and without offset parameters.
 
         Args:
-            offsets: (T, D) along the D directions of each of the T tendons [m].
+            offsets: (T, D) offsets of the T tendons along their D directions [m].
         """
-        along = np.asarray(offsets, dtype=np.float64)
+        all_offsets = np.asarray(offsets, dtype=np.float64)
         routes = [
-            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, own_directions, strict=True))
-            for route, own, own_directions in zip(self.guides, along, self.directions, strict=True)
+            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, directions, strict=True))
+            for route, own, directions in zip(self.guides, all_offsets, self.directions, strict=True)
         ]
         return replace(self, routes=routes, directions=())
 
     @property
     def offset_count(self) -> int:
-        """Number of directions of offsets, equal for all tendons."""
+        """Number of offset directions per tendon."""
         return len(self.directions[0]) if len(self.directions) else 0
 
     @property
@@ -145,7 +143,7 @@ class Tendons(Energy):
 
     @property
     def guides(self) -> list[NDArray[np.float64]]:
-        """Guides (G, 3) of every tendon [m]."""
+        """Guides (G, 3) of each tendon [m]."""
         return [np.asarray(route, dtype=np.float64) for route in self.routes]
 
     @property
@@ -165,14 +163,14 @@ class Tendons(Energy):
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Returns the values for the energy's terms; offsets without a direction are zero."""
+        """Implements `Energy.prepare`; offsets without a direction are zero."""
         values = super().prepare(constants)
         zero = torch.zeros_like(values["tendon_stiffness"])
         return values | {offset.name: zero for offset in OFFSETS[self.offset_count :]}
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
-        """Returns the pieces between guides, as points on the vertices of the cells around their ends.
+        """Returns the segments between guides, each attached to the cells that contain its ends.
 
         Raises:
             InputError: a guide outside of the body.
@@ -187,7 +185,7 @@ class Tendons(Energy):
                     f"{1e3 * places.outside[worst]:.3g} mm outside of the body: move it, or raise the reach of "
                     f"{1e3 * self.reach:g} mm."
                 )
-            weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): place, and its derivatives by the offsets
+            weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): position, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))
             weights[..., 0], shape[..., 0] = places.weights, route
             for k in range(self.offset_count):
@@ -195,19 +193,19 @@ class Tendons(Energy):
                 weights[..., 1 + k] = np.einsum("gki,gi->gk", places.gradients, step)
                 shape[..., 1 + k] = step
             for first in range(len(route) - 1):
-                piece = _difference(mesh, places.cells[first : first + 2], weights[first : first + 2])
-                nodes.append(piece[0])
-                operators.append(piece[1])
+                own_nodes, own_operators = _difference(
+                    mesh, places.cells[first : first + 2], weights[first : first + 2]
+                )
+                nodes.append(own_nodes)
+                operators.append(own_operators)
             tendon += [number] * (len(route) - 1)
             rest.append(np.diff(shape, axis=0))
         most = max(map(len, nodes))
-        # What pads a list repeats its first vertex with a zero weight, which contributes nothing.
-        padded = np.array(
-            [np.pad(vertices, (0, most - len(vertices)), constant_values=vertices[0]) for vertices in nodes]
-        )
+        # Lists are padded with their first vertex and a zero operator.
+        padded = np.array([np.pad(own, (0, most - len(own)), constant_values=own[0]) for own in nodes])
         operator = np.zeros((len(nodes), 1, most, 3))
-        for row, weights in enumerate(operators):
-            operator[row, 0, : len(weights)] = weights
+        for row, own in enumerate(operators):
+            operator[row, 0, : len(own)] = own
         return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), np.concatenate(rest)),)
 
     @override
@@ -218,7 +216,7 @@ class Tendons(Energy):
 def _difference(
     mesh: Mesh, cells: NDArray[np.int64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Returns unique vertices and their weights (K', 3), whose sum is the vector from one place to another."""
+    """Returns vertices (K',), without duplicates, and operators (K', 3) of the vector between two guides."""
     vertices, inverse = np.unique(mesh.cells[cells].ravel(), return_inverse=True)
     sums = np.zeros((len(vertices), 3))
     np.add.at(sums, inverse, np.concatenate([-weights[0], weights[1]]))
@@ -230,9 +228,9 @@ class TendonTerm(PartTerm):
     """Kernels of tendons.
 
     Args:
-        launcher: of the potential.
-        sets: the pieces.
-        tendons: the tendons of the pieces.
+        launcher: launcher of the potential.
+        sets: segments.
+        tendons: the tendons.
     """
 
     couples_cells = True
@@ -241,30 +239,25 @@ class TendonTerm(PartTerm):
         (s,) = sets
         assert isinstance(s.source, TendonPoints)
         numbers = s.source.part
-        super().__init__(launcher, sets, "tendon_tension", tendons.count)
+        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(offset.name for offset in OFFSETS))
+        super().__init__(launcher, sets, dict.fromkeys(names, (tendons.count,)), tendons.count)
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
         self._rest = launcher.upload(s.source.rest, wp.mat33d)
         self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(tendons.count)
         self._spring = launcher.zeros(tendons.count, 3)
         self._direction = launcher.zeros(s.n_points, 3, 3)
-        self._directions: Any = None  # the launch that fills it
-        self._piece_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
+        self._directions: Any = None  # the launch that fills it, made at its first use
+        self._segment_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
         columns = 1 + tendons.offset_count
-        operator = np.zeros((s.n_points, s.n_vertices, columns))  # how a vertex moves a piece
+        operator = np.zeros((s.n_points, s.n_vertices, columns))
         rows = np.arange(s.n_points)[:, None]
         np.add.at(operator, (rows, s.source.nodes), s.source.gradients[:, 0, :, :columns])
         self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (.., P, N)
 
     @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(offset.name for offset in OFFSETS))
-        return dict.fromkeys(names, (self.count,))
-
-    @property
-    def _pull(self) -> tuple[Any, Any]:
-        """Outputs of `before`: c and the tension of every tendon."""
+    def _state(self) -> tuple[Any, Any]:
+        """Outputs of `before`: c and the tension of each tendon."""
         return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
     @override
@@ -273,7 +266,7 @@ class TendonTerm(PartTerm):
         tension, contraction, stiffness, *offsets = self.views(values)
         runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
         inputs = [active, *runs, tension, contraction, stiffness, self._toe, positions]
-        outputs = [*self._pull, warp_view(self._spring, wp.vec3d)]
+        outputs = [*self._state, warp_view(self._spring, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
@@ -281,49 +274,46 @@ class TendonTerm(PartTerm):
         tension, _, stiffness, *_ = self.views(values)
         return kernels.local_step, [
             *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),
-            *(*self._pull, warp_view(self._spring, wp.vec3d), positions),
+            *(*self._state, warp_view(self._spring, wp.vec3d), positions),
         ]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._pull, positions]
+        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._state, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        stiffness = values["tendon_stiffness"]
-        assert stiffness is not None
+        stiffness = value_of(values, "tendon_stiffness")
         if not bool((stiffness > 0.0).any()):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
-            inputs = [s.nodes, s.gradients, self.part, self._pull[0], positions]
+            inputs = [s.nodes, s.gradients, self.part, self._state[0], positions]
             out = [warp_view(self._direction, wp.mat33d)]
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
         columns = self._direction.movedim(-1, 1)[:, : len(self._operator)]  # (B, .., P, 3)
-        by_column = columns[..., None] * self._own[:, None]  # (B, .., P, 3, T)
+        by_column = columns[..., None] * self._one_hot[:, None]  # (B, .., P, 3, T)
         gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 T)
         gradient = gradient.unflatten(2, (3, self.count)).flatten(1, 2)
         return gradient * (stiffness * self._spring[..., 2]).sqrt()[:, None]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
-        tension, stiffness = values["tendon_tension"], values["tendon_stiffness"]
-        assert tension is not None
-        assert stiffness is not None
-        # |F c|^2 is at most |c|^2 |F|^2, and the square of a sum of n lengths at most n times the sum of their squares.
-        columns = 1.0 + sum((values[offset.name] / kernels.OFFSET_UNIT).square() for offset in OFFSETS)
-        stretching = (tension * columns)[:, self.part_of] / self._piece_length
-        return stretching + (stiffness * columns * self._own.sum(0))[:, self.part_of]
+        tension, stiffness = value_of(values, "tendon_tension"), value_of(values, "tendon_stiffness")
+        # |F c|^2 <= |c|^2 |F|^2, and the square of a sum of n lengths is at most n times the sum of their squares.
+        columns = 1.0 + sum((value_of(values, o.name) / kernels.OFFSET_UNIT).square() for o in OFFSETS)
+        stretching = (tension * columns)[:, self.part_of] / self._segment_length
+        return stretching + (stiffness * columns * self._one_hot.sum(0))[:, self.part_of]
 
     @override
     def adjoint(
         self, values: Values, positions: torch.Tensor, direction: torch.Tensor
     ) -> Callable[[], dict[str, torch.Tensor]]:
         own, (s,) = self.launcher, self.sets
-        views = [warp_view(vectors, wp.vec3d) for vectors in (positions, direction)]
+        views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
-        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._pull, *views]
+        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._state, *views]
         outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),
@@ -332,8 +322,7 @@ class TendonTerm(PartTerm):
 
         def differentiate() -> dict[str, torch.Tensor]:
             own.launch(*launches)
-            stiffness = values["tendon_stiffness"]
-            assert stiffness is not None
+            stiffness = value_of(values, "tendon_stiffness")
             by_tension = self.sum_parts(shorter)
             by_contraction = stiffness * self._spring[..., 2] * by_tension
             by_stiffness = self._spring[..., 1] * by_tension

@@ -1,23 +1,24 @@
 r"""Viscosity of a solid over one implicit stage: Kelvin-Voigt, and generalised Maxwell (Prony) branches.
 
-Both are quadratic in the Green strain E(x) of the stage's solution: a step keeps one potential, with the density
+Both are quadratic in the Green strain E(x) of the stage's solution, so that a step still minimises one potential, with
+the additional density
 
     mu (c E - 2 W) : E + lambda / 2 (d tr E - 2 w) tr E .
 
-Kelvin-Voigt viscosity of retardation time beta has c = d = beta / h_e, W = c R with the strain R that the integrator's
-stage starts from, and w = d tr R.
+Kelvin-Voigt viscosity of retardation time beta has c = d = beta / h_e, W = c R with the reference strain R of the
+integrator's stage, and w = d tr R.
 
-Branch k relaxes shear: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), mu being the modulus that is left after a long time,
-and lambda stays elastic, as is usual for rubber. It carries the strain H_k, the part that has not relaxed yet:
+Prony branches relax shear only: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), with the long-term modulus mu; lambda stays
+elastic, as is usual for rubber. Branch k has the strain H_k that has not relaxed yet:
 
     dH/dt = dE/dt - H / tau,     second Piola-Kirchhoff stress  2 mu g H .
 
-For a strain that changes evenly during s seconds that is solved exactly, and unconditionally stably, by
+For a constant strain rate during s seconds the exact, unconditionally stable solution is
 
     H(s) = exp(-s / tau) H(0) + gamma (E(s) - E(0)),     gamma = (1 - exp(-s / tau)) tau / s
 
 (Taylor, Pister and Goudreau 1970; Simo and Hughes, Computational Inelasticity, 1998, section 10.3). So a branch adds
-g gamma to c, and g (gamma E(0) - exp(-s / tau) H(0)) to W: however many there are, a step costs the same.
+g gamma to c, and g (gamma E(0) - exp(-s / tau) H(0)) to W; the cost of a step does not depend on their number.
 """
 
 from collections.abc import Callable
@@ -34,11 +35,11 @@ StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
 
 @dataclass(frozen=True)
 class Viscosity:
-    """Viscous constants of a solid; None for an absent part."""
+    """Viscous constants of a solid."""
 
     damping: torch.Tensor  # (1 or B,) retardation time beta [s]
-    acts: bool  # whether beta may be nonzero
-    ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu
+    damped: bool  # whether beta may be non-zero
+    ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu; None without branches
     time: torch.Tensor | None  # (1 or B, K) their relaxation times [s]
 
     def step_values(
@@ -47,16 +48,16 @@ class Viscosity:
         """Returns c and d (B, 2), W (B, P, 3, 3) and w (B, P) of a step, the last two None without viscosity.
 
         Args:
-            strain: of the solid.
+            strain: strain function of the solid.
             q: (B, N, 3) positions at the start [m].
-            carried: (B, K, P, 3, 3) strains H of the branches at the start; None for relaxed ones.
-            stage: of the integrator.
+            carried: (B, K, P, 3, 3) strains H of the branches at the start; None: relaxed.
+            stage: stage of the integrator.
             time_step: h [s].
         """
         batch = len(q)
         c = d = (self.damping / stage.step).expand(batch)
         offset = dilation = None
-        if self.acts:
+        if self.damped:
             offset = _scale(d, reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights]))
             dilation = offset.diagonal(dim1=-2, dim2=-1).sum(-1)
         if self.ratio is None or self.time is None:
@@ -73,14 +74,14 @@ class Viscosity:
     def relax(
         self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, end: torch.Tensor, seconds: float
     ) -> torch.Tensor:
-        """Returns the strains H (B, K, P, 3, 3) of the branches after a motion.
+        """Returns the strains H (B, K, P, 3, 3) of the branches at the end of a motion.
 
         Args:
-            strain: of the solid.
-            q: (B, N, 3) positions at its start [m].
-            carried: (B, K, P, 3, 3) strains H at its start; None for relaxed branches.
-            end: (B, N, 3) positions at its end [m].
-            seconds: its duration [s].
+            strain: strain function of the solid.
+            q: (B, N, 3) positions at the start [m].
+            carried: (B, K, P, 3, 3) strains H at the start; None: relaxed.
+            end: (B, N, 3) positions at the end [m].
+            seconds: duration [s].
         """
         assert self.time is not None
         decay, gamma = (x[..., None, None, None] for x in relaxation(self.time, seconds))
@@ -89,7 +90,7 @@ class Viscosity:
 
 
 def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns exp(-s / tau) and gamma, (1 or B, K), of relaxation times tau [s]."""
+    """Returns exp(-s / tau) and gamma, (1 or B, K) each, for relaxation times tau [s]."""
     ratio = seconds / time
     return torch.exp(-ratio), -torch.expm1(-ratio) / ratio
 

@@ -157,7 +157,7 @@ def measure(mesh: Mesh, study: LockingStudy, timed: bool = True) -> dict[str, An
         moved = simulator.static_equilibrium(Inputs(pressure=load)).q - simulator.rest_positions
         return 1e3 * float(moved[0, tip, 0].mean())
 
-    volumes = hanging.held_energy("pressure", 1).conjugates(hanging.rest_positions[None])
+    volumes = hanging.explicit_energy("pressure", 1).conjugates(hanging.rest_positions[None])
     result: dict[str, Any] = {
         "vertices": len(mesh.vertices),
         "chamber_cm3": 1e6 * float(volumes[0, number - 1]),

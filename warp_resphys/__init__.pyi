@@ -6,8 +6,8 @@ from .data.observation import Observation as Observation
 from .data.recordings.reading import read_recording as read_recording
 from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator
-from .dynamics.simulator import Trajectory as Trajectory
 from .dynamics.tape import record_rollout as record_rollout
+from .dynamics.trajectory import Trajectory as Trajectory
 from .energies.base import Energy as Energy
 from .energies.fibres import Fibres as Fibres
 from .energies.materials import Corotated as Corotated

@@ -6,7 +6,7 @@ import scipy.linalg
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
-from warp_resphys.dynamics.modes import resolved, vibration_modes, with_signs
+from warp_resphys.dynamics.modes import align_degenerate_modes, fix_signs, vibration_modes
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 
@@ -58,7 +58,7 @@ def test_a_ring_whose_axes_weigh_the_same_has_one_basis(waves):
     radial = np.stack([0.0 * angles, np.cos(angles), np.sin(angles)], 1)
     pair = np.stack([np.cos(waves * angles), np.sin(waves * angles)], 1) / np.sqrt(12.0)
     shapes = (radial[:, :, None] * pair[:, None]).reshape(-1, 2)
-    found = [with_signs(resolved(np.ones(2), turn(shapes, seed), radial, 1e-4)) for seed in range(4)]
+    found = [fix_signs(align_degenerate_modes(np.ones(2), turn(shapes, seed), radial, 1e-4)) for seed in range(4)]
     assert max(np.abs(other - found[0]).max() for other in found) < 1e-12
-    apart = resolved(np.array([1.0, 1.1]), shapes, radial, 1e-4)
+    apart = align_degenerate_modes(np.array([1.0, 1.1]), shapes, radial, 1e-4)
     np.testing.assert_allclose(np.abs(apart), np.abs(shapes), atol=1e-12)

@@ -283,7 +283,9 @@ def test_bad_input():
         Pressure([])
     with pytest.raises(InputError, match="two energies of the body depend on pressure"):
         Body(mesh, energies=[Pressure([chamber]), Pressure([chamber])])
-    with pytest.raises(InputError, match="'fibre_stiffness' is not a parameter of this simulator: it has youngs"):
+    with pytest.raises(
+        InputError, match="'fibre_stiffness' is not a parameter of this simulator: it has youngs_modulus"
+    ):
         simulator().prepare({"fibre_stiffness": 1.0})
     with pytest.raises(InputError, match=r"fibre_stiffness has 3 values for 2 chambers"):
         simulator(fibres={"stiffness": [1.0, 2.0, 3.0]}).prepare()

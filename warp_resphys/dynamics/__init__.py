@@ -1,4 +1,4 @@
-"""Time steps and equilibria: one solve, one adjoint, and the integrators around them.
+"""Time steps and static equilibria with their adjoint, vibration modes, and body frames.
 
-From outside: `simulator.Simulator`, `stepping.state.State`, `tape.record_rollout`, `modes.vibration_modes`.
+Public: `simulator.Simulator`, `trajectory.Trajectory`, `tape.record_rollout`, `modes.vibration_modes`.
 """

@@ -1,4 +1,4 @@
-"""Sparsity pattern of the Hessian, and its assembly in the layout of a linear solver."""
+"""Block structure of the Hessian, and its assembly in the layout of a linear solver."""
 
 from collections.abc import Sequence
 
@@ -15,21 +15,21 @@ from ..linalg.linear_solver import LinearSolver
 
 
 class BlockPattern:
-    """Pairs of vertices that the Hessian couples, and the cell blocks that each pair sums.
+    """Pairs of vertices coupled by the Hessian, and the cell blocks that contribute to each pair.
 
     Args:
-        vertices: (N, 3) at rest [m].
-        fixed: (D,) vertices that are not unknowns.
-        sets: every set of points that carries energy.
+        vertices: (N, 3) rest positions [m].
+        fixed: (D,) fixed vertices.
+        sets: sets of points of all energies.
 
     Attributes:
         free: (F,) vertices that are not fixed.
-        positions: (F, 3) of the free vertices at rest [m].
+        positions: (F, 3) their rest positions [m].
         rows: (E,) row of each block, an index into ``free``.
         cols: (E,) column of each block; ``rows >= cols``.
         start: (E + 1,) first entry of each block in ``contribution``.
-        contribution: index of the cell block, or -1 - index where it enters transposed.
-        diagonal_vertex: (E,) the vertex of a diagonal block, else -1.
+        contribution: index of a cell block, or -1 - index for its transpose.
+        diagonal_vertex: (E,) vertex of a diagonal block, else -1.
         offsets: first cell block of each point set.
         n_cell_blocks: number of cell blocks of all point sets.
     """
@@ -47,7 +47,7 @@ class BlockPattern:
         for points in sets:
             a, c = np.tril_indices(points.nodes.shape[1])
             pair = np.stack([reduced[points.nodes[:, a]], reduced[points.nodes[:, c]]], axis=-1).reshape(-1, 2)
-            # A padded node repeats its patch's own vertex with a zero gradient and contributes nothing.
+            # Padded nodes have a zero gradient.
             used = np.abs(points.gradients).sum(axis=(1, 3)) > 0.0
             keep = (pair >= 0).all(axis=1) & (used[:, a] & used[:, c]).ravel()
             sources.append(self.n_cell_blocks + np.flatnonzero(keep))
@@ -57,12 +57,12 @@ class BlockPattern:
         self._collect(np.concatenate(sources), np.concatenate(pairs))
 
     def unknowns(self, device: torch.device) -> torch.Tensor:
-        """Returns the indices (3 F,) of the free coordinates among all coordinates."""
+        """Returns the indices (3 F,) of the free coordinates."""
         free = torch.as_tensor(self.free, device=device)
         return (3 * free[:, None] + torch.arange(3, device=device)).reshape(-1)
 
     def _collect(self, source: NDArray[np.int64], pair: NDArray[np.int64]) -> None:
-        """Sorts the cell blocks by matrix block; a block above the diagonal enters transposed."""
+        """Sorts the cell blocks by matrix block; blocks above the diagonal are transposed."""
         n = len(self.free)
         source = np.where(pair[:, 0] < pair[:, 1], -1 - source, source)
         diagonal = np.arange(n) * (n + 1)
@@ -79,8 +79,8 @@ class HessianAssembly:
     """Recorded launches from the tangent of a potential to the value array of a linear solver.
 
     Attributes:
-        launches: set ``values`` in the environments of the potential's last tangent.
-        values: (B, n_values) entries of the matrix.
+        launches: launches that set ``values`` in the environments of the potential's ``tangent_active``.
+        values: (B, n_values).
     """
 
     def __init__(self, potential: IncrementalPotential, solver: LinearSolver, pattern: BlockPattern) -> None:
@@ -116,7 +116,7 @@ class HessianAssembly:
         self.launches = p.capture(*commands)
 
     def __call__(self) -> torch.Tensor:
-        """Returns (B, n_values) entries for the potential's last `update_tangent`; the next call overwrites them."""
+        """Returns the values (B, n_values) for the potential's last `update_tangent`; the next call overwrites them."""
         p = self._potential
         if self._overwritten and p.all_active:
             self.values.zero_()

@@ -1,4 +1,4 @@
-"""The differentiable solve: minimiser of an incremental potential, with its implicit adjoint."""
+"""Differentiable minimisation of an incremental potential, with an implicit adjoint."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
@@ -22,26 +22,26 @@ from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings, chec
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
-_LEAST_SHARE = 1.0 / 64.0  # smallest load increment of `ramped`
-_REFINEMENTS = 8  # iterations with a float32 factor, after which a float64 factor is used
-_REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: the target, and the largest accepted
+_LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
+_REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
+_REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: target, and limit if rounding prevents the target
 
 
 class Workspace:
     """Buffers, launches and factors for one batch size of a body.
 
     Args:
-        energies: of the body.
+        energies: energies of the body.
         n_vertices: N.
         fixed: (D,) fixed vertices.
-        held: (H,) vertices that are not unknowns: fixed ones, and those that others determine.
+        eliminated: (H,) vertices that are not unknowns: the fixed and the dependent ones.
         pattern: block structure of the Hessian.
-        batch: environments.
-        device: of every buffer.
-        dtype: of states and factors; the potential is evaluated in float64.
+        batch: number of environments.
+        device: device of every buffer.
+        dtype: dtype of states and factors; the potential is evaluated in float64.
 
     Attributes:
-        shards: rows of the batch with their workspaces, if several threads share it; else empty.
+        shards: slices of the batch with a workspace each, if several threads share it, else empty.
     """
 
     def __init__(
@@ -49,17 +49,17 @@ class Workspace:
         energies: Sequence[PlacedEnergy],
         n_vertices: int,
         fixed: NDArray[np.int64],
-        held: NDArray[np.int64],
+        eliminated: NDArray[np.int64],
         pattern: BlockPattern,
         batch: int,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
         self.fixed = torch.as_tensor(fixed, device=device)
-        unknown = torch.as_tensor(held, device=device)
-        self.potential = IncrementalPotential(energies, n_vertices, unknown, batch, device)
+        masked = torch.as_tensor(eliminated, device=device)
+        self.potential = IncrementalPotential(energies, n_vertices, masked, batch, device)
         self.pattern, self.dtype = pattern, dtype
-        self._made: dict[Any, Any] = {}
+        self._cache: dict[Any, Any] = {}
         self.shards: list[Shard] = []
         self._last: torch.Tensor | None = None
 
@@ -68,48 +68,49 @@ class Workspace:
         """The shards, or the whole batch."""
         return self.shards or [(slice(None), self)]
 
-    def reached(self, q: torch.Tensor) -> None:
-        """Stores the positions (B, N, 3) at the end of the last step of the dynamics."""
+    def record_positions(self, q: torch.Tensor) -> None:
+        """Stores the positions (B, N, 3) at the end of a time step, for `follows`."""
         self._last = q.detach()
 
     def follows(self, q: torch.Tensor) -> torch.Tensor | None:
-        """Returns (B,) flags of environments whose step from positions q continues the last one; None for none."""
+        """Returns (B,) whether positions are those at the end of the last time step; None before the first step."""
         return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
 
     def gather(self) -> IncrementalPotential:
-        """Returns the potential of the whole batch, with the shards' latest terms and positions."""
-        for rows, own in self.shards:
-            mine, theirs = self.potential, own.potential
-            pairs: list[tuple[Any, Any]] = [(mine.positions, theirs.positions)]
-            pairs += [(getattr(mine.terms, n), getattr(theirs.terms, n)) for n in ("target", "inertia", "force")]
-            pairs += [(mine.terms.values[name], value) for name, value in theirs.terms.values.items()]
-            for whole, part in pairs:
-                if whole is not None and part is not None:
-                    whole[rows] = part
-        return self.potential
+        """Returns the potential of the whole batch, with the last terms and positions of the shards."""
+        whole = self.potential
+        for rows, shard in self.shards:
+            part = shard.potential
+            pairs: list[tuple[Any, Any]] = [(whole.positions, part.positions)]
+            pairs += [(getattr(whole.terms, n), getattr(part.terms, n)) for n in ("target", "inertia", "force")]
+            pairs += [(whole.terms.values[name], value) for name, value in part.terms.values.items()]
+            for target, source in pairs:
+                if target is not None and source is not None:
+                    target[rows] = source
+        return whole
 
-    def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Returns the object of a key, made at its first use."""
-        if key not in self._made:
-            self._made[key] = make()
-        made: T = self._made[key]
-        return made
+    def cached(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Returns an object of this batch, made at the first use of its key."""
+        if key not in self._cache:
+            self._cache[key] = make()
+        value: T = self._cache[key]
+        return value
 
     def solver(self, purpose: str, settings: SolverSettings) -> NonlinearSolver:
-        """Returns the solver for a purpose (dynamics, statics), which keeps its own factor."""
-        return self.once(
+        """Returns the nonlinear solver for a purpose (dynamics, statics), with its own factor."""
+        return self.cached(
             (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
         )
 
     def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:
         """Returns the exact Hessian, for adjoint solves."""
-        return self.once(
+        return self.cached(
             (linear_solver, dtype),
             lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver, dtype)),
         )
 
     def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:
-        """Returns a new linear solver of the named kind for the Hessian's structure."""
+        """Returns a new linear solver for the Hessian."""
         p, k = self.potential, self.pattern
         return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype, k.positions)
 
@@ -123,26 +124,26 @@ def equilibrium(
     fixed_positions: torch.Tensor,
     follows: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, SolveReport]:
-    """Returns the minimiser x* (B, N, 3) of a step's potential, differentiable in its terms and the fixed positions.
+    """Returns the minimiser (B, N, 3) of a step's potential, differentiable in the terms and fixed positions.
 
     Args:
-        workspace: of the batch.
-        purpose: which of the workspace's solvers; see `Workspace.solver`.
-        settings: of the solver.
-        terms: of the step.
-        start: (B, N, 3) first guess [m], without a gradient; changes the result within the tolerance only.
-        fixed_positions: (B, D, 3) of the fixed vertices [m].
-        follows: see `NonlinearSolver.solve`.
+        workspace: workspace of the batch.
+        purpose: ``dynamics`` or ``statics`` (`Workspace.solver`).
+        settings: settings of the solver.
+        terms: terms of the step.
+        start: (B, N, 3) initial guess [m], without gradient; it affects the result only within the tolerance.
+        fixed_positions: (B, D, 3) positions of the fixed vertices [m].
+        follows: passed to `NonlinearSolver.solve`.
 
     Raises:
-        ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
+        ConvergenceError: an environment did not converge, if `SolverSettings.on_failure` is ``raise``.
     """
     values = {name: terms.values[name] for name in workspace.potential.terms.values}
     names, main = tuple(values), (terms.target, terms.inertia, terms.force)
     tensors = (start, fixed_positions, *main, *values.values())
-    # Forward-mode differentiation goes through the Function too, which refuses it.
-    graded = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors[1:])
-    if graded or forward_ad._current_level >= 0:
+    needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors[1:])
+    # Forward-mode differentiation also calls the function, which raises torch's error for it.
+    if needs_grad or forward_ad._current_level >= 0:
         reports: list[SolveReport] = []
         x: torch.Tensor = _Equilibrium.apply(workspace, purpose, settings, follows, reports, names, *tensors)
         report = reports[0]
@@ -152,15 +153,15 @@ def equilibrium(
     return x, report
 
 
-def ramped(
+def ramp_loads(
     solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
 ) -> torch.Tensor:
-    """Returns the equilibrium (B, N, 3) under all loads, reached from rest by increasing them [m].
+    """Returns the equilibrium (B, N, 3) reached by increasing the loads from zero in steps.
 
     Args:
-        solve: returns the equilibrium under a share of the loads, from a start.
-        rest: (B, N, 3) positions without loads [m].
-        limited: error of the solve with all loads, if a configured iteration limit may be its cause.
+        solve: returns the equilibrium under a fraction of the loads, from an initial guess.
+        rest: (B, N, 3) equilibrium without loads [m].
+        limited: error of the solve with all loads, if a configured limit of iterations may be its cause.
 
     Raises:
         ConvergenceError: no equilibrium was found.
@@ -237,16 +238,14 @@ class _Equilibrium(torch.autograd.Function):
 
         def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
             rows, own, hessians = part
-            return _adjoint(
-                own, hessians, ctx.names, needed, *(_rows(tensor, rows) for tensor in (gradient, x, *saved))
-            )
+            return _adjoint(own, hessians, ctx.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
 
         try:
             with threads_for(gradient[0].numel(), len(parts)):
                 gradients = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
-        return (*([None] * 7), *map(_joined, (None, *saved), zip(*gradients, strict=True)))
+        return (*([None] * 7), *map(_join_gradients, (None, *saved), zip(*gradients, strict=True)))
 
 
 def _solve_shards(
@@ -255,17 +254,17 @@ def _solve_shards(
     settings: SolverSettings,
     follows: torch.Tensor | None,
     names: tuple[str, ...],
-    given: Sequence[torch.Tensor | None],
+    inputs: Sequence[torch.Tensor | None],
 ) -> tuple[torch.Tensor, SolveReport]:
-    """Returns the minimiser and the report of a batch; each shard is solved by its own thread."""
-    tensors = [None if tensor is None else tensor.detach() for tensor in given]
-    # Made here, not in the threads: Warp captures graphs for the whole process.
+    """Returns the minimiser and the report of a batch, with one thread per shard."""
+    tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
+    # Solvers are made here and not in the threads, because Warp captures the launches of all threads.
     parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
 
     def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
         rows, own, solver = part
-        mine = None if follows is None else follows[rows]
-        return _solve(own, solver, mine, names, *(_rows(tensor, rows) for tensor in tensors))
+        own_follows = None if follows is None else follows[rows]
+        return _solve(own, solver, own_follows, names, *(_rows(tensor, rows) for tensor in tensors))
 
     assert tensors[0] is not None
     with threads_for(tensors[0][0].numel(), len(parts)):
@@ -275,16 +274,16 @@ def _solve_shards(
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
-    """Returns the rows of some environments; values shared by all are returned as they are."""
+    """Returns the values of some environments; values shared by all are returned unchanged."""
     return values if values is None or len(values) == 1 else values[rows]
 
 
-def _joined(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:
-    """Returns the gradient of a value from the gradients of the shards: their sum, if the shards share the value."""
-    present = [slope for slope in slopes if slope is not None]
-    if len(present) < 2:
-        return present[0] if present else None
-    return torch.stack(present).sum(0) if value is not None and len(value) == 1 else torch.cat(present)
+def _join_gradients(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:
+    """Returns the gradient by a value from those of the shards: concatenated, or summed if the value is shared."""
+    parts = [slope for slope in slopes if slope is not None]
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    return torch.stack(parts).sum(0) if value is not None and len(value) == 1 else torch.cat(parts)
 
 
 def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
@@ -319,7 +318,7 @@ def _adjoint(
     x: Any,
     *saved: Any,
 ) -> tuple[torch.Tensor | None, ...]:
-    """Returns gradients of the fixed positions and terms, by the equations of `_Equilibrium`."""
+    """Returns the gradients by fixed positions and terms (equations in `_Equilibrium`)."""
     terms = _terms(names, saved)
     potential = workspace.potential
     potential.set_terms(terms)
@@ -328,34 +327,34 @@ def _adjoint(
     z, product = _adjoint_solution(potential, hessians, gradient)
     fixed, target, inertia, force, *values = needed
     slopes = potential.value_adjoint(z) if any(values) else {}
-    of_values: list[torch.Tensor | None] = []
-    for name, wanted in zip(names, values, strict=True):
+    by_values: list[torch.Tensor | None] = []
+    for name, is_needed in zip(names, values, strict=True):
         value, slope = terms.values[name], slopes.get(name)
-        if value is None or slope is None or not wanted:
-            of_values.append(None)
+        if value is None or slope is None or not is_needed:
+            by_values.append(None)
         else:
-            of_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
+            by_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
     return (
         (gradient - product)[:, workspace.fixed] if fixed else None,
         terms.inertia[..., None] * z * potential.free_mask[:, None] if target else None,
         -(z * (x - terms.target)).sum(-1) * potential.free_mask if inertia else None,
         z if force else None,
-        *of_values,
+        *by_values,
     )
 
 
 def _adjoint_solution(
     potential: IncrementalPotential, hessians: Sequence[ExactHessian], gradient: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the adjoint z (B, N, 3) at the potential's positions [m], and its product with the stiffness [N].
+    """Returns the adjoint z (B, N, 3) [m] and its product with the stiffness [N] at the potential's positions.
 
     Args:
-        potential: set to the terms and positions of the solution.
-        hessians: tried in turn; a solution by a float32 factor is refined until it is accurate.
-        gradient: (B, N, 3) of the loss by the positions.
+        potential: potential with the terms and positions of the solution.
+        hessians: Hessians to try in turn; a float32 factor is combined with iterative refinement.
+        gradient: (B, N, 3) gradient of the loss by the positions.
 
     Raises:
-        ConvergenceError: the Hessian is singular, as where a body can turn about its only fixed vertex.
+        ConvergenceError: the Hessian is singular, for example if a body can turn about its only fixed vertex.
     """
     mask = potential.free_mask[:, None]
     right = gradient * mask
@@ -372,7 +371,7 @@ def _adjoint_solution(
             product = potential.stiffness_product(z)
             rest = right - (product + potential.inertia[..., None] * z) * mask
             error = rest.flatten(1).norm(dim=1)
-            # Rounding of the product, too, ends the refinement.
+            # The refinement also ends where rounding of the product prevents progress.
             if bool(((error <= _REFINED * size) | ~(error <= 0.5 * before)).all()):
                 break
             before = error

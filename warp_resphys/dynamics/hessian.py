@@ -17,8 +17,8 @@ class HessianApproximation(ABC):
     """A factorised approximation of the potential's Hessian.
 
     Attributes:
-        clamped: (B,) environments whose matrix is clamped or positive definite by construction; if a line search fails
-            with it, the solve has failed.
+        clamped: (B,) environments whose matrix is positive definite by clamping or by construction; if a line search
+            fails with it, the solve has failed.
         vertex_at: (F,) free vertices in the order of the right-hand sides of `solve_in_place`.
     """
 
@@ -27,34 +27,34 @@ class HessianApproximation(ABC):
 
     @abstractmethod
     def ready(self) -> bool:
-        """Returns whether there is a factor that suits the current terms."""
+        """Whether there is a factor that can be used for the current terms."""
 
     @abstractmethod
     def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
         """Factorises at the potential's positions.
 
         Args:
-            clamp: (B,) environments whose matrix is clamped to be positive definite.
-            active: (B,) environments that get a new factor; the others keep their factor. All by default.
+            clamp: (B,) environments with eigenvalues clamped; None: no environment.
+            active: (B,) environments that get a new factor; the others keep theirs, if any. None: all.
         """
 
     @abstractmethod
     def solve_in_place(self, right: torch.Tensor) -> None:
-        """Overwrites residuals (B, F, 3) [N] at free vertices, in the order of `vertex_at`, by displacements [m]."""
+        """Overwrites residuals (B, F, 3) [N] at the free vertices, ordered as `vertex_at`, with displacements [m]."""
 
 
 class ExactHessian(HessianApproximation):
-    """The exact Hessian, clamped to be positive definite in environments where it is indefinite.
+    """The exact Hessian, clamped to positive eigenvalues in environments where it is indefinite.
 
     Args:
-        potential: gives the Hessian.
+        potential: the potential.
         pattern: block structure of the Hessian.
         linear: solver for that pattern with blocks of 3.
 
     Attributes:
         linear: the solver.
-        assembly: assembly of the Hessian in the solver's layout.
-        exact: whether factors are float64.
+        assembly: assembly in the solver's layout.
+        exact: whether factors are in float64.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -89,7 +89,7 @@ class ExactHessian(HessianApproximation):
         self._factor = self._factor_of(self.assembly(), active=active)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
-        """Returns the factor of assembled values and the low-rank correction."""
+        """Factorises assembled values, with the low-rank correction of the potential."""
         columns = self._potential.low_rank
         columns = None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
         return self.linear.factor(values, definite, columns, None if active is None else ~active, self._factor)
@@ -109,7 +109,7 @@ class ExactHessian(HessianApproximation):
         self._factor.solve_in_place(right.flatten(1))
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m); zero at fixed vertices."""
+        """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m), zero at fixed vertices."""
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
@@ -118,12 +118,12 @@ class ExactHessian(HessianApproximation):
 
 
 class ProjectiveHessian(HessianApproximation):
-    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, the same in each coordinate.
+    """Inertia plus ``(2 mu + lambda) V G G^T`` at every point of the solid, identical for each coordinate.
 
-    Fibres and tendons enter with their stiffness, pressure does not.
+    Fibres and tendons contribute their stiffness, pressure does not contribute.
 
     This is the Hessian of the distances to fixed projections (Bouaziz et al. 2014, equation 10). It does not depend on
-    the positions: one factor is used until inertia or stiffness change, and for the whole batch where these are shared.
+    the positions: a factor is valid until inertia or stiffness change, for the whole batch if these are shared.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -136,7 +136,7 @@ class ProjectiveHessian(HessianApproximation):
         self._factor: Factor | None = None
 
     def _gradient_products(self, points: PointSet) -> torch.Tensor:
-        """Returns scalar products (C, Q, pairs) of the gradients of the node pairs a >= c of every cell."""
+        """Returns the scalar products (C, Q, pairs) of the gradients of every node pair a >= c of a cell."""
         gradients = points.source.gradients
         a, c = np.tril_indices(gradients.shape[2])
         products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
@@ -155,7 +155,7 @@ class ProjectiveHessian(HessianApproximation):
 
     @override
     def refactor(self, clamp: torch.Tensor | None = None, active: torch.Tensor | None = None) -> None:
-        del clamp, active  # The matrix is always positive definite, and is used by later steps.
+        del clamp, active  # The matrix is positive definite and the same for later steps.
         self._key = tuple(t.clone() for t in self._terms())
         inertia, *weights = (t[:1] if bool((t == t[:1]).all()) else t for t in self._key)
         batch = max(len(t) for t in (inertia, *weights))

@@ -1,4 +1,4 @@
-"""Residual of a step and its exact derivative at any positions, for methods with solvers of their own."""
+"""Residual of a step and its exact derivative at any positions, for other methods than the simulator's solvers."""
 
 import math
 from collections.abc import Callable
@@ -21,21 +21,21 @@ from .equilibrium import Workspace
 class Linearisation:
     """The residual g(x) of a step and its Hessian H = dg/dx.
 
-    It uses the buffers of a batch, and is valid until the simulator is used for that batch again.
+    It uses the buffers of a batch, and is valid until the simulator is used again for a batch of that size.
 
     Args:
-        workspace: of the batch.
-        terms: of the step.
-        stage: of the integrator.
-        fixed_positions: (B, D, 3) where the fixed vertices are at the stage [m].
-        coordinates: of the body; forces on dependent vertices act on their control vertices.
-        finish: returns the new state of a solution x.
-        linear_solver: name of the solver that factorises H.
+        workspace: workspace of the batch.
+        terms: terms of the step.
+        stage: stage of the integrator.
+        fixed_positions: (B, D, 3) positions of the fixed vertices at the stage [m].
+        coordinates: coordinates of the body, which eliminate the dependent vertices.
+        finish: maps a solution x to the new state.
+        linear_solver: name of the linear solver.
 
     Attributes:
-        stage: implicit stage of the integrator that x solves.
-        start: (B, N, 3) positions to which inertia alone takes the free vertices, and positions of the fixed ones [m].
-        finish: returns the new state of a solution x.
+        stage: stage of the integrator.
+        start: (B, N, 3) inertial target of the free vertices, positions of the fixed ones [m].
+        finish: maps a solution x to the new state.
         free: (F,) free vertices.
     """
 
@@ -57,28 +57,28 @@ class Linearisation:
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns x with fixed vertices at their positions and dependent ones placed by their control vertices."""
+        """Returns x with the positions of the fixed and the dependent vertices inserted."""
         return self._coordinates.expand(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns g (B, N, 3) at x [N], zero at fixed vertices: the extra force by which the step would end at x."""
+        """Returns g (B, N, 3) at x [N], zero at fixed vertices: the additional force for which x solves the step."""
         self._potential.positions.copy_(x)
         self._potential.evaluate()
         return self._potential.residual.clone()
 
     def factorise(self, x: torch.Tensor) -> None:
-        """Computes H and its factor at x (B, N, 3) [m], for `solve` and `product`."""
+        """Prepares H at x (B, N, 3) [m] for `solve` and `product`."""
         self._potential.positions.copy_(x)
         self._workspace.hessian(self._name).refactor_exact()
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
-        """Returns solutions (B, 3 N, m) of H y = r for right-hand sides (B, 3 N, m); zero at fixed vertices."""
+        """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
         fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
         solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
         return self._coordinates.expand(solution.unflatten(1, (-1, 3))).flatten(1, 2)
 
     def update(self, x: torch.Tensor) -> None:
-        """Computes H at x without a factor, for `product` and `shifted`."""
+        """Prepares H at x for `product` and `shifted`, without a factor."""
         self._potential.positions.copy_(x)
         self._potential.update_tangent()
 
@@ -88,9 +88,9 @@ class Linearisation:
         return (p.stiffness_product(direction) + p.inertia[..., None] * direction) * p.free_mask[:, None]
 
     def shifted(self, scale: float) -> Factor:
-        """Returns a factor of I + scale H on the free vertices, with H clamped where that is not positive definite."""
+        """Returns a factor of I + scale H on the free vertices; H is clamped if this is not positive definite."""
         w, name = self._workspace, self._name
-        shift = w.once(("shifted", name), lambda: _ShiftedHessian(w, name))
+        shift = w.cached(("shifted", name), lambda: _ShiftedHessian(w, name))
         factor = shift(scale)
         if factor.failed.any():
             self._potential.update_tangent(torch.as_tensor(factor.failed, device=self._potential.device))
@@ -99,7 +99,7 @@ class Linearisation:
         return factor
 
     def matrix(self, x: torch.Tensor) -> tuple[scipy.sparse.csc_array, NDArray[np.float64]]:
-        """Returns H (3 F, 3 F) of the first environment on free vertices, and the diagonal inertia (3 F,) [N/m]."""
+        """Returns H (3 F, 3 F) of the first environment on the free vertices, and the inertia (3 F,) in it [N/m]."""
         p, pattern = self._potential, self._workspace.pattern
         self.update(x)
         solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, torch.float64)
@@ -112,7 +112,7 @@ class Linearisation:
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
     def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:
-        """Returns the inertia (3 F, 3 F) in H [N/m], including rigid parts and glued vertices."""
+        """Returns the inertia (3 F, 3 F) in H, including rigid parts and glued vertices [N/m]."""
         whole, diagonal = self.matrix(x)
         if not len(self._coordinates.dependent):
             return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))
@@ -127,8 +127,8 @@ class _ShiftedHessian:
     """Factors of I + scale H on the free vertices of a batch.
 
     Args:
-        workspace: of the batch.
-        linear_solver: name of the solver that factorises.
+        workspace: workspace of the batch.
+        linear_solver: name of the linear solver.
     """
 
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:

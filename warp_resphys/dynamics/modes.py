@@ -14,22 +14,22 @@ from .simulator import Simulator
 
 FloatArray = NDArray[np.float64]
 
-_DENSE = 600  # unknowns above which Lanczos is faster than a dense eigenvalue solver
-_MORE = 6  # extra modes, so that no cluster is cut: a free body has six rigid modes
-_AXES = np.array([1.0, 2.0, 4.0])  # distinct weights of x, y and z, whose pairwise means are distinct too
-_SAME = 1e-4  # relative difference of equal eigenvalues after rounding
-_ZERO = 1e-12  # absolute difference of equal eigenvalues, in units of the largest diagonal entry, for free bodies
+_DENSE = 600  # largest number of unknowns for a dense eigensolver
+_MORE = 6  # modes beyond the count, so that no cluster is cut: a free body has six rigid-body modes
+_AXES = np.array([1.0, 2.0, 4.0])  # weights of x, y and z, with distinct pairwise means
+_SAME = 1e-4  # relative difference up to which eigenvalues count as equal
+_ZERO = 1e-12  # absolute difference for zero eigenvalues, in units of the largest entry
 
 
 def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
-    """Returns orthonormal columns (3 N, count) that span the inertial forces M phi of the slowest vibration modes.
+    """Returns orthonormal columns (3 N, count) that span the inertial forces M phi of the lowest vibration modes.
 
-    The modes phi solve K phi = omega^2 M phi with K the stiffness of the rest shape. They do not depend on rounding:
-    modes of one frequency, such as the two bending modes of a square beam, are aligned with the axes (`resolved`), and
-    if the count cuts such a set, its first modes are taken.
+    The modes phi solve K phi = omega^2 M phi with the stiffness K of the rest shape. They do not depend on rounding:
+    modes of equal frequency, such as the bending modes of a square beam, get a unique basis from
+    `align_degenerate_modes`; if the count cuts a cluster, its first modes are used.
 
     Raises:
-        InputError: count is below one or above the number of free coordinates.
+        InputError: `count` is not between one and the number of free coordinates.
     """
     stiffness, inertia, free = _about_rest(simulator)
     unknowns = inertia.shape[0]
@@ -42,31 +42,33 @@ def vibration_modes(simulator: Simulator, count: int) -> torch.Tensor:
     if unknowns <= max(_DENSE, number):
         values, shapes = scipy.linalg.eigh(scaled.toarray(), subset_by_index=[0, number - 1])
     else:
-        # Lanczos about a shift just below zero, where the matrix of a free body is regular too; fixed start vector.
+        # Lanczos with a shift slightly below zero, where a free body is regular too, and a fixed starting vector.
         below = -1e-8 * float(scaled.diagonal().max())
         values, shapes = scipy.sparse.linalg.eigsh(scaled, number, sigma=below, v0=np.ones(unknowns))
         order = np.argsort(values)
         values, shapes = values[order], shapes[:, order]
     same = _SAME * np.abs(values) + _ZERO * scaled.diagonal().max()
-    shapes = resolved(values, shapes, simulator.body.mesh.vertices[free], same)[:, :count]
-    orthonormal = with_signs(np.linalg.qr(root.T @ shapes)[0])
+    shapes = align_degenerate_modes(values, shapes, simulator.body.mesh.vertices[free], same)[:, :count]
+    orthonormal = fix_signs(np.linalg.qr(root.T @ shapes)[0])
     basis = simulator.rest_positions.new_zeros(simulator.body.n_vertices, 3, count)
     basis[free] = simulator.tensor(orthonormal.reshape(-1, 3, count))
     return basis.flatten(0, 1)
 
 
-def resolved(values: FloatArray, shapes: FloatArray, positions: FloatArray, same: FloatArray | float) -> FloatArray:
-    """Returns orthonormal shapes (3 F, m) in which shapes of equal value are aligned with the axes.
+def align_degenerate_modes(
+    values: FloatArray, shapes: FloatArray, positions: FloatArray, same: FloatArray | float
+) -> FloatArray:
+    """Returns orthonormal shapes (3 F, m) with a unique basis, along the axes, for each set of equal eigenvalues.
 
-    Shapes of equal value have no unique basis, and rounding would choose one. This basis diagonalises a weighted sum of
-    squares. The weights differ by axis, which separates a beam's bending to one side from bending to the other, and
-    grow along the axes, which separates shapes that have equal sums by axis.
+    An eigensolver returns an arbitrary basis of such a set, which depends on rounding. This basis diagonalises a
+    weighted sum of squares. The weights differ by axis, to separate bending in two directions, and grow along the axes,
+    to separate shapes with equal components.
 
     Args:
-        values: (m,) eigenvalues of the shapes, in order.
-        shapes: (3 F, m) orthonormal.
-        positions: (F, 3) of the vertices at rest [m].
-        same: largest difference between neighbouring values that count as equal.
+        values: (m,) eigenvalues, in order.
+        shapes: (3 F, m) orthonormal shapes.
+        positions: (F, 3) rest positions of the vertices [m].
+        same: difference up to which consecutive eigenvalues count as equal.
     """
     place = (positions - positions.min(0)) / np.ptp(positions, axis=0).max()
     weights = (np.exp(2.0 * place) @ _AXES)[:, None] * _AXES
@@ -75,20 +77,20 @@ def resolved(values: FloatArray, shapes: FloatArray, positions: FloatArray, same
     return np.hstack([s @ np.linalg.eigh(s.T @ (weights.reshape(-1, 1) * s))[1] for s in clusters])
 
 
-def with_signs(shapes: FloatArray) -> FloatArray:
-    """Returns columns (n, m) with signs such that the first entry of nearly the largest size is positive."""
+def fix_signs(shapes: FloatArray) -> FloatArray:
+    """Returns columns (n, m) with signs such that the first entry of nearly maximal size is positive."""
     size = np.abs(shapes)
     first = (size > 0.99 * size.max(0)).argmax(0)
     return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
 
 
 def _blocks(inertia: scipy.sparse.csc_array) -> NDArray[np.int64]:
-    """Returns the coordinates (m,) that an inertia matrix couples to others."""
+    """Returns the coordinates (m,) that are coupled by an inertia matrix."""
     return np.flatnonzero(np.diff(inertia.indptr) > 1)
 
 
 def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
-    """Returns the triangular R with R^T R = M; few coordinates are coupled, by rigid parts and glue."""
+    """Returns the triangular R with R^T R = M; only the few coordinates of rigid parts and glue are coupled."""
     coupled, root = _blocks(inertia), scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
     if len(coupled):
         block = inertia[coupled][:, coupled].toarray()
@@ -108,8 +110,8 @@ def _inverse(root: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
 def _about_rest(
     simulator: Simulator,
 ) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, NDArray[np.int64]]:
-    """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] of the F free vertices at rest, and these vertices."""
-    simulator = replace(simulator, dtype=torch.float64)  # The slowest vibrations are below the rounding of float32.
+    """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] at rest, and the F free vertices."""
+    simulator = replace(simulator, dtype=torch.float64)  # The lowest eigenvalues are below the rounding of float32.
     rest = simulator.rest_state()
     elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith("stiffness_damping")})
     linearisation = simulator.linearise(rest, parameters=elastic)
@@ -119,10 +121,10 @@ def _about_rest(
 
 
 class RestStiffness:
-    """Stiffness K of a clamped body at rest: displacements of forces, and forces of displacements.
+    """The stiffness K of a body at rest, and its inverse.
 
     Args:
-        simulator: of a body that is clamped.
+        simulator: simulator of a clamped body.
 
     Raises:
         InputError: the body has no fixed vertices.
@@ -140,13 +142,13 @@ class RestStiffness:
         self._size = 3 * n
 
     def displacements(self, forces: FloatArray) -> FloatArray:
-        """Returns K^-1 f (3 N, m) [m] of forces (3 N, m) [N]; zero at fixed vertices."""
+        """Returns K^-1 f (3 N, m) [m], zero at fixed vertices."""
         out = np.zeros((self._size, forces.shape[1]))
         out[self._dofs] = self._factor.solve((self._map.T @ forces)[self._dofs])
         return np.asarray(self._map @ out)
 
     def forces(self, displacements: FloatArray) -> FloatArray:
-        """Returns K u (3 N, m) [N] of displacements (3 N, m) [m]; zero at fixed vertices."""
+        """Returns K u (3 N, m) [N], zero at fixed vertices."""
         out = np.zeros((self._size, displacements.shape[1]))
         out[self._dofs] = self._matrix @ displacements[self._dofs]
         return out

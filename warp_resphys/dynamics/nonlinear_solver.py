@@ -1,23 +1,24 @@
-"""Solver of an incremental potential: local steps on the points, global steps with a factorised matrix.
+"""Nonlinear solvers for the incremental potential: local steps on the points, global steps with a factorised matrix.
 
-Three solvers differ in the matrix of the global step and share everything else:
+The three solvers differ only in the matrix of the global step:
 
 =======================  ====================================================================================
 ``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al. 2017)
-``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; factorised anew when steps get slow, or
-                         for every iterate where that costs little (multigrid)
+``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; refactorised when convergence is slow,
+                         or for every iterate if that is cheap (multigrid)
 ``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
 =======================  ====================================================================================
 
-An environment of the batch has converged when its residual is at most ``relative_tolerance`` times the norm of the
-balancing forces, inertia and loads. Rounding may leave a larger residual: an environment whose residual has not halved
-in three iterations has also converged if the residual is below its measured change when every coordinate moves by one
-rounding unit. An environment without loads has also converged if its first step is within the rounding of its state.
+An environment has converged when its residual is at most ``relative_tolerance`` times the norm of the balancing forces,
+inertia and loads. Because of rounding, an environment whose residual has not halved in three iterations has also
+converged if the residual is less than its measured change when every coordinate moves by one rounding unit; and an
+environment without loads, if its first step is within the rounding of its state.
 
-Residuals and positions are float64. Factors and pairs may be float32: they change the number of iterations only.
+Residuals and positions are float64. Factors and L-BFGS pairs may be float32, which affects only the number of
+iterations.
 
-Kernels make the decisions for every environment (`minimiser`); the host launches them and factorises, or launches one
-graph that does both.
+Kernels make all decisions for an environment (`minimiser`); the host launches them and factorises, or launches a graph
+that does both.
 """
 
 from collections.abc import Sequence
@@ -40,21 +41,21 @@ FACTORS = ("double", "single")
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings of the solver of a step."""
+    """Settings of the nonlinear solver."""
 
     name: str = "quasi_newton"  # one of `SOLVERS`
-    # residual over balancing forces at which a solve has converged; below 1e-5, float32 states do not get better
+    # residual over balancing forces at which a solve has converged; below 1e-5 no gain for float32 states
     relative_tolerance: float = 1e-8
-    absolute_tolerance: float = 1e-12  # residual below which a solve has converged in any case [N]
-    max_iterations: int = 2000  # after which a solve has failed
-    memory: int = 12  # pairs that L-BFGS keeps
-    refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` factorises anew
+    absolute_tolerance: float = 1e-12  # residual at which a solve has converged in any case [N]
+    max_iterations: int = 2000  # iterations after which a solve has failed
+    memory: int = 12  # number of L-BFGS pairs
+    refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` refactorises
     linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``multigrid``
-    factors: str = "double"  # or ``single``: factors and pairs in float32; residuals and states keep their types
-    on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and go on
+    factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32
+    on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and continue
 
     def __post_init__(self) -> None:
-        """Checks the settings; raises InputError for an unknown name, or a number out of range."""
+        """Raises InputError for an unknown name or a number out of range."""
         if self.name not in SOLVERS:
             raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
         if self.on_failure not in ("raise", "count"):
@@ -76,31 +77,22 @@ class SolverSettings:
 class SolveReport:
     """Outcome of a solve, by environment."""
 
-    iterations: torch.Tensor  # (B,) global steps
+    iterations: torch.Tensor  # (B,) number of global steps
     relative_residual: torch.Tensor  # (B,) last residual over balancing forces
     converged: torch.Tensor  # (B,) bool
-    factorisations: torch.Tensor  # (B,) factorisations of the matrix
+    factorisations: torch.Tensor  # (B,) number of factorisations
 
     @staticmethod
     def of(shards: "Sequence[SolveReport]") -> "SolveReport":
-        """Returns the report of a batch from the reports of its shards."""
+        """Returns the report of a batch from those of its shards."""
         if len(shards) == 1:
             return shards[0]
-        names = [field.name for field in fields(SolveReport)]
+        names = [item.name for item in fields(SolveReport)]
         return SolveReport(*(torch.cat([getattr(report, name) for report in shards]) for name in names))
 
 
 def check_converged(settings: SolverSettings, report: SolveReport, positions: torch.Tensor) -> None:
-    """Raises an error for a failed solve, unless failures are only counted.
-
-    Args:
-        settings: of the solver.
-        report: of the solve.
-        positions: (B, N, 3) at the end of the solve [m].
-
-    Raises:
-        ConvergenceError: an environment did not converge.
-    """
+    """Raises ConvergenceError with the last positions (B, N, 3) if a solve failed and failures are not counted."""
     if settings.on_failure != "raise" or bool(report.converged.all()):
         return
     worst = int((~report.converged).nonzero()[0])
@@ -114,13 +106,13 @@ def check_converged(settings: SolverSettings, report: SolveReport, positions: to
 
 
 class NonlinearSolver:
-    """Minimises a potential repeatedly; keeps factor and buffers between solves.
+    """Minimises a potential repeatedly, with factor and buffers kept between solves.
 
     Args:
-        potential: evaluated at its current terms.
+        potential: the potential.
         pattern: block structure of its Hessian.
-        settings: see `SolverSettings`.
-        dtype: of states.
+        settings: settings of the solver.
+        dtype: dtype of states.
     """
 
     def __init__(
@@ -137,7 +129,7 @@ class NonlinearSolver:
         else:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
-        # An iterative linear solver spends most of a solve on directions, so that a new Hessian costs little.
+        # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
         quasi = 0 if linear.iterates else settings.refactor_after
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
         self._minimiser = Minimiser(
@@ -156,9 +148,9 @@ class NonlinearSolver:
         """Minimises the potential; the solution is in ``potential.positions``.
 
         Args:
-            start: (B, N, 3) positions to which inertia alone would lead, or any guess [m].
-            follows: (B,) environments that continue the step solved last: they start from its extrapolation, with its
-                factor. None for none. Results of the others do not depend on earlier solves.
+            start: (B, N, 3) inertial target, or any initial guess [m].
+            follows: (B,) environments in which this step follows the last solved one: their start is extrapolated and
+                they reuse the factor. None: no environment. Results of the others do not depend on earlier solves.
         """
         self._minimiser.minimise(start, follows)
         return SolveReport(*self._minimiser.outcome())

@@ -1,16 +1,14 @@
-"""Batched, differentiable simulation of one body."""
+"""Batched, differentiable simulation of a body."""
 
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 
 from ..energies.base import Energy
 from ..energies.explicit import ExplicitEnergy
@@ -22,9 +20,7 @@ from ..energies.solid import solids_of
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
-from ..io.files import atomic_hdf5, create
 from ..linalg.threads import shards_of
-from ..mesh.motion_files import write_vtk
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
@@ -32,112 +28,23 @@ from ..stepping.quantity import Quantity
 from ..stepping.state import ImplicitStage, State
 from .assembly import BlockPattern
 from .energy_set import EnergySet
-from .equilibrium import Workspace, equilibrium, ramped
+from .equilibrium import Workspace, equilibrium, ramp_loads
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings
+from .trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
 GRAVITY = (0.0, 0.0, -9.80709)
 _MOST_LENGTHS = 100.0  # largest displacement of an equilibrium, in lengths of the body
 COUPLINGS = ("implicit", "explicit")
-_MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few are enough from a good start
-_NOTHING = Inputs()
-_DEPENDENT = "dependent_"  # prefix of the values of vertices that others determine
+_MOST_ITERATIONS = 100  # of Newton's method for an equilibrium; a few suffice from a good start
+_NO_INPUTS = Inputs()
+_DEPENDENT = "dependent_"  # prefix of the inertia of dependent vertices
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
-Materials = Mapping[str, Any]  # a material, or the materials of regions, by the name of the region or body
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Result of a roll-out."""
-
-    q: torch.Tensor  # (T + 1, B, N, 3) positions, the start included [m]
-    v: torch.Tensor  # (T + 1, B, N, 3) velocities [m/s]
-    reports: list[SolveReport]  # T outcomes of the solver
-    final: State  # last state, the start of a further roll-out
-    body: Body  # the simulated body
-    time_step: float  # [s]
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Times (T + 1,) of the states, from zero [s]."""
-        return self.time_step * np.arange(len(self.q), dtype=np.float64)
-
-    def save(self, path: str | Path) -> Path:
-        """Writes times, positions and velocities, with their units, to an HDF5 file.
-
-        Its datasets are ``times`` (T + 1,), ``q`` and ``v`` (T + 1, B, N, 3) and ``rest`` (N, 3), each with an
-        attribute ``units``.
-
-        Args:
-            path: the file to write; missing folders are made.
-
-        Raises:
-            DataFileError: the file cannot be written.
-        """
-        with atomic_hdf5(path, "trajectory") as file:
-            create(file, "times", self.times, "s")
-            create(file, "q", _array(self.q), "m")
-            create(file, "v", _array(self.v), "m/s")
-            create(file, "rest", self.body.vertices, "m")
-        return Path(path)
-
-    def plot(self, vertices: ArrayLike, axis: str = "z", environment: int = 0, ax: Any = None) -> Any:
-        """Draws the mean displacement of some vertices from their rest position over time.
-
-        Args:
-            vertices: numbers of the vertices, such as those of `select_vertices`; or one number.
-            axis: ``x``, ``y`` or ``z``.
-            environment: index of the environment, 0 to B - 1.
-            ax: matplotlib axes to draw in; a new figure by default.
-
-        Returns:
-            The axes.
-
-        Raises:
-            InputError: an unknown axis, a vertex that the body does not have, or no such environment.
-        """
-        import matplotlib.pyplot as plt
-
-        self._check(environment)
-        chosen, count = np.atleast_1d(np.asarray(vertices, dtype=np.int64)), self.body.n_vertices
-        if axis not in ("x", "y", "z"):
-            raise InputError(f"axis is {axis!r}: choose x, y or z.")
-        if not len(chosen) or chosen.min() < 0 or chosen.max() >= count:
-            raise InputError(f"the vertices to plot must be one or more of 0 to {count - 1}.")
-        moved = (_array(self.q[:, environment]) - self.body.vertices)[:, chosen, "xyz".index(axis)].mean(1)
-        ax = plt.subplots(layout="constrained")[1] if ax is None else ax
-        ax.plot(self.times, 1e3 * moved)
-        ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
-        return ax
-
-    def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
-        """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
-
-        The vertices have ``displacement`` and ``velocity``.
-
-        Args:
-            path: the ``.pvd`` file to write.
-            environment: index of the environment, 0 to B - 1.
-
-        Raises:
-            InputError: no such environment, or another extension.
-            DataFileError: the file cannot be written.
-        """
-        self._check(environment)
-        q, v = (_array(values[:, environment]) for values in (self.q, self.v))
-        return write_vtk(Path(path), self.body.mesh, self.times, q, v, q[:, :0])
-
-    def _check(self, environment: int) -> None:
-        if not 0 <= environment < self.q.shape[1]:
-            raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
-
-
-def _array(values: torch.Tensor) -> NDArray[np.float64]:
-    return np.asarray(values.detach().cpu().numpy(), dtype=np.float64)
+Materials = Mapping[str, Any]  # by name of a region or body: a material, or the materials of its regions
 
 
 def _check_count(name: str, value: object) -> None:
@@ -146,11 +53,7 @@ def _check_count(name: str, value: object) -> None:
 
 
 def _device(name: str | torch.device) -> torch.device:
-    """Returns a device that the kernels run on.
-
-    Raises:
-        InputError: an unknown device, or CUDA without a CUDA device.
-    """
+    """Returns the torch device, or raises InputError for an unknown device or CUDA without a CUDA device."""
     try:
         device = torch.device(name)
     except RuntimeError:
@@ -163,7 +66,7 @@ def _device(name: str | torch.device) -> torch.device:
 
 
 def _flat(materials: Materials) -> dict[str, Material]:
-    """Returns the materials of bodies and of their regions by name, as in ``finger_tip``."""
+    """Returns the materials of bodies and their regions by joined names, such as ``finger_tip``."""
     flat: dict[str, Material] = {}
     for name, material in materials.items():
         own = {"": material} if isinstance(material, Material) else _flat(material)
@@ -172,11 +75,7 @@ def _flat(materials: Materials) -> dict[str, Material]:
 
 
 def _material_of(material: Material | Materials, name: str) -> Material | Materials:
-    """Returns the material of a body by its name; all bodies may have the same.
-
-    Raises:
-        InputError: no material for the body.
-    """
+    """Returns the material of a body, or raises InputError; a single material applies to all bodies."""
     if not name or isinstance(material, Material):
         return material
     if name not in material:
@@ -187,12 +86,12 @@ def _material_of(material: Material | Materials, name: str) -> Material | Materi
 
 @dataclass
 class Simulator:
-    """Steps a body through time.
+    """Simulates a body over time.
 
     Args:
-        body: the body to simulate, or a `fem.scene.Scene` of several bodies.
-        material: one material, or one for each region of the mesh or body of a scene, by name. Every method accepts
-            other values of its constants (``parameters``); the constants of a region or body have its name in front, as
+        body: a body, or a `fem.scene.Scene` of several bodies.
+        material: material of the body, or materials by region of the mesh, or by body of a scene. Methods accept other
+            values of the constants by name (``parameters``); those of a region or body are prefixed with its name, as
             in ``tip_youngs_modulus``.
         time_step: h [s].
         gravity: acceleration (3,) [m/s^2].
@@ -200,21 +99,21 @@ class Simulator:
         solver: a name, or `SolverSettings`.
         relative_tolerance: shorthand for that field of the settings.
         device: a torch device.
-        dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are always evaluated in
-            float64: single precision leaves no correct digit of them in a nearly incompressible solid. From a relative
-            tolerance of 1e-5 on, a float32 step is as accurate as its positions, 4e-9 m on a beam of 0.1 m.
-        coupling: when loads such as pressure are evaluated: ``implicit``, at the end of a step (in its middle for
-            ``midpoint``); or ``explicit``, at its start, as published.
+        dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are evaluated in float64 in
+            both cases, as in single precision those of a nearly incompressible solid have no correct digit. With a
+            relative tolerance of 1e-5 a float32 step is as accurate as its positions, 4e-9 m for a beam of 0.1 m.
+        coupling: time at which loads such as pressure act: ``implicit``, at the end of a step (at its middle for
+            ``midpoint``); or ``explicit``, at its start, as in the publication.
 
     Raises:
-        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or no CUDA device.
+        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a missing CUDA
+            device.
 
     Attributes:
-        parameters: quantities whose values every method accepts, by name: constants of the materials and energies, and
-            ``gravity`` (B, 3).
-        inputs: quantities that act through the body's energies over time, by name.
-        counts: number of values of an input or parameter, without the environments, by name.
-        parts: names of the parts, such as tendons, that a parameter may have values for, by the parameter's name.
+        parameters: parameters by name: constants of the materials and energies, and ``gravity`` (B, 3).
+        inputs: inputs of the energies by name.
+        counts: number of values of an input or a parameter per environment, by name.
+        parts: names of the parts, such as tendons, for which a parameter may have values, by the parameter's name.
         constants: default values of the parameters.
     """
 
@@ -230,7 +129,7 @@ class Simulator:
     coupling: str = "implicit"
 
     def __post_init__(self) -> None:
-        """Checks the arguments and uploads constant data."""
+        """Checks the arguments and builds the energies."""
         if not (np.isfinite(self.time_step) and self.time_step > 0.0):
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
@@ -251,18 +150,17 @@ class Simulator:
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
-        energies = self._place_energies()
-        self._set = EnergySet(energies, body, self.rest_positions, self.method, self.time_step)
-        own = self._set
-        self._held = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # not unknowns of a solve
-        self._pattern = BlockPattern(
-            body.vertices, self._held, [points for placed in energies for points in placed.points]
-        )
-        self.parameters: dict[str, Quantity] = {**own.parameters, "gravity": _GRAVITY}
-        self.constants: dict[str, Any] = {**own.constants, "gravity": [list(self.gravity)]}
-        self.counts = {**own.counts, "gravity": 3}
-        self.inputs, self.parts = own.inputs, own.parts
-        followers = [name for placed in energies if placed.energy.implicit_only for name in placed.input_names]
+        placed = self._place_energies()
+        self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
+        energies = self._set
+        self._eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
+        sets = [points for item in placed for points in item.points]
+        self._pattern = BlockPattern(body.vertices, self._eliminated, sets)
+        self.parameters: dict[str, Quantity] = {**energies.parameters, "gravity": _GRAVITY}
+        self.constants: dict[str, Any] = {**energies.constants, "gravity": [list(self.gravity)]}
+        self.counts = {**energies.counts, "gravity": 3}
+        self.inputs, self.parts = energies.inputs, energies.parts
+        followers = [name for item in placed if item.energy.implicit_only for name in item.input_names]
         if self.coupling == "explicit" and followers:
             raise InputError(
                 f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
@@ -275,51 +173,46 @@ class Simulator:
 
     @property
     def materials(self) -> dict[str, Material]:
-        """Materials by the name of their region or body; an empty name for one material of the whole body."""
+        """Materials by name of region or body; a single material for all has an empty name."""
         return {"": self.material} if isinstance(self.material, Material) else _flat(self.material)
 
     def _place_energies(self) -> list[PlacedEnergy]:
-        """Returns the energies of all bodies: their solids, their rigid parts, and what acts in or on them."""
+        """Returns the energies of all bodies: solids, rigid parts, and the bodies' own energies."""
         whole, placed = self.body, list[PlacedEnergy]()
         for name, body, first in whole.members:
-            begin = f"{name}_" if name else ""
-            material = _material_of(self.material, name)
-            own: list[tuple[Energy, str]] = [(solid, f"{begin}{prefix}") for solid, prefix in solids_of(body, material)]
-            for part in body.controls:
-                own += [(energy, f"{begin}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
-            pairs: list[tuple[Energy, Any, str]] = [
-                (energy, energy.points(body.mesh), prefix) for energy, prefix in own
+            prefix = f"{name}_" if name else ""
+            energies: list[tuple[Energy, str]] = [
+                (solid, f"{prefix}{region}") for solid, region in solids_of(body, _material_of(self.material, name))
             ]
-            acting = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
-            pairs += [(energy, points, begin) for energy, points in acting]
-            placed += [PlacedEnergy.of(whole, body, first, energy, points, prefix) for energy, points, prefix in pairs]
+            for part in body.controls:
+                energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
+            items: list[tuple[Energy, Any, str]] = [(energy, energy.points(body.mesh), own) for energy, own in energies]
+            given = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
+            items += [(energy, points, prefix) for energy, points in given]
+            placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
         if whole.coordinates:
             placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), _DEPENDENT))
         return placed
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Refuses changes, because uploaded data would not follow them.
-
-        Raises:
-            AttributeError: always, once the simulator is built.
-        """
+        """Raises AttributeError once the simulator is built, because device data would not follow a change."""
         if getattr(self, "_built", False):
             raise AttributeError(f"cannot set {name}: a simulator is constant; dataclasses.replace makes another one.")
         object.__setattr__(self, name, value)
 
     def tensor(self, values: object) -> torch.Tensor:
-        """Returns values on the simulator's device, in its type."""
+        """Returns values with the simulator's device and dtype."""
         return torch.as_tensor(values, device=self.device, dtype=self.dtype)
 
     def prepare(self, parameters: Parameters | Constants | None = None) -> Constants:
-        """Turns parameters into stiffness, mass and weight; pass the result to `step` when stepping one by one.
+        """Computes stiffness, mass and weight from parameters; pass the result to `step` to do so only once.
 
         Args:
-            parameters: values that replace the simulator's own, by a name of ``parameters``: numbers, tensors (M,) by
-                element (or chamber), (B, 1) by environment, or (B, M). Prepared constants are returned as they are.
+            parameters: values that replace the defaults, by name: numbers, (M,) tensors with one value per element (or
+                chamber), (B, 1) with one per environment, or (B, M). Prepared constants are returned unchanged.
 
         Raises:
-            InputError: an unknown name, a value out of range, or a number of values other than the number of elements.
+            InputError: an unknown name, a value out of range, or a wrong number of values.
         """
         if isinstance(parameters, Constants):
             return parameters
@@ -339,32 +232,32 @@ class Simulator:
         )
 
     def workspace(self, batch: int) -> Workspace:
-        """Returns the buffers of a batch size, made at their first use."""
+        """Returns the buffers for a batch size, made at their first use."""
         if batch not in self._workspaces:
             workspace = self._make_workspace(batch)
-            rows = shards_of(batch, workspace.potential.device)
-            workspace.shards += [(shard, self._make_workspace(shard.stop - shard.start)) for shard in rows]
+            shards = shards_of(batch, workspace.potential.device)
+            workspace.shards += [(rows, self._make_workspace(rows.stop - rows.start)) for rows in shards]
             self._workspaces[batch] = workspace
         return self._workspaces[batch]
 
     def _make_workspace(self, batch: int) -> Workspace:
         n, fixed = self.body.n_vertices, self.body.fixed_vertices
         return Workspace(
-            self._set.placed, n, fixed, self._held, self._pattern, batch, torch.device(self.device), self.dtype
+            self._set.placed, n, fixed, self._eliminated, self._pattern, batch, torch.device(self.device), self.dtype
         )
 
     def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
-        """The energy with an input of that name, by itself in a given state.
+        """Returns the energy with the named input, for evaluation at given positions.
 
         Raises:
             InputError: no energy of the body has that input.
         """
         if (batch, name) not in self._explicit_energies:
-            acting = [each for each in self._set.placed if name in each.input_names]
-            if not acting:
+            placed = next((item for item in self._set.placed if name in item.input_names), None)
+            if placed is None:
                 accepted = ", ".join(self.inputs) or "none"
                 raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
-            energy, (points,) = acting[0].energy, acting[0].all_points or acting[0].points
+            energy, (points,) = placed.energy, placed.all_points or placed.points
             if energy.implicit_only:
                 raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             device = torch.device(self.device)
@@ -372,11 +265,7 @@ class Simulator:
         return self._explicit_energies[batch, name]
 
     def rest_state(self, batch: int = 1) -> State:
-        """Returns the undeformed body at rest.
-
-        Raises:
-            InputError: the batch is not a whole number of at least one.
-        """
+        """Returns the undeformed body at rest, for a batch of one or more environments."""
         _check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
@@ -385,8 +274,8 @@ class Simulator:
         """Returns a state without memory from arrays or tensors.
 
         Args:
-            q: (B, N, 3) positions, or (N, 3) of a batch of one [m].
-            v: velocities of the same shape; at rest where left out [m/s].
+            q: (B, N, 3) positions, or (N, 3) for a batch of one [m].
+            v: velocities of the same shape; zero if omitted [m/s].
 
         Raises:
             InputError: another shape, or values that are not finite.
@@ -403,28 +292,28 @@ class Simulator:
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
-        Where the state continues the last step, the solver starts from an extrapolation of the steps before it. From
-        other positions the solution is that of a new simulator.
+        If the state has the positions at the end of the last step, the solver starts from an extrapolation of the last
+        steps; otherwise the result is that of a new simulator.
 
         Args:
-            state: start of the step.
-            inputs: loads and actuation during the step.
-            parameters: values that replace the simulator's own (see `prepare`), or prepared constants.
+            state: state at the start.
+            inputs: inputs during the step.
+            parameters: parameters or prepared constants (`prepare`).
 
         Returns:
             The new state, differentiable, and the solver's report.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
-            ConvergenceError: see `nonlinear_solver.SolverSettings.on_failure`.
+            ConvergenceError: the solver failed, if `SolverSettings.on_failure` is ``raise``.
         """
-        inputs = _NOTHING if inputs is None else inputs
+        inputs = _NO_INPUTS if inputs is None else inputs
         constants = self.prepare(parameters)
         self._check(state, inputs, constants)
         return self._advance(state, inputs, constants)
 
     def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport]:
-        """Advances a batch by one time step; the arguments have been checked."""
+        """Advances a batch by one time step, with checked arguments."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms(state, stage, inputs, constants)
@@ -433,24 +322,24 @@ class Simulator:
         x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped, follows)
         x = self._coordinates.expand(x)
         new = self._finish(state, stage, inputs, constants, x)
-        workspace.reached(new.q)
+        workspace.record_positions(new.q)
         return new, report
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
-        """Positions (B, D, 3) of the fixed vertices at the stage [m]."""
+        """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
         now = state.q[:, self.fixed]
         return now if inputs.fixed_positions is None else now + stage.end * (inputs.fixed_positions - now)
 
     def _finish(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor
     ) -> State:
-        """Returns the new state from the stage's solution x (B, N, 3)."""
+        """Returns the new state from the solution x of the stage."""
         new = self.method.finish(state, x, self.time_step)
         memory = self._end_step(state, stage, inputs, constants, x, new.q)
         new = replace(new, memory=memory)
         if stage.end == 1.0 or not len(self.fixed):
             return new
-        # A prescribed motion has a velocity of its own; extrapolated from mid-step it would ring.
+        # Prescribed motions have a known velocity; extrapolation from mid-step would oscillate.
         now = state.q[:, self.fixed]
         moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
         return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
@@ -458,36 +347,36 @@ class Simulator:
     def _end_step(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor, q: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """Returns the energies' memory after a step with the solution x and the new positions q."""
+        """Returns the memory variables after a step with solution x and final positions q."""
         terms = self.workspace(state.batch).potential.energies
         return self._set.end_step(state, stage, inputs, constants, terms, x, q)
 
     def remember(self, state: State, q: torch.Tensor, constants: Constants) -> State:
-        """Returns the state at given positions, with the energies' memory of a step that ends there.
+        """Returns a state at given positions, with the memory variables after a step to these positions.
 
         Args:
-            state: start of the step.
+            state: state at the start of the step.
             q: (B, N, 3) positions at its end [m].
-            constants: from `prepare`.
+            constants: constants from `prepare`.
         """
         stage = self.method.stage(state, self.time_step)
         x = self.method.solution_for(state, q)
-        return State(q, state.v, memory=self._end_step(state, stage, _NOTHING, constants, x, q))
+        return State(q, state.v, memory=self._end_step(state, stage, _NO_INPUTS, constants, x, q))
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> Linearisation:
-        """Returns the residual of a step and its derivative, to be evaluated at any positions.
+        """Returns the residual of a step and its derivative at any positions.
 
         Args:
-            state: start of the step.
-            inputs: loads and actuation during the step.
-            parameters: see `prepare`.
+            state: state at the start of the step.
+            inputs: inputs during the step.
+            parameters: parameters or prepared constants (`prepare`).
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
         """
-        inputs = _NOTHING if inputs is None else inputs
+        inputs = _NO_INPUTS if inputs is None else inputs
         constants = self.prepare(parameters)
         self._check(state, inputs, constants)
         stage = self.method.stage(state, self.time_step)
@@ -502,18 +391,18 @@ class Simulator:
         )
 
     def _terms(self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants) -> StepTerms:
-        """Returns the terms of a step's incremental potential, differentiable in state, inputs and constants."""
+        """Returns the terms of a step's incremental potential, differentiable."""
         batch, h = state.batch, stage.step
-        # Mass damping is linear in x: it joins inertia and moves the target.
+        # Mass damping is linear in x, so it is merged with inertia and target.
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
         mass, force = constants.mass, self._loads(inputs, constants, batch)
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         energies = self.workspace(batch).potential.energies
-        values = self._set.acting(constants, inputs, batch)
+        values = self._set.values(constants, inputs, batch)
         values |= self._set.begin_step(state, stage, inputs, constants, energies)
         if self.coupling == "explicit":
-            for name in (name for placed in self._set.placed if placed.energy.is_load for name in placed.input_names):
+            for name in (name for item in self._set.placed if item.energy.is_load for name in item.input_names):
                 value = values[name]
                 assert value is not None
                 force = force + self.explicit_energy(name, batch).force(state.q, value)
@@ -527,16 +416,16 @@ class Simulator:
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
     def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool = False) -> torch.Tensor:
-        """Loads (1 or B, N, 3): gravity, external force and the loads of the energies [N]."""
+        """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
         mass = constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
-        weight = mass[..., None] * constants.gravity[:, None]
+        force = mass[..., None] * constants.gravity[:, None]
         if inputs.external_force is not None:
-            weight = weight + inputs.external_force
+            force = force + inputs.external_force
         for load in self._set.loads(constants, inputs, batch, static):
-            weight = weight + load
-        return weight
+            force = force + load
+        return force
 
     def static_equilibrium(
         self,
@@ -545,26 +434,26 @@ class Simulator:
         start: torch.Tensor | None = None,
         batch: int | None = None,
     ) -> State:
-        """Returns the equilibrium under gravity and constant inputs, differentiable like a step.
+        """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
 
         Args:
-            inputs: loads and actuation.
-            parameters: see `prepare`.
-            start: (B, N, 3) first guess [m]; the rest shape by default. If Newton's method does not converge from it in
-                100 iterations, loads, inputs and motion of the clamp are increased step by step.
-            batch: number of environments, if it does not follow from another argument.
+            inputs: constant inputs.
+            parameters: parameters or prepared constants (`prepare`).
+            start: (B, N, 3) initial guess [m]; the rest shape if omitted. If Newton's method does not converge from it
+                in 100 iterations, loads, inputs and motion of the fixed vertices are increased in steps.
+            batch: number of environments, if no other argument implies it.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
-            ConvergenceError: no equilibrium was found, or the body grows without limit, as under a pressure that its
-                material cannot hold.
+            ConvergenceError: no equilibrium was found, or the body grows without bound, like an inflated one whose
+                material cannot resist the pressure.
         """
         if not len(self.fixed):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
-        inputs = _NOTHING if inputs is None else inputs
+        inputs = _NO_INPUTS if inputs is None else inputs
         constants = self.prepare(parameters)
-        given = [*inputs.fields.values(), *([] if start is None else [start])]
         if batch is None:
+            given = [*inputs.fields.values(), *([] if start is None else [start])]
             batch = max([len(t) for t in given] + [constants.batch])
         state = self.rest_state(batch)
         self._check(state, inputs, constants)
@@ -574,14 +463,14 @@ class Simulator:
         try:
             x, report = solve(1.0, state.q if start is None else start.detach())
         except ConvergenceError as error:
-            log.debug("the equilibrium is computed under gradually increasing loads: %s", error)
+            log.info("retrying the equilibrium with loads increased in steps: %s", error)
             with torch.no_grad():
                 limited = self.settings.max_iterations < _MOST_ITERATIONS
-                near = ramped(lambda share, at: solve(share, at)[0], state.q, error if limited else None)
+                near = ramp_loads(lambda share, at: solve(share, at)[0], state.q, error if limited else None)
             x, report = solve(1.0, near)
         lengths = self.rest_positions.amax(0) - self.rest_positions.amin(0)
-        furthest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)
-        if bool((grown := ~(furthest < _MOST_LENGTHS * float(lengths.max()))).any()):
+        largest = (x.detach() - self.rest_positions).abs().flatten(1).amax(1)
+        if bool((grown := ~(largest < _MOST_LENGTHS * float(lengths.max()))).any()):
             report = replace(report, converged=report.converged & ~grown)
             raise ConvergenceError(
                 f"{int(grown.sum())} of {batch} bodies have no equilibrium under these loads: they grow to more than "
@@ -594,9 +483,9 @@ class Simulator:
     def _balance(
         self, inputs: Inputs, constants: Constants, rest: torch.Tensor, share: float, start: torch.Tensor
     ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) under a share of all loads, inputs and motion of the clamp [m]."""
+        """Returns the equilibrium (B, N, 3) under a fraction of all loads, inputs and motion of the clamp [m]."""
         batch = len(rest)
-        values = self._set.acting(constants, inputs, batch)
+        values = self._set.values(constants, inputs, batch)
         for name in self.inputs:
             value = values[name]
             values[name] = None if value is None else share * value
@@ -621,40 +510,40 @@ class Simulator:
         inputs: Inputs | None = None,
         parameters: Parameters | Constants | None = None,
     ) -> Trajectory:
-        """Returns the trajectory of many steps.
+        """Simulates several time steps.
 
-        Memory grows by the states and terms of each step, never by factors: the adjoint of a step rebuilds its Hessian
-        from the step's end.
+        For the gradient, states and terms of each step are kept, but no factors: the adjoint of a step recomputes its
+        Hessian from the final state of the step.
 
         Args:
-            state: start of the roll-out.
-            steps: T.
-            inputs: constant over all steps, or with a time axis T.
-            parameters: see `prepare`.
+            state: initial state.
+            steps: number of steps T.
+            inputs: inputs, constant or with a time axis.
+            parameters: parameters or prepared constants (`prepare`).
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
-            ConvergenceError: see `step`.
+            ConvergenceError: as in `step`.
         """
         _check_count("steps", steps)
-        inputs = _NOTHING if inputs is None else inputs
+        inputs = _NO_INPUTS if inputs is None else inputs
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
         states, reports = [state], []
         for t in range(steps):
-            acting = inputs.at(t)
+            current = inputs.at(t)
             if t == 0:
-                self._check(state, acting, constants)
-            elif acting is not inputs:
-                self._check_inputs(acting, state.batch)
-            state, report = self._advance(state, acting, constants)
+                self._check(state, current, constants)
+            elif current is not inputs:
+                self._check_inputs(current, state.batch)
+            state, report = self._advance(state, current, constants)
             states.append(state)
             reports.append(report)
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
         return Trajectory(q, v, reports, state, self.body, self.time_step)
 
     def _check(self, state: State, inputs: Inputs, constants: Constants) -> None:
-        """Raises an InputError for the first argument that cannot be simulated."""
+        """Raises InputError for a state, inputs or constants that do not fit."""
         batch, n, like = state.batch, self.body.n_vertices, self.rest_positions
         fields = {"state.q": state.q, "state.v": state.v}
         if state.previous is not None:
@@ -668,7 +557,7 @@ class Simulator:
         self._set.check_memory(state.memory, batch, like)
 
     def _check_inputs(self, inputs: Inputs, batch: int) -> None:
-        """Raises an InputError for the first input that cannot be simulated."""
+        """Raises InputError for inputs that do not fit."""
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
         accepted = {name: (quantity, self.counts[name]) for name, quantity in self.inputs.items()}

@@ -1,6 +1,6 @@
-"""Roll-outs on a Warp tape, as an alternative to gradients by ``torch.autograd``.
+"""Roll-outs on a Warp tape, with the same gradients as ``torch.autograd``.
 
-A recorded roll-out is part of a tape with the user's kernels, and ``tape.backward`` differentiates all of it::
+A recorded roll-out can be combined with other kernels on a tape; ``tape.backward`` differentiates all of them::
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])
@@ -8,8 +8,8 @@ A recorded roll-out is part of a tape with the user's kernels, and ``tape.backwa
         wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
     tape.backward(value)
 
-Nothing is copied: torch uses the memory of the arrays that are passed, and the arrays that are returned use
-torch's. A step keeps only its states for its adjoint, as with torch.
+Nothing is copied: torch uses the memory of the input arrays, and the result arrays use torch's memory. As with torch, a
+step keeps only its states and terms for the adjoint.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,9 +35,9 @@ _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 class RecordedRollout:
     """Result of a recorded roll-out."""
 
-    q: wp.array  # (T + 1, B, N) vec3 positions, the start included [m]
+    q: wp.array  # (T + 1, B, N) vec3 positions, including the start [m]
     v: wp.array  # (T + 1, B, N) vec3 velocities [m/s]
-    reports: list[SolveReport]  # T outcomes of the solver
+    reports: list[SolveReport]  # T solver reports
 
 
 def record_rollout(
@@ -51,42 +51,40 @@ def record_rollout(
     inputs: Mapping[str, wp.array] | None = None,
     parameters: Mapping[str, wp.array] | None = None,
 ) -> RecordedRollout:
-    """Returns a roll-out, recorded on a tape for differentiation.
+    """Simulates several time steps and records their adjoint on a tape.
 
-    Gradients are added to the ``grad`` of every array given that requires gradients. As for Warp's own
-    kernels, the arrays must keep their values until ``tape.backward``, which reads the gradients of the
-    results and sets them to zero unless ``retain_grad`` is set. It may be called again.
+    Gradients are added to the ``grad`` of every input array that requires gradients. As for Warp's kernels, the arrays
+    must keep their values until ``tape.backward``, which reads the gradients of the results and sets them to zero
+    unless they are retained. It may be called repeatedly.
 
     Args:
-        tape: entered by the caller or not.
-        simulator: its device and type must be those of every array.
+        tape: a tape, active or not.
+        simulator: the simulator; every array must have its device and dtype.
         q: (B, N) vec3 positions [m]; Prony branches start relaxed.
         v: (B, N) vec3 velocities [m/s].
-        steps: T.
+        steps: number of steps T.
         previous: (q, v) one step earlier, to continue a roll-out by BDF2: its ``(q[-2], v[-2])``.
-        inputs: arrays by a name of `Inputs`: ``external_force`` (B, N) vec3 [N], ``fixed_positions`` (B, D) vec3 [m],
-            ``attached_mass`` (B, N) [kg], and the inputs of the body's energies (B, n). All but the masses may have a
-            time axis T in front.
-        parameters: values that replace the simulator's, by a name of ``simulator.parameters``, shaped as for
-            `Simulator.prepare`.
+        inputs: inputs by name: ``external_force`` (B, N) vec3 [N], ``fixed_positions`` (B, D) vec3 [m],
+            ``attached_mass`` (B, N) [kg], and those of the energies (B, n); all but the masses may have a leading time
+            axis T.
+        parameters: parameters by name, with shapes as in `Simulator.prepare`.
 
     Raises:
-        InputError: an unknown parameter, an array of another type or device than the simulator's, wrong
-            shapes, or values that are not finite.
-        ConvergenceError: see `Simulator.step`.
+        InputError: an unknown parameter, a wrong dtype, device or shape, or values that are not finite.
+        ConvergenceError: as in `Simulator.step`.
     """
     leaves = _Leaves(simulator)
     back = None
     if previous is not None:
         back = leaves.vectors("previous q", previous[0]), leaves.vectors("previous v", previous[1])
     state = State(leaves.vectors("q", q), leaves.vectors("v", v), back)
-    acting = {
+    fields = {
         name: (leaves.vectors if name in _VECTOR_INPUTS else leaves.scalars)(name, array)
         for name, array in (inputs or {}).items()
     }
     values = {name: leaves.scalars(name, array) for name, array in (parameters or {}).items()}
     with leaves.stream(), torch.enable_grad():
-        trajectory = simulator.rollout(state, steps, Inputs(**acting), values)
+        trajectory = simulator.rollout(state, steps, Inputs(**fields), values)
     results = [trajectory.q, trajectory.v]
     arrays = [leaves.result(tensor) for tensor in results]
     if leaves.pairs:
@@ -126,19 +124,18 @@ class _Leaves:
         return leaf
 
     def result(self, tensor: torch.Tensor) -> wp.array:
-        """Returns an array of vec3 on the memory of a tensor of the graph."""
-        dtype = _VECTORS[self.dtype]
-        array = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=bool(self.pairs))
+        """Returns the array of vec3 on the memory of a result tensor."""
+        array = wp.from_torch(tensor.detach(), dtype=_VECTORS[self.dtype], requires_grad=bool(self.pairs))
         return cast(wp.array, array)
 
     def stream(self) -> AbstractContextManager[object]:
-        """Makes torch work on Warp's stream, so that neither overtakes the other."""
+        """Returns a context in which torch uses Warp's stream, so that their operations are ordered."""
         if self.device.type == "cpu":
             return nullcontext()
         return torch.cuda.stream(wp.stream_to_torch(self._warp_device))
 
     def backward(self, results: list[torch.Tensor], arrays: list[wp.array]) -> Callable[[], None]:
-        """Returns the function that adds the gradients of the results to the arrays of the leaves."""
+        """Returns the function that propagates the gradients of the results to the leaves."""
 
         def differentiate() -> None:
             with self.stream():

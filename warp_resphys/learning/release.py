@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from ..data.observation import Observation
 from ..data.trials import Trials
-from ..dynamics.modes import resolved, vibration_modes, with_signs
+from ..dynamics.modes import align_degenerate_modes, fix_signs, vibration_modes
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
 from ..linalg.least_squares import Move, Point, Problem, damped, minimise
@@ -220,7 +220,7 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
             size *= _SIDEWAYS_STRAIN * extent / float(bent.norm(dim=2).max())
     # From the softest direction to the stiffest; a relative difference below 0.01 is within the solver's tolerance.
     _, sizes, rows = np.linalg.svd(bent.flatten(1).double().cpu().numpy(), full_matrices=False)
-    columns = with_signs(resolved(sizes, rows.T, simulator.body.mesh.vertices, 0.01 * sizes))
+    columns = fix_signs(align_degenerate_modes(sizes, rows.T, simulator.body.mesh.vertices, 0.01 * sizes))
     shapes = simulator.tensor(columns.T).unflatten(1, (-1, 3))
     furthest = shapes.norm(dim=2).amax(1)
     reach = simulator.tensor(sizes) * furthest

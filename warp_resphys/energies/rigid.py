@@ -207,8 +207,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
 
 def _moments(mesh: Mesh, cells: NDArray[np.int64], corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Returns the integral (4, 4) of w w^T over cells, with barycentric coordinates w, and their volume [m^3]."""
-    simplex = mesh.element.faces.shape[1] in (3, 6)
-    points, weights = conical_simplex(4) if simplex else gauss_box(4)
+    points, weights = conical_simplex(4) if mesh.element.is_simplex else gauss_box(4)
     values, reference = mesh.element.shape(points)
     _, determinants = physical_gradients(mesh.vertices, mesh.cells[cells], reference)
     volumes = (determinants * weights).ravel()

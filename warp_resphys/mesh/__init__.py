@@ -1,4 +1,4 @@
-"""Rest shapes: meshes, their readers and quality, surfaces, chambers, and pneumatic arms of given measures.
+"""Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms.
 
-From outside: `mesh.Mesh` and its boxes, `readers.read_mesh`, `chambers.find_chambers`, `arm.mesh_arm`.
+Public: `mesh.Mesh` and its boxes, `readers.read_mesh`, `chambers.find_chambers`, `arm.mesh_arm`.
 """

@@ -1,7 +1,6 @@
 """Meshes of parametric pneumatic arms.
 
-An arm is clamped at z = 0 and hangs along -z. `mesh_arm` fills it with hexahedra, which takes no other program, or with
-tetrahedra, which gmsh makes.
+An arm is clamped at z = 0 and hangs along -z. `mesh_arm` fills it with hexahedra, or with tetrahedra by gmsh.
 """
 
 from math import pi
@@ -16,7 +15,7 @@ from .chambers import find_chambers
 from .mesh import IntArray, Mesh, boundary_faces, check_mesh
 
 CELLS = ("hexahedra", "tetrahedra")
-_SLENDER = 2.5  # height of a layer of hexahedra over their size in the section, where it is not given
+_SLENDER = 2.5  # default height of a layer of hexahedra over their size in the section
 _MOST_CELLS = 2_000_000
 
 
@@ -25,23 +24,23 @@ def mesh_arm(
 ) -> tuple[Mesh, dict[str, IntArray]]:
     """Meshes an arm.
 
-    Hexahedra are blocks of quadrilaterals, swept along the arm: every wall is at least one element thick, and the
-    corners of the chambers are kept. Polygons stand for the curves, of the same area, so that even coarse chambers have
-    their volume; on coarse meshes their corners therefore lie outside the curves by up to a fifteenth of the radius.
+    Hexahedra are blocks of quadrilaterals swept along the arm: every wall is at least one element thick, and the
+    corners of the chambers are preserved. Curves are replaced by polygons of the same area, so that even coarse
+    chambers have the correct volume; their corners lie outside the curves by up to a fifteenth of the radius.
 
     Args:
         geometry: the arm.
-        size: of the elements [m]; for hexahedra, a length of the edges in the section that is aimed at on average,
-            for walls, flat sides and arcs each.
+        size: element size [m]; for hexahedra, the average edge length in the section, for walls, flat sides and arcs
+            separately.
         cells: "hexahedra" or "tetrahedra" (4-node; `mesh.quadratic` adds the midpoints).
-        layers: height of the layers of hexahedra [m]; None: 2.5 times the size, as the arm is slender.
+        layers: height of the layers of hexahedra [m]; None: 2.5 times the size.
 
     Returns:
-        The mesh, its vertices numbered from the base to the tip, and its surfaces by name, as from `name_surfaces`.
+        The mesh, with vertices numbered from the base to the tip, and its surfaces by name (`name_surfaces`).
 
     Raises:
-        MeshError: a size is not positive or would give millions of cells; rotated segments are to be meshed with
-            hexahedra; or gmsh, which makes tetrahedra, is not installed or fails.
+        MeshError: a size that is not positive or would give millions of cells; hexahedra for rotated segments; a
+            missing or failing gmsh.
     """
     if cells not in CELLS:
         raise MeshError(f"the arm's cells are {cells!r}: choose {' or '.join(CELLS)}.")
@@ -58,11 +57,11 @@ def mesh_arm(
 
 
 def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
-    """The surfaces of an arm that hangs along -z.
+    """Returns the surfaces of an arm that hangs along -z, by name.
 
     Returns:
-        (F, 3 | 4 | 6) faces as `mesh.boundary_faces` gives them: ``base`` and ``tip`` on the planes of the highest and
-        the lowest vertices, ``chamber_1`` and so on as `chambers.find_chambers` numbers them, ``outside``, the rest.
+        (F, 3 | 4 | 6) faces as from `mesh.boundary_faces`: ``base`` and ``tip`` in the planes of the highest and lowest
+        vertices, ``chamber_1`` and so on as from `chambers.find_chambers`, and ``outside``, the rest.
     """
     faces = boundary_faces(mesh)
     heights = mesh.vertices[:, 2]
@@ -72,17 +71,13 @@ def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
         "tip": np.all(heights[faces] < heights.min() + tolerance, axis=1),
     }
     chambers = {chamber.name: chamber.faces for chamber in find_chambers(mesh)}
-    inner = (
-        np.concatenate([np.unique(vertices) for vertices in chambers.values()])
-        if chambers
-        else np.empty(0, dtype=np.int64)
-    )
-    outside = ~(surfaces["base"] | surfaces["tip"] | np.isin(faces[:, 0], inner))
+    inner = [own.ravel() for own in chambers.values()]
+    outside = ~(surfaces["base"] | surfaces["tip"] | np.isin(faces[:, 0], np.concatenate([*inner, faces[:0, 0]])))
     return {**{name: faces[chosen] for name, chosen in surfaces.items()}, "outside": faces[outside], **chambers}
 
 
 def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
-    """Sweeps the section along the arm; quadrilaterals in a chamber are left out between its ends."""
+    """Sweeps the section along the arm, without the quadrilaterals inside chambers."""
     if len({angle % (360.0 / geometry.chambers) for angle in geometry.rotations}) > 1:
         raise MeshError(
             "segments that are rotated against each other cannot be swept: set the arm's cells to tetrahedra."
@@ -97,7 +92,7 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
         )
     grids, chamber = section_grids(middle, divisions)
     place, quads = section_quadrilaterals(grids)
-    solid = np.concatenate([quad for quad, number in zip(quads, chamber, strict=True) if number == SOLID])
+    solid = np.concatenate([block for block, number in zip(quads, chamber, strict=True) if number == SOLID])
     full = np.concatenate(quads)
     turn = np.exp(1j * pi / 180.0 * (geometry.rotations[0] if geometry.rotations else 0.0))
     heights = np.concatenate(
@@ -110,7 +105,7 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
         vertices[level] = np.stack([points.real, points.imag, np.full(len(points), height)], axis=1)
     cells = []
     for level, part in enumerate(np.repeat(np.arange(len(counts)), counts)):
-        upper = len(place) * level + (full if part % 2 == 0 else solid)  # caps and chambers take turns
+        upper = len(place) * level + (full if part % 2 == 0 else solid)  # caps and chambers alternate
         cells.append(np.concatenate([upper + len(place), upper], axis=1))
     used, numbered = np.unique(np.concatenate(cells), return_inverse=True)
     return Mesh(vertices.reshape(-1, 3)[used], numbered.reshape(-1, 8))

@@ -1,4 +1,4 @@
-"""Measures of pneumatic arms: segments in a row, each with closed chambers around the axis."""
+"""Dimensions of pneumatic arms: segments in series, each with closed chambers around the axis."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,36 +12,39 @@ from .arm_section import Section
 
 _PROFILES = ("half_disc", "disc", "sector")
 _OUTLINES = ("lobed", "round")
-_MOST_CHAMBERS = 8  # in a segment
+_MOST_CHAMBERS = 8  # per segment
 
 
 @dataclass(frozen=True)
 class ArmGeometry:
-    """Measures of a pneumatic arm; those of SoPrA (Toshimitsu et al. 2021) by default.
+    """Dimensions of a pneumatic arm; defaults are those of SoPrA (Toshimitsu et al. 2021).
 
-    From the base on, the arm is a cap, the chambers of a segment, a cap, and so on, and ends with a cap. It tapers
-    evenly along chambers; caps are cylinders.
+    From base to tip, solid caps alternate with the chambers of a segment, beginning and ending with a cap. The arm
+    tapers linearly along chambers; caps are cylinders.
 
     Raises:
-        MeshError: a measure is not positive, numbers of measures do not fit, or the chambers do not.
+        MeshError: a dimension that is not positive, sequences of inconsistent length, or chambers that do not fit.
     """
 
-    chamber_lengths: Sequence[float] = (0.120, 0.120)  # of each segment [m]
-    # heights of the solid parts before, between and after the chambers [m]; one more than there are segments
-    caps: Sequence[float] = (0.010, 0.021, 0.005)
-    # of the outline, where it is farthest from the axis, before the first chambers and after those of each segment [m]
+    chamber_lengths: Sequence[float] = (0.120, 0.120)  # length of the chambers of each segment [m]
+    caps: Sequence[float] = (0.010, 0.021, 0.005)  # heights of the solid caps [m]; one more than segments
+    # largest radius of the outline before the first chambers and after those of each segment [m]
     radii: Sequence[float] = (0.0283923, 0.0212942, 0.0165622)
-    chambers: int = 3  # of each segment, 2 to 8
-    profile: str = "half_disc"  # of a chamber: this, its flat side towards the axis; disc; or sector of an annulus
-    outline: str = "lobed"  # around each chamber, at the distance of the wall; or round, a circle
-    wall: float = 0.004  # between a chamber and the outline [m]
-    web: float = 0.004  # between neighbouring chambers, where they are closest [m]
-    core: float | None = None  # between axis and chambers at the base [m], shrinks with the radius; None: the least
-    # of each segment's chambers about the axis [degrees], counter-clockwise seen from the base; empty: in line with +x
+    chambers: int = 3  # chambers per segment, 2 to 8
+    profile: str = (
+        "half_disc"  # of a chamber: half_disc, with the flat side towards the axis; disc; sector of an annulus
+    )
+    outline: str = "lobed"  # lobed, parallel to each chamber at the distance `wall`; or round, a circle
+    wall: float = 0.004  # thickness between a chamber and the outline [m]
+    web: float = 0.004  # smallest thickness between neighbouring chambers [m]
+    core: float | None = (
+        None  # distance of the chambers from the axis at the base [m], scales with the radius; None: min
+    )
+    # rotation of each segment's chambers about the axis [deg], counter-clockwise seen from the base; empty: none
     rotations: Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        """Check all measures, and store sequences as tuples."""
+        """Checks all dimensions, and stores sequences as tuples."""
         for name in ("chamber_lengths", "caps", "radii", "rotations"):
             object.__setattr__(self, name, numbers(name, getattr(self, name), positive=name != "rotations"))
         count = len(self.chamber_lengths)
@@ -69,34 +72,30 @@ class ArmGeometry:
 
     @property
     def length(self) -> float:
-        """From the base to the tip [m]."""
+        """Length from base to tip [m]."""
         return float(sum(self.chamber_lengths) + sum(self.caps))
 
     @property
     def stations(self) -> tuple[float, ...]:
-        """Heights where caps and chambers begin and end, from the base's 0 down to the tip [m]; an even number."""
+        """Heights of the ends of caps and chambers, from 0 at the base down to the tip [m]; an even number."""
         parts = [self.caps[0]]
         for chamber, cap in zip(self.chamber_lengths, self.caps[1:], strict=True):
             parts += [chamber, cap]
         return (0.0, *(-np.cumsum(parts)).tolist())
 
     def section(self, radius: float) -> Section:
-        """The cross-section where the outline has a radius [m], not rotated."""
+        """Returns the unrotated cross-section with a given outline radius [m]."""
         core = None if self.core is None else self.core * radius / self.radii[0]
         return Section(radius, self.chambers, self.profile, self.outline, self.wall, self.web, core)
 
     def radius_at(self, height: float) -> float:
-        """The radius of the outline at a height [m], 0 at the base and negative below it."""
+        """Returns the radius of the outline at a height [m], which is 0 at the base and negative below."""
         ends = np.array(self.stations[1:-1])
         return float(np.interp(-height, -ends, np.repeat(self.radii, 2)[1:-1]))
 
 
 def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[float, ...]:
-    """The numbers of a measure as a tuple.
-
-    Raises:
-        MeshError: a measure is not finite or not positive.
-    """
+    """Returns a dimension as a tuple, or raises MeshError for values that are not finite or not positive."""
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise MeshError(f"the arm's {name} are {given!r}: give a list of numbers.")
     for value in given:

@@ -1,10 +1,10 @@
-"""Cross-sections of pneumatic arms: their outlines, and blocks of quadrilaterals that fill them.
+"""Cross-sections of pneumatic arms: outlines, and blocks of quadrilaterals that fill them.
 
-Points of a section are complex numbers, x + iy [m]. Chamber 1 lies towards +x; the others follow counter-clockwise.
+Points of a section are complex numbers, x + iy [m]. Chamber 1 is towards +x; the others follow counter-clockwise.
 
-A mesh has polygons in place of the curves. With corners on the curves, a coarse chamber would be too small by a tenth,
-and pressure would bend the arm as much less. So points on arcs are moved away from the arc's centre, by such a share of
-their distance that the polygon has the area of the curve that it stands for (`Section.growth`).
+A mesh replaces curves by polygons. With corners on the curves, a coarse chamber would be too small by a tenth, and the
+arm would bend less under pressure. So points on arcs are moved away from the arc's centre, by a fraction of the radius
+for which the polygon has the area of the curve (`Section.growth`).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,13 +21,13 @@ from ..io.errors import MeshError
 
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
-Edge = tuple[str, str]  # names of its ends, in the order of the alphabet where it is a key
+Edge = tuple[str, str]  # names of the ends, in alphabetical order if used as a key
 Divisions = Mapping[Edge, int]
-Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and the chamber's wedge
+Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and index of the wedge
 
-SOLID = -1  # instead of the number of a chamber
-_LEAST_ROOM = 0.1  # that a chamber takes of the radius
-_LARGEST_TURN = 1.15  # of an arc for which one straight edge stands [rad]
+SOLID = -1  # replaces the number of a chamber
+_LEAST_ROOM = 0.1  # smallest size of a chamber, over the radius of the outline
+_LARGEST_TURN = 1.15  # largest angle of an arc replaced by one edge [rad]
 
 
 class Piece(NamedTuple):
@@ -35,18 +35,18 @@ class Piece(NamedTuple):
 
     start: complex
     end: complex
-    centre: complex | None  # of the circle that it is an arc of, shorter than half of it; None where it is straight
+    centre: complex | None  # centre of a circular arc of less than 180 degrees; None for a straight line
 
     def points(self, t: NDArray[np.float64]) -> ComplexArray:
-        """Points at fractions (T,) of its length."""
+        """Returns the points at fractions (T,) of the length."""
         if self.centre is None:
             return np.asarray(self.start + (self.end - self.start) * t, dtype=np.complex128)
-        # A complex power turns and stretches evenly, so that ends at unlike distances from the centre do no harm.
+        # A complex power rotates and scales uniformly, so the ends may have different distances from the centre.
         spoke = self.start - self.centre
         return np.asarray(self.centre + spoke * ((self.end - self.centre) / spoke) ** t, dtype=np.complex128)
 
     def moves(self, t: NDArray[np.float64], first: complex, last: complex, share: float = 1.0) -> ComplexArray:
-        """How these points move with the ends: on an arc, away from its centre by a share of the distance."""
+        """Returns the displacements of these points: interpolated on a line, radial by a share of the radius on an arc."""
         if self.centre is None:
             return np.asarray(first * (1.0 - t) + last * t, dtype=np.complex128)
         moves = share * (self.points(t) - self.centre)
@@ -55,12 +55,12 @@ class Piece(NamedTuple):
 
     @property
     def turn(self) -> float:
-        """Angle that its arc spans [rad], positive counter-clockwise; 0 where it is straight."""
+        """Angle of the arc [rad], positive counter-clockwise; 0 for a straight line."""
         return 0.0 if self.centre is None else float(np.angle((self.end - self.centre) / (self.start - self.centre)))
 
     @property
     def area(self) -> float:
-        """Between the piece and the origin [m^2], positive where it runs counter-clockwise."""
+        """Area between the piece and the origin [m^2], positive counter-clockwise."""
         triangle = 0.5 * (self.start.conjugate() * self.end).imag
         if self.centre is None:
             return float(triangle)
@@ -68,13 +68,13 @@ class Piece(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How far the corners of the chambers' and of the arm's polygon lie outside the curves, over the arcs' radii."""
+    """Distances of the polygons' corners from the curves of chambers and outline, over the radii of the arcs."""
 
     chamber: float
     outline: float
 
     def of(self, name: str) -> float:
-        """That of the curve on which a named point lies, or with which it moves."""
+        """Returns the growth of the curve on which a named point lies, or with which it moves."""
         return self.outline if name[0] in "BV" else self.chamber
 
 
@@ -82,28 +82,28 @@ class Growth(NamedTuple):
 class Section:
     """The cross-section of an arm at one height.
 
-    The half of a wedge counter-clockwise of the middle of chamber 1 is described by named points, and mirrored:
+    The half wedge counter-clockwise from the middle of chamber 1 is described by named points, and mirrored:
 
         O            the axis
-        M, C, (E)    the chamber's inner side: its middle, its corner, and where a sector's straight side ends
-        A0 to Am     the chamber's outer arc, from its last corner (C or E) to its crown
-        B0 to Bm     the outline opposite
-        W, (U)       the middle of the web opposite C (and E)
-        V            the middle of the web on the outline; lobes meet there, and B0 is there as well
-        Xm, Xc, X1, X2  inside of the chamber, next to M, C, A1 and A2: used where caps close it
+        M, C, (E)    inner side of the chamber: its middle, its corner, and the end of a sector's straight side
+        A0 to Am     outer arc of the chamber, from its last corner (C or E) to its crown
+        B0 to Bm     the outline opposite the arc
+        W, (U)       middle of the web opposite C (and E)
+        V            middle of the web on the outline; for a lobed outline the same as B0
+        Xm, Xc, X1, X2  inside the chamber, next to M, C, A1 and A2, for the caps
     """
 
-    radius: float  # of the outline, where it is farthest from the axis [m]
+    radius: float  # largest radius of the outline [m]
     count: int  # number of chambers
-    profile: str  # of a chamber: ``half_disc``, its flat side towards the axis; ``disc``; or ``sector`` of an annulus
-    outline: str  # ``lobed``: around each chamber, at the distance of the wall; or ``round``: a circle
-    wall: float  # between a chamber and the outline [m]
-    web: float  # between neighbouring chambers, where they are closest [m]
-    core: float | None = None  # between the axis and a chamber [m]; None: the least that the webs allow
+    profile: str  # as in `ArmGeometry`, like all that follows
+    outline: str
+    wall: float  # [m]
+    web: float  # [m]
+    core: float | None = None  # [m]; None: the smallest that the webs allow
 
     @property
     def half_angle(self) -> float:
-        """Between the middle of a chamber and the middle of the web beside it [rad]."""
+        """Angle between the middle of a chamber and the middle of the web beside it [rad]."""
         return pi / self.count
 
     @property
@@ -112,15 +112,15 @@ class Section:
         reach, s, c = self.radius - self.wall, sin(self.half_angle), cos(self.half_angle)
         if self.profile == "sector":
             return 0.0
-        # With the centre at d and the radius a = reach - d, the middle of the web is at d s - a c from the corner of
-        # half a disc and at d s - a from a disc; either is half the web.
+        # With centre d and radius a = reach - d, the distance from the middle of the web is d s - a c for the corner of
+        # a half disc and d s - a for a disc; it equals half the web.
         if self.profile == "half_disc":
             return (0.5 * self.web + reach * c) / (s + c) if self.core is None else self.core
         return (0.5 * self.web + reach) / (s + 1.0) if self.core is None else 0.5 * (self.core + reach)
 
     @property
     def arc_radius(self) -> float:
-        """Radius of the chamber's outer arc [m]."""
+        """Radius of the outer arc of a chamber [m]."""
         return self.radius - self.wall - self.arc_centre
 
     @property
@@ -133,11 +133,7 @@ class Section:
         return self.web / sin(self.half_angle) if self.core is None else self.core
 
     def check(self) -> None:
-        """Checks that the chambers fit.
-
-        Raises:
-            MeshError: they do not.
-        """
+        """Raises MeshError if the chambers do not fit."""
         where = f"where the arm's radius is {1e3 * self.radius:.4g} mm"
         d, a, s, c = self.arc_centre, self.arc_radius, sin(self.half_angle), cos(self.half_angle)
         room = a - self.inner_radius if self.profile == "sector" else a
@@ -157,7 +153,7 @@ class Section:
             )
 
     def _valley(self) -> complex:
-        """Where the outline crosses the middle of the web."""
+        """Returns the point of the outline at the middle of the web."""
         d, s, c = self.arc_centre, sin(self.half_angle), cos(self.half_angle)
         if self.outline == "round":
             return complex(self.radius * c, self.radius * s)
@@ -165,12 +161,12 @@ class Section:
 
     @property
     def rows(self) -> int:
-        """Number m of the pieces that half of the outer arc is divided into."""
+        """Number m of pieces in half of the outer arc."""
         return 1 if self.profile == "sector" else 2
 
     @property
     def inner_side(self) -> tuple[str, ...]:
-        """Names of the points of half the inner side, from its middle."""
+        """Names of the points on half of the inner side, from its middle."""
         return ("M", "C", "E") if self.profile == "sector" else ("M", "C")
 
     @cached_property
@@ -183,7 +179,7 @@ class Section:
                 point[name] = radius * np.exp(1j * (half - asin(0.5 * self.web / radius)))
         elif self.profile == "half_disc":
             point["C"] = complex(d, a)
-        else:  # where the wall is thinnest towards the valley, or the web is
+        else:  # the point with the thinnest wall towards the valley, or with the thinnest web
             lobe = valley - d if self.outline == "lobed" else np.exp(1j * (half / 2 + pi / 2))
             point["C"] = d + a * lobe / abs(lobe)
         last = point[self.inner_side[-1]]
@@ -197,7 +193,7 @@ class Section:
             point |= {f"X{name[-1].lower()}": 0.5 * (d + point[name]) for name in ("M", "C", "A1", "A2")}
         along = np.exp(1j * half)
         feet = [(point[name] / along).real for name in self.inner_side[1:]]
-        if self.outline == "lobed":  # opposite the valley, as far from the corners
+        if self.outline == "lobed":  # opposite the valley, at the same distance from the corners
             feet[-1] = max(2.0 * feet[-1] - abs(valley), 0.5 * feet[-1])
         for name, foot in zip("WU", feet, strict=False):
             point[name] = foot * along
@@ -205,11 +201,11 @@ class Section:
 
     @property
     def _outline_centre(self) -> complex:
-        """Of the outline's arc opposite chamber 1."""
+        """Centre of the outline's arc opposite chamber 1."""
         return complex(self.arc_centre if self.outline == "lobed" else 0.0)
 
     def piece(self, first: str, last: str) -> Piece:
-        """The line between two neighbouring named points."""
+        """Returns the piece between two neighbouring named points."""
         letters = "".join(sorted({first[0], last[0]}))
         centre: complex | None = None
         if letters == "B" or (letters == "BV" and self.outline == "round"):
@@ -219,7 +215,7 @@ class Section:
         return Piece(self.points[first], self.points[last], centre)
 
     def motion(self, name: str) -> complex:
-        """How a named point moves with the growth of its curve: a corner stays, or keeps the web as wide as it is."""
+        """Returns the displacement of a named point per unit of growth; corners are fixed, or keep the web's width."""
         point = self.points[name]
         if name[0] in "AMCE":
             if self.profile == "sector" and name not in ("M", "A1"):
@@ -229,17 +225,17 @@ class Section:
             return 0j if corner else point - self.arc_centre
         if name[0] in "BV":
             return 0j if self.outline == "lobed" and name in ("B0", "V") else point - self._outline_centre
-        if name == "W" and self.profile == "disc":  # goes with the corner opposite, as in `points`
+        if name == "W" and self.profile == "disc":  # moves with the opposite corner, as in `points`
             along = complex(np.exp(1j * self.half_angle))
             return (2.0 if self.outline == "lobed" else 1.0) * (self.motion("C") / along).real * along
         return 0j
 
     def divisions(self, size: float) -> Divisions:
-        """Into how many edges the lines between named points are divided, so that these have a size [m] on average.
+        """Returns the number of mesh edges on each line between named points, for an average edge length [m].
 
-        Opposite sides of a block are divided alike, and so on through the blocks: walls, chambers' flat sides and arcs
-        have numbers of their own, from the lengths of what is solid. No edge stands for more than about 65 degrees of
-        an arc.
+        Opposite sides of a block have the same number, which propagates through the blocks: walls, flat sides and arcs
+        of chambers have separate numbers, from the lengths of the solid parts. No edge replaces more than about 65
+        degrees of an arc.
         """
         strips: list[list[Edge]] = []
         solid: set[Edge] = set()
@@ -261,31 +257,31 @@ class Section:
         return numbers
 
     def edge(self, first: str, last: str) -> Edge:
-        """The line between two named points, however it is named."""
+        """Returns the key of the line between two named points, with synonyms resolved."""
         same = {"A0": self.inner_side[-1], **({"B0": "V"} if self.outline == "lobed" else {})}
         a, b = sorted((same.get(first, first), same.get(last, last)))
         return a, b
 
     def growth(self, divisions: Divisions) -> Growth:
-        """How far the corners of polygons move so that their areas are right."""
+        """Returns the growth for which the polygons have the areas of the curves."""
         return Growth(*(self._polygon(sides, divisions)[1] for sides in (self._chamber_sides, self._outline_sides)))
 
     @property
     def _chamber_sides(self) -> tuple[Edge, ...]:
-        """Neighbouring names along half the outline of a chamber, from its crown."""
+        """Pairs of neighbouring names along half of a chamber's outline, from its crown."""
         arc = [f"A{i}" for i in range(self.rows, -1, -1)]
         return (*pairwise(arc), *pairwise(self.inner_side[::-1]))
 
     @property
     def _outline_sides(self) -> tuple[Edge, ...]:
-        """Neighbouring names along half the outline opposite a chamber, from its crown."""
+        """Pairs of neighbouring names along half of the outline opposite a chamber, from its crown."""
         arc = [f"B{i}" for i in range(self.rows, -1, -1)]
         return tuple(pairwise(arc if self.outline == "lobed" else [*arc, "V"]))
 
     def _polygon(self, sides: Sequence[Edge], divisions: Divisions) -> tuple[ComplexArray, float]:
-        """The corners along neighbouring sides, and the share by which they are moved.
+        """Returns the polygon's corners along the sides, and its growth.
 
-        With points p + e w, a polygon has the area A0 + A1 e + A2 e^2, which is to be that of the curve.
+        A polygon with corners p + e w has the area A0 + A1 e + A2 e^2, which must equal that of the curve.
         """
         start, move, area = [], [], 0.0
         for first, last in sides:
@@ -302,34 +298,32 @@ class Section:
         return np.asarray(p + growth * w, dtype=np.complex128), growth
 
     def chamber_polygon(self, divisions: Divisions) -> ComplexArray:
-        """The corners of chamber 1, counter-clockwise from its crown."""
+        """Returns the corners of chamber 1, counter-clockwise from its crown."""
         upper, _ = self._polygon(self._chamber_sides, divisions)
         return np.concatenate([upper, upper[-2:0:-1].conj()])
 
     def body_polygon(self, divisions: Divisions) -> ComplexArray:
-        """The corners of the arm's outline, counter-clockwise from chamber 1."""
+        """Returns the corners of the arm's outline, counter-clockwise from chamber 1."""
         half, _ = self._polygon(self._outline_sides, divisions)
         turns = np.exp(2j * self.half_angle * np.arange(self.count))
         wedge = np.concatenate([half[:0:-1].conj(), half[:-1]])
         return np.asarray((turns[:, None] * wedge).ravel(), dtype=np.complex128)
 
     def line(self, first: Corner, last: Corner, t: NDArray[np.float64], growth: Growth) -> ComplexArray:
-        """Points at fractions (T,) of the line between two neighbouring corners, moved with their curves."""
+        """Returns the points at fractions (T,) of the line between two neighbouring corners, after the growth."""
         start, end = (self._placed(self.points[corner[0]], corner) for corner in (first, last))
-        by_start, by_end = (
-            self._placed(growth.of(corner[0]) * self.motion(corner[0]), corner) for corner in (first, last)
-        )
+        by_start, by_end = (self._placed(growth.of(c[0]) * self.motion(c[0]), c) for c in (first, last))
         centre = self.piece(first[0], last[0]).centre
         piece = Piece(start, end, None if centre is None else self._placed(centre, first))
         return piece.points(t) + piece.moves(t, by_start, by_end, growth.of(first[0]))
 
     def _placed(self, point: complex, corner: Corner) -> complex:
-        """Where a corner has a point of the half wedge."""
+        """Maps a point of the half wedge to the wedge of a corner."""
         _, mirrored, wedge = corner
         return (point.conjugate() if mirrored else point) * complex(np.exp(2j * self.half_angle * wedge))
 
     def blocks(self) -> Iterator[tuple[list[Corner], int]]:
-        """Quadrilaterals that fill the section: four corners, and the chamber that it belongs to, or `SOLID`."""
+        """Yields the blocks that fill the section: four corners, and the index of the chamber or `SOLID`."""
         m, n = self.rows, self.count
         inner, middle = self.inner_side, ("O", "W", "U")
         solid = [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(inner) - 1)]
@@ -358,11 +352,11 @@ class Section:
 
 
 def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:
-    """Grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
+    """Returns grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
 
     Returns:
-        Of each block: (k + 1, l + 1) points, those along the second axis counter-clockwise of those along the first,
-        and the chamber that it belongs to, counted from 0, or `SOLID`.
+        For each block: (k + 1, l + 1) points, with the second axis counter-clockwise of the first, and the index of its
+        chamber, from 0, or `SOLID`.
     """
     growth = section.growth(divisions)
     grids, chambers = [], []
@@ -383,15 +377,15 @@ def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexA
 
 
 def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, list[IntArray]]:
-    """Numbers the points of grids that share sides, as those of `section_grids` do.
+    """Numbers the points of grids with shared sides, such as those of `section_grids`.
 
     Returns:
-        (S,) a place of each point among those of all grids, and of each block (Q, 4) the points of its quadrilaterals,
-        counter-clockwise.
+        Index (S,) of each distinct point among those of all grids, and for each block the points of its quadrilaterals
+        (Q, 4), counter-clockwise.
     """
     flat = np.concatenate([grid.ravel() for grid in grids])
     unit = 1e-7 * np.abs(flat).max()
-    keys = np.floor(np.stack([flat.real, flat.imag], axis=1) / unit + 0.1234567)  # no point of symmetry near a step
+    keys = np.floor(np.stack([flat.real, flat.imag], axis=1) / unit + 0.1234567)  # keeps symmetric points off the steps
     _, place, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     ends = np.cumsum([grid.size for grid in grids])
     quads = []
@@ -403,5 +397,5 @@ def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, lis
 
 
 def _fan(a: ComplexArray, b: ComplexArray) -> float:
-    """The bilinear form that is the area between an open polygon and the origin where both are the same."""
+    """Returns the bilinear form whose quadratic form is the area between an open polygon and the origin."""
     return float(0.5 * (a[:-1].conj() * b[1:]).imag.sum())

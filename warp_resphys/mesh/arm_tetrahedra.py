@@ -1,4 +1,4 @@
-"""Pneumatic arms of tetrahedra, made by gmsh (Geuzaine and Remacle 2009) with the OpenCASCADE kernel."""
+"""Pneumatic arms of tetrahedra by gmsh (Geuzaine and Remacle 2009) with the OpenCASCADE kernel."""
 
 import cmath
 import math
@@ -13,22 +13,16 @@ from .tetrahedra import tetrahedra_by_gmsh
 
 
 def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
-    """Meshes an arm with 4-node tetrahedra of a size [m]: the body, lofted along caps and segments, less its chambers.
-
-    Vertices are numbered from the base down.
+    """Returns an arm of 4-node tetrahedra of a given size [m], with vertices numbered from the base down.
 
     Raises:
-        MeshError: gmsh is not installed, or it fails.
+        MeshError: gmsh is missing or fails.
     """
-
-    def describe(gmsh: Any) -> None:
-        _build(gmsh.model.occ, geometry, size)
-
-    return tetrahedra_by_gmsh(describe, size, "an arm")
+    return tetrahedra_by_gmsh(lambda gmsh: _build(gmsh.model.occ, geometry, size), size, "an arm")
 
 
 def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
-    """Builds the body with its chambers cut out in the current model."""
+    """Builds the body, lofted along caps and segments, with the chambers cut out."""
     heights = geometry.stations
     divisions = geometry.section(0.5 * (geometry.radii[0] + geometry.radii[-1])).divisions(size)
     sections = [geometry.section(geometry.radius_at(height)) for height in heights]
@@ -40,21 +34,17 @@ def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
             rotation = math.radians(geometry.rotations[part // 2]) if geometry.rotations else 0.0
             for number in range(geometry.chambers):
                 angle = rotation + 2.0 * math.pi * number / geometry.chambers
-                chambers.append(
-                    _loft(occ, [(section.chamber_polygon(divisions), height, angle) for section, height in ends])
-                )
+                chambers.append(_loft(occ, [(s.chamber_polygon(divisions), height, angle) for s, height in ends]))
     fused, _ = occ.fuse(body[:1], body[1:])
     occ.cut(fused, chambers)
     occ.synchronize()
 
 
 def _loft(occ: Any, ends: Sequence[tuple[ComplexArray, float, float]]) -> tuple[int, int]:
-    """A solid between two polygons, each with its height [m] and angle about the axis [rad]."""
+    """Returns a solid between two polygons with given heights [m] and angles about the axis [rad]."""
     wires = []
     for polygon, height, angle in ends:
         tags = [occ.addPoint(point.real, point.imag, height) for point in polygon * cmath.exp(1j * angle)]
         wires.append(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
-    ((dimension, tag),) = (
-        entity for entity in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if entity[0] == 3
-    )
+    ((dimension, tag),) = (e for e in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if e[0] == 3)
     return dimension, tag

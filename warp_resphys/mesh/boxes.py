@@ -1,4 +1,4 @@
-"""Bodies that are made of boxes, as many moulded ones are, of hexahedra."""
+"""Hexahedral meshes of unions of boxes, as for many moulded bodies."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -11,21 +11,21 @@ from .mesh import Mesh, box_hexahedra, connected_parts, quadratic
 
 FloatArray = NDArray[np.float64]
 
-_APART = 1e-9  # m: planes that are closer are one
+_APART = 1e-9  # distance below which planes are merged [m]
 
 
 def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, nodes: int = 8) -> Mesh:
-    """The union of boxes along the axes, of hexahedra.
+    """Returns a hexahedral mesh of a union of axis-aligned boxes.
 
-    Every face of a box is a plane of the mesh, all through it, so that boxes that touch or overlap share their cells.
+    Every face of a box is extended to a plane of the whole mesh, so that boxes that touch or overlap share cells.
 
     Args:
-        boxes: opposite corners of each, the lower ones first [m].
-        size: that no edge of a cell is longer than [m].
-        nodes: of a hexahedron: 8, 20 or 27.
+        boxes: lower and upper corner of each box [m].
+        size: largest edge length of a cell [m].
+        nodes: nodes of a hexahedron: 8, 20 or 27.
 
     Raises:
-        MeshError: no box, one without a volume, or a size that is not positive.
+        MeshError: no box, a box without volume, or a size that is not positive.
     """
     if not boxes:
         raise MeshError("a body of boxes needs one box or more")
@@ -36,7 +36,7 @@ def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, n
         if not (np.isfinite([low, high]).all() and (high - low > _APART).all()):
             raise MeshError(f"box {number} reaches from {low.tolist()} to {high.tolist()} m: it has no volume")
     lines = [_lines(corners[:, :, axis], size) for axis in range(3)]
-    grid = box_hexahedra((1.0, 1.0, 1.0), [len(line) - 1 for line in lines])
+    grid = box_hexahedra((1.0, 1.0, 1.0), [len(planes) - 1 for planes in lines])
     places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     centres = places[grid.cells].mean(axis=1)[:, None]
     inside = ((centres > corners[:, 0]) & (centres < corners[:, 1])).all(axis=2).any(axis=1)
@@ -48,7 +48,7 @@ def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, n
 
 
 def _lines(ends: FloatArray, size: float) -> FloatArray:
-    """Coordinates of the planes of the mesh across an axis, in ascending order [m]."""
+    """Returns the coordinates of the mesh planes normal to an axis, ascending [m]."""
     planes = np.unique(ends)
     planes = planes[np.diff(planes, prepend=-np.inf) > _APART]
     parts = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)), endpoint=False) for a, b in pairwise(planes)]

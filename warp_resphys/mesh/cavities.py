@@ -1,4 +1,4 @@
-"""Cavities of a body that are open to the outside: what should perhaps have been a closed chamber."""
+"""Detection of open cavities, which may have been intended as closed chambers."""
 
 from dataclasses import dataclass
 
@@ -7,30 +7,30 @@ import numpy as np
 from .chambers import find_chambers
 from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
 
-MOST_TRIANGLES = 10_000  # of a surface that is looked at
-_DIRECTIONS = 24  # from each triangle, over the half of all directions that it faces
-_HIDDEN = 0.2  # share of directions that lead out, below which a triangle lies within a cavity
-_LEAST_AREA = 0.01  # of a cavity, over the area of the outside
-_LIFT = 1e-6  # of a ray's start off the surface, over the diagonal of the mesh
-_RAYS = 200_000  # pairs of a ray and a triangle that are looked at in one go, over the number of triangles
+MOST_TRIANGLES = 10_000  # largest surface that is examined
+_DIRECTIONS = 24  # rays per triangle, over the hemisphere of its normal
+_HIDDEN = 0.2  # fraction of unobstructed rays below which a triangle is inside a cavity
+_LEAST_AREA = 0.01  # smallest area of a cavity, over that of the outer surface
+_LIFT = 1e-6  # distance of a ray's start from the surface, over the diagonal of the mesh
+_RAYS = 200_000  # ray-triangle pairs processed together
 
 
 @dataclass(frozen=True)
 class OpenCavity:
-    """A part of the outer surface from which little of the outside is seen."""
+    """A part of the outer surface with mostly obstructed view of the outside."""
 
-    centre: FloatArray  # (3,) [m] mean of its triangles
-    area: float  # of it [m^2]
+    centre: FloatArray  # (3,) area-weighted centre [m]
+    area: float  # [m^2]
 
 
 def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
-    """Finds where the outer surface lies in a deep hollow: a chamber with a hole in its wall or without an end.
+    """Finds deep hollows in the outer surface, such as a chamber with a hole in its wall or without an end.
 
-    From the middle of each triangle, straight lines go in evenly spread directions; where few of them leave without
-    meeting the body again, the triangle is hidden. Hidden triangles that touch are one cavity.
+    Rays in uniformly distributed directions start from the centre of each triangle; if few of them leave the body
+    without hitting it, the triangle is hidden. Connected hidden triangles form a cavity.
 
     Returns:
-        The cavities, largest first; None where the surface has more than `MOST_TRIANGLES`.
+        The cavities, largest first; None if the surface has more than `MOST_TRIANGLES`.
     """
     import trimesh
 
@@ -42,7 +42,7 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
     surface = trimesh.Trimesh(mesh.vertices, outer, process=False)
     centres, normals, areas = surface.triangles_center, surface.face_normals, surface.area_faces
     starts = centres + _LIFT * surface.scale * normals
-    hidden = np.flatnonzero(_blocked(starts, normals, surface.triangles))  # who sees the outside ahead is not hidden
+    hidden = np.flatnonzero(_blocked(starts, normals, surface.triangles))  # candidates: obstructed along the normal
     directions = _half_sphere(normals[hidden]).reshape(-1, 3)
     blocked = _blocked(np.repeat(starts[hidden], _DIRECTIONS, axis=0), directions, surface.triangles)
     hidden = hidden[1.0 - blocked.reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN]
@@ -55,7 +55,7 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
 
 
 def _half_sphere(normals: FloatArray) -> FloatArray:
-    """(T, D, 3) unit vectors, spread evenly over the half sphere around each normal (T, 3)."""
+    """Returns unit vectors (T, D, 3), uniformly distributed over the hemisphere of each normal (T, 3)."""
     heights = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     angles = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(_DIRECTIONS)  # golden spiral
     local = np.stack([np.cos(angles), np.sin(angles)], axis=1) * np.sqrt(1.0 - heights**2)[:, None]
@@ -67,9 +67,9 @@ def _half_sphere(normals: FloatArray) -> FloatArray:
 
 
 def _blocked(starts: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
-    """Whether rays (R, 3) meet any triangle (T, 3, 3), (R,) of 0 and 1 (Moeller and Trumbore 1997)."""
+    """Returns 1 for rays (R,) that hit any triangle (T, 3, 3), else 0 (Moeller and Trumbore 1997)."""
     origin, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    met = np.zeros(len(starts))
+    hit = np.zeros(len(starts))
     chunk = max(1, _RAYS // len(corners))
     for begin in range(0, len(starts), chunk):
         rays, offset = directions[begin : begin + chunk, None], starts[begin : begin + chunk, None] - origin
@@ -81,5 +81,5 @@ def _blocked(starts: FloatArray, directions: FloatArray, corners: FloatArray) ->
             v = (around * rays).sum(axis=-1) / determinant
             distance = (around * second).sum(axis=-1) / determinant
             inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
-        met[begin : begin + chunk] = inside.any(axis=1)
-    return met
+        hit[begin : begin + chunk] = inside.any(axis=1)
+    return hit

@@ -10,21 +10,21 @@ from ..io.errors import MeshError
 from .elements import FACES, Rule, Shape
 from .mesh import Mesh, boundary_faces, connected_parts, face_triangles
 
-_SAME_HEIGHT = 0.05  # of the body's length: chambers whose centres are closer than that along it are side by side
+_SAME_HEIGHT = 0.05  # chambers with centres closer than this along the axis, over the body's length, are side by side
 
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
     """A closed surface inside a body."""
 
-    name: str  # by which results and messages call it
-    # (F, 3 | 4 | 6) vertices of its faces, ordered as `mesh.boundary_faces` gives them: counter-clockwise seen from
-    # outside of the solid, that is, from inside the chamber
+    name: str  # name in results and messages
+    # (F, 3 | 4 | 6) vertices of the faces, as from `mesh.boundary_faces`: counter-clockwise seen from outside the solid,
+    # that is, from inside the chamber
     faces: NDArray[np.int64]
 
     @property
     def vertices(self) -> NDArray[np.int64]:
-        """(S,) sorted vertices on it."""
+        """(S,) vertices of the faces, sorted."""
         return np.unique(self.faces)
 
 
@@ -35,13 +35,14 @@ def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
 
 
 def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple[Chamber, ...]:
-    """The inner components of a body's boundary, in a fixed order.
+    """Returns the closed inner components of a body's boundary, in a fixed order.
 
-    A component is a chamber where its faces, seen from outside of the solid, enclose a negative volume. A cavity that
-    is open to the outside is part of the outer surface, and no chamber.
+    A component is a chamber if its faces enclose a negative volume with the solid's orientation. A cavity that is open
+    to the outside is part of the outer surface and not a chamber.
 
-    They are named ``chamber_1`` and so on along the axis, which leads from the clamped end along the body; those side
-    by side by their angle about it, counter-clockwise seen against it, from the direction of x, or y if the axis is x.
+    Chambers are named ``chamber_1`` and so on, ordered along the axis, which points from the clamped end along the
+    body; chambers side by side are ordered by their angle about it, counter-clockwise looking against the axis, from
+    the x direction (y if the axis is x).
     """
     faces = boundary_faces(mesh)
     owner = connected_parts(faces)
@@ -54,7 +55,7 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
 
 
 def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.float64]) -> list[int]:
-    """The order of surfaces along an axis, and about it."""
+    """Returns the order of surfaces along and about an axis."""
     along = axis / np.linalg.norm(axis)
     across = np.eye(3)[0 if abs(along[0]) < 0.9 else 1]
     across = across - (across @ along) * along
@@ -73,11 +74,11 @@ def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.f
 
 
 def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
-    """Checks that pressure in each chamber has no net force.
+    """Checks that chambers are closed and correctly oriented, so that pressure has no net force.
 
     Raises:
-        MeshError: a chamber has no faces, faces of vertices that the mesh does not have, an edge on its rim, faces that
-            look the wrong way, or a face of another chamber.
+        MeshError: a chamber without faces, with vertices that the mesh does not have, with a boundary edge, with wrong
+            orientation, or with a face of another chamber.
     """
     owners: dict[frozenset[int], str] = {}
     for chamber in chambers:

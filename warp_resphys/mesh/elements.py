@@ -1,7 +1,7 @@
-"""Finite elements: nodes, shape functions, quadrature and faces of each kind of cell. Nodes are in VTK's order.
+"""Finite elements: nodes in VTK order, shape functions, quadrature and faces.
 
-An element is one entry of `ELEMENTS`; nothing else knows it by name. Its shape functions are the polynomials of given
-exponents that are one at one node and zero at the others.
+An element is one entry of `ELEMENTS`. Its shape functions are the polynomials with given exponents that are one at one
+node and zero at the others.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ Rule = tuple[Array, Array]  # points (Q, d) and weights (Q,)
 
 
 def _products(values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """(n^d, d) all combinations of values, the last one fastest."""
+    """Returns all combinations of values, (n^d, d), with the last coordinate varying fastest."""
     return np.stack(np.meshgrid(*[values] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
 
 
 def gauss_box(order: int, dimension: int = 3) -> Rule:
-    """Product of Gauss rules on [-1, 1]^d, exact up to the degree 2 order - 1 in each coordinate."""
+    """Returns the product Gauss rule on [-1, 1]^d, exact up to degree 2 order - 1 in each coordinate."""
     x, w = np.polynomial.legendre.leggauss(order)
     return _products(x, dimension), np.prod(_products(w, dimension), axis=-1)
 
 
 def conical_simplex(order: int, dimension: int = 3) -> Rule:
-    """Conical product of Gauss rules on the unit simplex (Stroud 1971), exact up to the degree 2 order - d."""
+    """Returns the conical product Gauss rule on the unit simplex (Stroud 1971), exact up to degree 2 order - d."""
     x, w = np.polynomial.legendre.leggauss(order)
     points, weights = _products((x + 1.0) / 2.0, dimension), np.prod(_products(w / 2.0, dimension), axis=-1)
     left = np.ones_like(weights)
@@ -41,7 +41,7 @@ def conical_simplex(order: int, dimension: int = 3) -> Rule:
 
 
 def degree_two_tetrahedron() -> Rule:
-    """4-point rule of degree 2 on the unit tetrahedron (Keast 1986)."""
+    """Returns the 4-point rule of degree 2 on the unit tetrahedron (Keast 1986)."""
     a, b = (5.0 - np.sqrt(5.0)) / 20.0, (5.0 + 3.0 * np.sqrt(5.0)) / 20.0
     return a + (b - a) * _TETRAHEDRON, np.full(4, 1.0 / 24.0)
 
@@ -51,14 +51,14 @@ class Shape:
     """Shape functions of a reference cell or face."""
 
     nodes: Array  # (K, d) reference coordinates
-    exponents: IntArray  # (K, d) of the monomials that span them
+    exponents: IntArray  # (K, d) exponents of the monomials that span the shape functions
 
     @cached_property
     def _coefficients(self) -> Array:
         return np.asarray(np.linalg.inv(_monomials(self.nodes, self.exponents)))
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Values (Q, K) and reference gradients (Q, K, d) at points (Q, d)."""
+        """Returns values (Q, K) and reference gradients (Q, K, d) at points (Q, d)."""
         slopes = []
         for axis in range(self.exponents.shape[1]):
             lower = self.exponents.copy()
@@ -68,7 +68,7 @@ class Shape:
 
 
 def _monomials(points: Array, exponents: IntArray) -> Array:
-    """(Q, K) x^a y^b z^c."""
+    """Returns x^a y^b z^c, (Q, K)."""
     return np.asarray(np.prod(points[:, None, :] ** exponents, axis=-1), dtype=np.float64)
 
 
@@ -76,12 +76,12 @@ def _monomials(points: Array, exponents: IntArray) -> Array:
 class Face:
     """A kind of face."""
 
-    shape: Shape  # functions on the reference triangle or square
-    corners: int  # nodes that come first
-    triangles: IntArray  # (T, 3) that it is split into, counter-clockwise as it is
+    shape: Shape  # shape functions on the reference triangle or square
+    corners: int  # number of corners, which are the first nodes
+    triangles: IntArray  # (T, 3) nodes of its triangles, with the face's orientation
 
     def rule(self, degree: int) -> Rule:
-        """A rule that is exact for linear faces, and for a polynomial degree on quadratic ones."""
+        """Returns a rule that is exact for linear faces, and for a polynomial degree on quadratic ones."""
         quadratic = len(self.shape.nodes) > self.corners
         if self.corners == 4:
             return gauss_box(degree // 2 + 1 if quadratic else 2, 2)
@@ -93,60 +93,64 @@ class Element:
     """A kind of cell."""
 
     name: str
-    shape: Shape  # its shape functions; corners come first
-    parents: list[list[int]]  # for every node that is not a corner, the corners whose mean it is
+    shape: Shape  # shape functions, those of the corners first
+    parents: list[list[int]]  # for each other node, the corners whose mean it is
     rule: Rule  # points and weights of the shape term of an energy
     faces: IntArray  # (F, n) nodes, counter-clockwise seen from outside, corners first
-    # (m, 3) exponents of the polynomials that the deformation gradient of the volume term is projected on, so that the
-    # element does not lock; None for means over the cells around each vertex
+    # (m, 3) exponents of the polynomials onto which the deformation gradient of the volume term is projected against
+    # locking; None: means over the cells around each vertex
     volume_modes: IntArray | None
-    # points and weights of the volume term; where None, one point with the element's volume
-    volume_rule: Rule | None = None
-    # a rule that is exact for products of two shape functions, by which masses are lumped in proportion to the
-    # consistent mass matrix's diagonal; None for row sums
+    volume_rule: Rule | None = None  # points and weights of the volume term; None: one point with the element's volume
+    # rule that is exact for products of shape functions, for masses in proportion to the diagonal of the consistent
+    # mass matrix; None: row sums
     mass_rule: Rule | None = None
 
     @property
     def nodes(self) -> int:
-        """K."""
+        """Number of nodes K."""
         return len(self.shape.nodes)
 
     @property
+    def is_simplex(self) -> bool:
+        """Whether the cell is a tetrahedron."""
+        return self.face.corners == 3
+
+    @property
     def linear(self) -> str:
-        """The name of the element with its corners alone."""
+        """Name of the linear element with the same corners."""
         return BY_NODES[self.nodes - len(self.parents)].name
 
     @property
     def file_type(self) -> str:
-        """What meshio calls it."""
+        """Name in meshio."""
         return self.name.replace("tetrahedron", "tetra")
 
     @property
     def face(self) -> Face:
-        """The kind of its faces."""
+        """Kind of the faces."""
         return FACES[self.faces.shape[1]]
 
     @cached_property
     def edges(self) -> IntArray:
-        """(E, 2) corners of the edges, in ascending order."""
+        """(E, 2) corners of the edges, ascending."""
         corners = self.faces[:, : self.face.corners]
         pairs = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
         return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
 def _exponents(most: int, *, total: int | None = None, others: int = 3) -> IntArray:
-    """(n, d) exponents up to `most` in each coordinate, and up to `total` together."""
+    """Returns exponents (n, d) up to `most` in each coordinate, with sums up to `total`."""
     grid = _products(np.arange(most + 1), others)
     return grid if total is None else grid[grid.sum(axis=1) <= total]
 
 
 def _serendipity(exponents: IntArray) -> IntArray:
-    """Those whose degree, without coordinates that enter linearly, is at most two (Arnold and Awanou 2011)."""
+    """Returns the exponents with a superlinear degree of at most two (Arnold and Awanou 2011)."""
     return exponents[np.where(exponents > 1, exponents, 0).sum(axis=1) <= 2]
 
 
 def _between(corners: Array, parents: list[list[int]]) -> Array:
-    """Corners, and after them the means of groups of them."""
+    """Returns the corners followed by the means of groups of corners."""
     return np.concatenate([corners, *(corners[group].mean(axis=0, keepdims=True) for group in parents)])
 
 
@@ -172,7 +176,7 @@ _LINEAR = np.concatenate([_CONSTANT, np.eye(3, dtype=np.int64)])
 
 
 def _element(name: str, corners: Array, exponents: IntArray, parents: list[list[int]], **rules: Any) -> Element:
-    """With nodes in the middle of groups of corners, and so on the faces."""
+    """Returns an element with nodes at the corners and at the means of groups of corners."""
     place = {frozenset(group): len(corners) + number for number, group in enumerate(parents)}
     faces = []
     for face in _TETRAHEDRON_FACES if len(corners) == 4 else _HEXAHEDRON_FACES:
@@ -205,7 +209,7 @@ FACES: dict[int, Face] = {
 _ONE_POINT: dict[str, Any] = {"rule": (np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)), "volume_modes": None}
 _KEAST: dict[str, Any] = {"rule": degree_two_tetrahedron(), "volume_modes": _CONSTANT, "mass_rule": conical_simplex(4)}
 _TRILINEAR: dict[str, Any] = {"rule": gauss_box(2), "volume_modes": _CONSTANT}
-# Four of the eight Gauss points, which integrate quadratic polynomials: as many as there are linear modes.
+# Four of the eight Gauss points, which integrate quadratic polynomials: as many points as linear modes.
 _FOUR_POINTS = _HEXAHEDRON[[0, 2, 5, 7]] / np.sqrt(3.0), np.full(4, 2.0)
 _TRIQUADRATIC: dict[str, Any] = {
     "rule": gauss_box(3),

@@ -1,7 +1,6 @@
-"""Volume meshes: boxes, quadratic elements, boundaries, selections and the checks that a simulation relies on.
+"""Volume meshes: boxes, quadratic elements, boundaries, selections and mesh checks.
 
-Nodes are numbered as VTK numbers them. Lengths are metres; conversion from other units belongs to
-`warp_resphys.mesh.readers`, which reads files.
+Nodes are in VTK order. Lengths are in metres; `mesh.readers` converts other units.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,18 +17,18 @@ from .elements import BY_NODES, ELEMENTS, FACES, Element
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-Extent = float | Sequence[float]  # along an axis: one place, or from one to another
+Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
 
-LARGEST_COORDINATE = 1e50  # in any unit; the product of three must be a number
+LARGEST_COORDINATE = 1e50  # in any unit; products of three coordinates must be finite
 DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
-COINCIDENT_DISTANCE = 1e-9  # largest distance of vertices that count as one, over the diagonal of the mesh
+COINCIDENT_DISTANCE = 1e-9  # largest distance of coincident vertices, over the diagonal of the mesh
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Vertices and cells of one kind, constant once built, with named regions of cells.
+    """Vertices, cells of one kind, and named regions of cells.
 
-    Building one checks shapes, number types and regions only; `check_mesh` checks what the numbers mean.
+    The constructor checks shapes, dtypes and regions only; `check_mesh` checks the geometry.
 
     Raises:
         MeshError: An array has the wrong shape, the indices are not integers, or a region is empty or has a cell that
@@ -41,13 +40,13 @@ class Mesh:
     regions: Mapping[str, IntArray] = field(default_factory=dict)  # (m,) sorted cell numbers by name
 
     def __post_init__(self) -> None:
-        """Check shapes and number types, and store contiguous float64 and int64 arrays."""
+        """Checks shapes and dtypes, and stores contiguous float64 and int64 arrays."""
         vertices, cells = np.asarray(self.vertices), np.asarray(self.cells)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
             raise MeshError(f"vertices must be (N, 3) numbers, not {vertices.shape} of {vertices.dtype}")
         if cells.ndim != 2 or cells.shape[1] not in BY_NODES or cells.dtype.kind not in "iu":
-            known = " | ".join(map(str, sorted(BY_NODES)))
-            raise MeshError(f"cells must be (M, {known}) integers, not {cells.shape} of {cells.dtype}")
+            nodes = " | ".join(map(str, sorted(BY_NODES)))
+            raise MeshError(f"cells must be (M, {nodes}) integers, not {cells.shape} of {cells.dtype}")
         object.__setattr__(self, "vertices", np.ascontiguousarray(vertices, dtype=np.float64))
         object.__setattr__(self, "cells", np.ascontiguousarray(cells, dtype=np.int64))
         regions = {name: np.unique(np.asarray(numbers)) for name, numbers in self.regions.items()}
@@ -71,35 +70,33 @@ class Mesh:
             MeshError: The mesh has no region of that name.
         """
         if name not in self.regions:
-            known = ", ".join(self.regions) or "no regions"
-            raise MeshError(f"the mesh has no region {name!r}; it has {known}")
+            raise MeshError(f"the mesh has no region {name!r}; it has {', '.join(self.regions) or 'no regions'}")
         return self.regions[name]
 
     @property
     def kind(self) -> str:
-        """Its name, such as "hexahedron"."""
+        """Name of the cells' kind, such as "hexahedron"."""
         return self.element.name
 
 
-_BRICK_CORNERS = (
-    ELEMENTS["hexahedron"].shape.nodes.astype(np.int64) + 1
-) // 2  # steps along x, y and z from the lowest corner
-# Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are
-# parallel, so that neighbouring bricks fit.
+# Steps along x, y and z from the lowest corner.
+_BRICK_CORNERS = (ELEMENTS["hexahedron"].shape.nodes.astype(np.int64) + 1) // 2
+# Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are parallel, so
+# that neighbouring bricks conform.
 _BRICK_TETRAHEDRA = np.array([[0, a, b, 6] for a, b in ((1, 2), (2, 3), (3, 7), (7, 4), (4, 5), (5, 1))])
 
 
 def box_hexahedra(
     size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), nodes: int = 8
 ) -> Mesh:
-    """Box of equal bricks with one corner at the origin.
+    """Returns a box of equal bricks with one corner at the origin.
 
     Vertex (i, j, k) has index (i (ny + 1) + j) (nz + 1) + k; cells are numbered the same way.
 
     Args:
         size: Lengths along x, y and z [m].
         divisions: Numbers of bricks (nx, ny, nz) along the axes.
-        nodes: Of a hexahedron: 8, 20 or 27; those beyond the corners are numbered after these.
+        nodes: Nodes of a hexahedron: 8, 20 or 27; corners are numbered first.
 
     Raises:
         MeshError: A length is not positive and finite, a number is not a positive integer, or the element is unknown.
@@ -121,9 +118,9 @@ def box_hexahedra(
 def box_tetrahedra(
     size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), order: int = 1
 ) -> Mesh:
-    """Box whose bricks are split into six tetrahedra each (Kuhn 1960), conforming and of equal volume.
+    """Returns a box whose bricks are split into six conforming tetrahedra of equal volume each (Kuhn 1960).
 
-    Its first vertices are those of `box_hexahedra` of that size and those divisions; of order 2 it has 10-node cells.
+    The first vertices are those of `box_hexahedra` with the same size and divisions; order 2 gives 10-node cells.
 
     Raises:
         MeshError: As in `box_hexahedra`, or the order is neither 1 nor 2.
@@ -136,12 +133,12 @@ def box_tetrahedra(
 
 
 def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
-    """Add the nodes of an element of second order after those of a mesh of linear cells; neighbours share them.
+    """Returns a mesh of quadratic elements from one of linear cells; the new nodes are numbered after the old ones.
 
-    The kind of element is by default that of 10-node tetrahedra or 27-node hexahedra.
+    The default elements are 10-node tetrahedra and 27-node hexahedra.
 
     Raises:
-        MeshError: The cells have more than corners, or other corners than the element's.
+        MeshError: The cells are not linear, or do not have the corners of the element.
     """
     element = ELEMENTS.get(kind or {"tetrahedron": "tetrahedron10", "hexahedron": "hexahedron27"}.get(mesh.kind, ""))
     if element is None or element.linear != mesh.kind:
@@ -151,22 +148,21 @@ def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
     for size in dict.fromkeys(map(len, element.parents)):
         corners = np.array([parents for parents in element.parents if len(parents) == size])
         groups = np.sort(mesh.cells[:, corners].reshape(-1, size), axis=1)
-        pairs, member = np.unique(groups, axis=0, return_inverse=True)
-        vertices.append(mesh.vertices[pairs].mean(axis=1))
+        distinct, member = np.unique(groups, axis=0, return_inverse=True)
+        vertices.append(mesh.vertices[distinct].mean(axis=1))
         cells.append(count + member.reshape(-1, len(corners)))
-        count += len(pairs)
+        count += len(distinct)
     return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1), mesh.regions)
 
 
 def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
-    """Check that a finite-element method can use the mesh.
+    """Checks that a mesh is valid for finite elements.
 
-    The Jacobian determinant of each cell's map from its reference cell must be positive at the quadrature
-    points and at the nodes.
+    The Jacobian determinant of each cell must be positive at the quadrature points and at the nodes.
 
     Args:
-        mesh: To be checked.
-        cracks: Whether vertices may coincide, as those of parts that are glued together do.
+        mesh: The mesh.
+        cracks: Whether vertices may coincide, like those of glued parts.
 
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
@@ -187,11 +183,10 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
 
 
 def boundary_faces(mesh: Mesh) -> IntArray:
-    """Faces that belong to one cell only, ordered by cell.
+    """Returns the faces of a single cell, ordered by cell.
 
     Returns:
-        (F, n) vertex indices, such as (F, 4) for 8-node hexahedra: the corners, counter-clockwise seen from outside,
-        then the other nodes.
+        (F, n) vertex indices, such as (F, 4) for 8-node hexahedra: corners first, counter-clockwise seen from outside.
     """
     element = mesh.element
     faces = mesh.cells[:, element.faces].reshape(-1, element.faces.shape[1])
@@ -201,7 +196,7 @@ def boundary_faces(mesh: Mesh) -> IntArray:
 
 
 def connected_parts(cells: IntArray) -> IntArray:
-    """Which of the parts that do not touch each cell or face (M, K) belongs to, (M,) numbered from 0."""
+    """Returns the index (M,) of the connected component of each cell or face (M, K), from 0."""
     count = int(cells.max(initial=-1)) + 1
     ends = cells.ravel(), np.roll(cells, 1, axis=1).ravel()
     graph = scipy.sparse.coo_array((np.ones(cells.size, dtype=np.int8), ends), shape=(count, count))
@@ -210,35 +205,32 @@ def connected_parts(cells: IntArray) -> IntArray:
 
 
 def boundary_triangles(mesh: Mesh) -> IntArray:
-    """Boundary split into triangles, (F, 3) vertex indices, counter-clockwise seen from outside.
-
-    A face with 3 nodes is one triangle, with 4 nodes two, with 6 nodes four, and so on; those of a face follow it.
-    """
+    """Returns the triangles of the boundary (T, 3), counter-clockwise seen from outside (`face_triangles`)."""
     return face_triangles(boundary_faces(mesh))
 
 
 def face_triangles(faces: IntArray) -> IntArray:
-    """Triangles (T, 3) that faces (F, n) are split into, counter-clockwise as they are; see above."""
+    """Returns the triangles (T, 3) of faces (F, n), face by face: one for 3 nodes, two for 4, four for 6, and so on."""
     return faces[:, FACES[faces.shape[1]].triangles].reshape(-1, 3)
 
 
 def surface_vertices(mesh: Mesh) -> IntArray:
-    """Vertices on the boundary, (S,) sorted indices."""
+    """Returns the vertices on the boundary (S,), sorted."""
     return np.unique(boundary_faces(mesh))
 
 
 @dataclass(frozen=True)
 class Place:
-    """Region of points by coordinates: every coordinate a plane, or an interval.
+    """A plane, a slab or a box: each coordinate is free, one value, or a range.
 
     Raises:
-        MeshError: no coordinate is given, or a coordinate is neither a finite number nor two in ascending order.
+        MeshError: no coordinate is given, or one is not a finite number or an ascending pair.
     """
 
     x: Extent | None = None  # [m]
     y: Extent | None = None
     z: Extent | None = None
-    tolerance: float = 1e-9  # how far off they may be [m]
+    tolerance: float = 1e-9  # [m]
 
     def __post_init__(self) -> None:
         """Checks the coordinates."""
@@ -258,7 +250,7 @@ class Place:
         return {axis: (float(np.min(at)), float(np.max(at))) for axis, at in self._given.items()}
 
     def holds(self, points: FloatArray) -> NDArray[np.bool_]:
-        """(N,) whether points (N, 3) [m] lie there."""
+        """Returns (N,) whether points (N, 3) [m] lie in the place."""
         inside = np.ones(len(points), dtype=bool)
         for axis, (first, last) in self._spans().items():
             along = points[:, "xyz".index(axis)]
@@ -273,9 +265,9 @@ class Place:
 
 
 def join(meshes: Mapping[str, Mesh]) -> Mesh:
-    """Returns several meshes as one that shares no vertices between them.
+    """Returns a mesh of several meshes, without shared vertices.
 
-    Its regions are the meshes by name and, as ``name_region``, their own regions.
+    Its regions are the meshes by name, and their regions as ``name_region``.
 
     Raises:
         MeshError: the meshes have different kinds of cells, or two regions have one name.
@@ -301,17 +293,17 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
 def select_vertices(
     mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
 ) -> IntArray:
-    """(S,) sorted vertices that lie at a `Place`, of one coordinate at least.
+    """Returns the vertices (S,) in a plane, a slab or a box, sorted.
 
     Args:
-        mesh: what they are chosen of.
-        x: the plane that they lie on, or from where to where they lie [m].
-        y: the same along y [m].
-        z: the same along z [m].
-        tolerance: how far off they may be [m].
+        mesh: The mesh.
+        x: A coordinate, or a range of coordinates [m].
+        y: Likewise [m].
+        z: Likewise [m].
+        tolerance: Tolerance of the coordinates [m].
 
     Raises:
-        MeshError: No coordinate is given, one that cannot be, or no vertex lies there.
+        MeshError: No coordinate or an invalid one, or no vertex lies there.
     """
     place = Place(x, y, z, tolerance)
     chosen = np.flatnonzero(place.holds(mesh.vertices))
@@ -329,7 +321,7 @@ def select_cells(
     y: Sequence[float] = (-np.inf, np.inf),
     z: Sequence[float] = (-np.inf, np.inf),
 ) -> IntArray:
-    """(S,) cells whose centres lie within a box, from two coordinates along each axis [m].
+    """Returns the cells (S,) with centres in a box, given by a range of coordinates along each axis [m].
 
     Raises:
         MeshError: no cell lies there.
@@ -346,9 +338,9 @@ def select_cells(
 
 
 def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
-    """Volumes and smallest Jacobian determinants of the cells, both (M,) and over the longest edge cubed.
+    """Returns volumes and smallest Jacobian determinants of the cells, (M,) each, over the cube of the longest edge.
 
-    Determinants are multiplied by the reference cell's volume: both are equal where the map is affine.
+    Determinants are multiplied by the volume of the reference cell, so that both are equal for affine cells.
     """
     element = mesh.element
     points, weights = element.rule
@@ -370,7 +362,7 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 
 def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
-    """Flags of vertices that lie on another one of a lower number, (N,)."""
+    """Marks duplicate vertices, (N,): those that coincide with a vertex of lower index."""
     offsets = vertices - vertices[0]
     distance = COINCIDENT_DISTANCE * float(np.linalg.norm(np.ptp(offsets, axis=0)))
     _, nearest = cKDTree(offsets).query(offsets, k=2, distance_upper_bound=np.nextafter(distance, np.inf))
@@ -378,7 +370,7 @@ def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
 
 
 def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:
-    """Raise MeshError if any flag is set, naming the first few and how many there are."""
+    """Raises MeshError with the first few indices and their number if any flag is set."""
     numbers = np.flatnonzero(broken)
     if len(numbers):
         first = ", ".join(map(str, numbers[:5])) + (", ..." if len(numbers) > 5 else "")

@@ -1,4 +1,4 @@
-"""Motions as files of other programs: tables, time series for ParaView, scenes in USD."""
+"""Export of motions: CSV tables, time series for ParaView, USD scenes."""
 
 import csv
 import io
@@ -18,11 +18,11 @@ from .mesh import Mesh, boundary_triangles, surface_vertices
 FloatArray = NDArray[np.float64]
 
 _USD = (".usd", ".usda", ".usdc")
-_MARKER_SHARE = 0.02  # of the body's size, that a marker's ball is wide
+_MARKER_SHARE = 0.02  # diameter of a marker, over the body's size
 
 
 def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
-    """(T + 1,) each: columns of what an input was during the step that led there, of values (T, C)."""
+    """Returns table columns (T + 1,) of an input (T, C): at each time, the value of the step that ends there."""
     headers = [f"{name}.{part} [{unit}]" for part in parts]
     return dict(zip(headers, np.concatenate([values[:1], values]).T, strict=True))
 
@@ -30,9 +30,9 @@ def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray
 def write_csv(
     path: Path, times: FloatArray, labels: Sequence[str], markers: FloatArray, columns: Mapping[str, FloatArray]
 ) -> Path:
-    """Writes a table of markers (T + 1, M, 3) [m] at times (T + 1,) [s], and further columns (T + 1,) by header.
+    """Writes a table of markers (T + 1, M, 3) [m] at times (T + 1,) [s], and of further columns (T + 1,) by header.
 
-    Without labels, the markers are all vertices.
+    Without labels, columns are named as vertices.
     """
     labels = labels or [f"vertex_{number}" for number in range(markers.shape[1])]
     header = ["time [s]", *(f"{label}.{axis} [m]" for label in labels for axis in "xyz"), *columns]
@@ -47,15 +47,15 @@ def write_csv(
 
 
 def write_vtk(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, v: FloatArray, markers: FloatArray) -> Path:
-    """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
+    """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
     Args:
-        path: of the ``.pvd`` file.
+        path: path of the ``.pvd`` file.
         mesh: the rest shape.
         times: (T + 1,) [s].
         q: (T + 1, N, 3) positions of the vertices [m].
         v: (T + 1, N, 3) velocities [m/s].
-        markers: (T + 1, M, 3), to ``NAME_markers.pvd`` unless M is 0 [m].
+        markers: (T + 1, M, 3) markers, written to ``NAME_markers.pvd`` unless M is 0 [m].
     """
     if path.suffix != ".pvd":
         raise InputError(f"{path} does not end in .pvd: give such a name, which ParaView opens as a time series.")
@@ -75,7 +75,7 @@ def _write_series(
     cells: tuple[str, NDArray[np.int64]],
     fields: Iterator[dict[str, Any]],
 ) -> None:
-    """A file for each time, then the collection that names them."""
+    """Writes one file per time, then the collection that lists them."""
     import meshio
 
     entries, digits = [], len(str(len(times) - 1))
@@ -96,8 +96,8 @@ def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers:
         from pxr import Usd, UsdGeom, Vt
     except ImportError:
         raise InputError("USD files need a package that is not installed: pip install 'warp-resphys[usd]'.") from None
-    kept = surface_vertices(mesh)
-    triangles = np.searchsorted(kept, boundary_triangles(mesh))
+    surface = surface_vertices(mesh)
+    triangles = np.searchsorted(surface, boundary_triangles(mesh))
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -112,7 +112,7 @@ def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers:
     body.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     body.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
     body.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
-    surfaces = [(body, q[:, kept])]
+    surfaces = [(body, q[:, surface])]
     if markers.shape[1]:
         dots = UsdGeom.Points.Define(stage, "/robot/markers")
         size = _MARKER_SHARE * float(np.ptp(mesh.vertices, axis=0).max())
@@ -124,10 +124,10 @@ def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers:
             points.Set(Vt.Vec3fArray.FromNumpy(at), float(number))
             extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([at.min(0), at.max(0)])), float(number))
     with atomic_path(path) as partial:
-        ending = partial.with_name(f"{partial.stem}.writing{path.suffix}")  # by which USD tells the format
+        temporary = partial.with_name(f"{partial.stem}.writing{path.suffix}")  # USD needs the suffix for the format
         try:
-            stage.Export(str(ending))
-            ending.replace(partial)
+            stage.Export(str(temporary))
+            temporary.replace(partial)
         finally:
-            ending.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
     return path

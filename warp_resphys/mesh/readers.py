@@ -1,4 +1,4 @@
-"""Reading and writing of volume meshes and their named surfaces, through meshio; lengths become metres here."""
+"""Reading and writing of volume meshes and their named surfaces by meshio, with conversion to metres."""
 
 import functools
 import os
@@ -17,23 +17,23 @@ from .elements import ELEMENTS
 from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
-SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # [m] of a body whose units are believed
+SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # plausible diagonals of a body [m]
 
 _CELL_TYPES = tuple(element.file_type for element in ELEMENTS.values())  # meshio's names
-_PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's numbers of groups
+_PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's group numbers
 
 
 def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
-    """Read and check a tetrahedral or hexahedral mesh in any format that meshio reads.
+    """Reads and checks a tetrahedral or hexahedral mesh in any format of meshio.
 
-    Points, lines and surface cells of the file are ignored, as are its data fields. Named volumes, gmsh's physical
-    groups or the cell sets of other formats, become the regions of the mesh.
+    Points, lines, surface cells and data fields of the file are ignored. Named volumes, that is gmsh's physical groups
+    or the cell sets of other formats, become the regions of the mesh.
 
     Args:
-        path: The file; its extension tells the format.
+        path: The file; its extension determines the format.
         units: Unit of the coordinates in the file: "m", "cm" or "mm".
-        order: 2 adds the edge midpoints to 4-node tetrahedra; 1 takes the cells as they are in the file.
-        drop_unreferenced: Leave out vertices that belong to no volume cell, which are an error otherwise.
+        order: 2 adds the edge midpoints to 4-node tetrahedra; 1 keeps the cells of the file.
+        drop_unreferenced: Whether to drop vertices that belong to no volume cell, which are an error otherwise.
 
     Returns:
         The mesh in metres. Vertices keep the file's order.
@@ -46,7 +46,7 @@ def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, dr
 
 
 def read_vertices(path: str | os.PathLike[str], units: str = "m") -> FloatArray:
-    """Read all vertices of a mesh file, (N, 3) [m], those that no volume cell uses as well.
+    """Reads all vertices of a mesh file, (N, 3) [m], including those without a volume cell.
 
     Raises:
         MeshError: As in `read_mesh`.
@@ -57,11 +57,11 @@ def read_vertices(path: str | os.PathLike[str], units: str = "m") -> FloatArray:
 def read_surfaces(
     path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False
 ) -> dict[str, IntArray]:
-    """Read the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
+    """Reads the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
 
     Returns:
-        (F, 3 | 4 | 6) faces by name, of the mesh that `read_mesh` gives for the same arguments and as
-        `mesh.boundary_faces` gives them; empty where the file names no surface.
+        (F, 3 | 4 | 6) faces by name, as from `mesh.boundary_faces` of the mesh that `read_mesh` returns for the same
+        arguments; empty without named surfaces.
 
     Raises:
         MeshError: As in `read_mesh`, or a named surface has a face that is not on the boundary of the body.
@@ -85,12 +85,12 @@ def read_surfaces(
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, IntArray] | None = None) -> None:
-    """Write a mesh in metres; only .msh, gmsh's format, keeps its regions and surfaces (F, 3 | 4 | 6 | 8 | 9) by name.
+    """Writes a mesh in metres; only gmsh's format .msh keeps regions and named surfaces (F, 3 | 4 | 6 | 8 | 9).
 
     Raises:
-        MeshError: The extension is unknown to meshio, its format does not know such cells, or a cell belongs to several
-            regions, which gmsh's format cannot say.
-        DataFileError: The disk is full, or the place cannot be written to.
+        MeshError: The extension is unknown to meshio, the format does not support such cells, or a cell belongs to
+            several regions, which gmsh's format does not support.
+        DataFileError: The file cannot be written.
     """
     import meshio
 
@@ -123,13 +123,13 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
                 meshio.write(target, content, file_format="gmsh22", binary=False, float_fmt=".12g")
             else:
                 meshio.write(target, content, file_format=formats[0])
-            _volume_cells(mesh_arrays(str(target), formats[0]))  # some formats leave out what they do not know
+            _volume_cells(mesh_arrays(str(target), formats[0]))  # some formats silently drop unsupported cells
     except (meshio.WriteError, meshio.ReadError, MeshError, DecodingError, KeyError, SystemExit) as error:
         raise MeshError(f"{path}: meshio cannot write such a file ({error}); use .msh, .vtu or .vtk") from error
 
 
 def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[Mesh, Arrays, IntArray]:
-    """The mesh, the file's content, and the number of each vertex of the file in the mesh, -1 where it was dropped."""
+    """Returns the mesh, the file's content, and the index in the mesh of each vertex of the file, -1 if dropped."""
     if units not in METRES:
         raise MeshError(f"the units of a mesh file must be one of {', '.join(METRES)}, not {units}")
     if order not in (1, 2):
@@ -155,12 +155,12 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
 
 
 def _read_file(path: Path) -> Arrays:
-    """What `decoding.mesh_arrays` gives; only the package's own files are read in this process."""
+    """Returns the arrays of a file (`decoding.mesh_arrays`); only the package's own files are read in this process."""
     try:
         if path.parent.resolve() == Path(str(resources.files("warp_resphys") / "meshes")).resolve():
             return mesh_arrays(str(path))
-        status = path.stat()
-        return _decoded(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns)
+        stat = path.stat()
+        return _decoded(path.absolute(), stat.st_ino, stat.st_size, stat.st_mtime_ns)
     except DecodingError as error:
         raise MeshError(
             f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
@@ -169,25 +169,25 @@ def _read_file(path: Path) -> Arrays:
 
 @functools.lru_cache(maxsize=2)
 def _decoded(path: Path, *_: int) -> Arrays:
-    """The arrays of a file in one state; an experiment reads its mesh a dozen times, each a third of a second."""
+    """Returns the arrays of a file, cached by its state: an experiment reads its mesh a dozen times, 0.3 s each."""
     return decode("meshio", path)
 
 
 def _volume_cells(arrays: Arrays) -> IntArray:
-    """Cells of the one supported kind in a file, (M, 4 | 8 | 10); MeshError if there is not exactly one."""
+    """Returns the volume cells of a file (M, K); raises MeshError unless there is exactly one supported kind."""
     solids = {name.removeprefix("solid/"): cells for name, cells in arrays.items() if name.startswith("solid/")}
     if not solids:
         others = ", ".join(sorted({*arrays["types"].tolist()})) or "no cells"
         raise MeshError(f"the file has no tetrahedra or hexahedra (only: {others}); mesh the volume first")
     if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
-        wanted = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
-        raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {wanted}, and of one kind")
+        supported = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
+        raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {supported}, and of one kind")
     (cells,) = solids.values()
     return cells
 
 
 def _check_size(mesh: Mesh, units: str) -> None:
-    """Raises MeshError if the bounding box is so small or large that the units are likely wrong."""
+    """Raises MeshError if the size of the bounding box suggests wrong units."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= diagonal <= LONGEST_DIAGONAL:
         others = " or ".join(f"units={unit}" for unit in METRES if unit != units)

@@ -1,9 +1,9 @@
-"""Round and elliptic rods, straight or along a curve, of one radius or tapered, from hexahedra.
+"""Hexahedral meshes of round and elliptic rods, straight or curved, with constant or varying radius.
 
-The section is a square of cells in the middle, and rings of cells between its edge and the rim, so that no cell has a
-corner of 180 degrees. The nodes of the rim lie on a circle a little larger than the rod, so that the section's area is
-that of the rod: it weighs as much and stretches as easily as one without corners. With
-four straight sides a round one bends 5 % less easily, with eight or with quadratic cells by less than 0.3 %.
+The section is a square of cells in the middle, and rings of cells between the square and the rim, so that no cell has
+an angle of 180 degrees. The nodes of the rim lie on a circle slightly larger than the rod, so that the area of the
+section, and with it weight and axial stiffness, is exact. The bending stiffness of a round rod is too large by 5 % with
+four straight sides, by less than 0.3 % with eight or with quadratic cells.
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from ..io.errors import MeshError
 from .elements import BY_NODES, FACES, gauss_box
 from .mesh import FloatArray, IntArray, Mesh
 
-_TIE = 1e-6  # by which a tangent may be closer to an axis than to another that comes first
-_CORE = 0.55  # half of the middle square's diagonal over the radius
+_TIE = 1e-6  # tolerance in the choice of the axis most perpendicular to the tangent
+_CORE = 0.55  # half diagonal of the middle square, over the radius
 
 
 def rod(
@@ -27,23 +27,23 @@ def rod(
     nodes: int = 27,
     grading: float = 0.0,
 ) -> Mesh:
-    """A round rod of hexahedra, or an elliptic one.
+    """Returns a round or elliptic rod of hexahedra.
 
     Args:
-        centreline: (M, 3) points of its axis, straight or curved, joined by straight lines [m].
-        radii: one radius; (R, 2) arc lengths and the radii there, linear in between; or (R, 3) arc lengths and the two
-            semi-axes there, the first one along that coordinate axis which the rod crosses most squarely where it
-            begins, or the first of x, y and z that it crosses so [m].
-        layers: of cells along the axis.
-        core: cells along a side of the section's middle square.
-        rings: of cells around it.
-        nodes: of a cell, 8, 20 or 27.
-        grading: layers are as long as this power of the rod's radius there, of an ellipse the geometric mean of both: 0
-            for one length, up to 1 for layers that are as slender as one another.
+        centreline: (M, 3) points of the centreline, a polyline [m].
+        radii: one radius; (R, 2) arc lengths and radii, linearly interpolated; or (R, 3) arc lengths and two semi-axes,
+            the first one along the coordinate axis that is most perpendicular to the rod at its start (in the order x,
+            y, z if several are) [m].
+        layers: number of layers of cells along the rod.
+        core: cells along a side of the middle square.
+        rings: rings of cells around the square.
+        nodes: nodes of a cell, 8, 20 or 27.
+        grading: exponent of the radius (geometric mean of the semi-axes) in the length of a layer: 0 for equal lengths,
+            1 for equal aspect ratios.
 
     Raises:
-        MeshError: fewer than two points, a radius that is not positive, a count that is not a whole number, a grading
-            out of its range, or a curve that is bent more sharply than the rod is thick.
+        MeshError: fewer than two points, a radius that is not positive, a number that is not an integer, a grading out
+            of range, or a radius of curvature smaller than the rod's radius.
     """
     axis, order = np.asarray(centreline, dtype=np.float64), 1 if nodes == 8 else 2
     if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():
@@ -70,16 +70,16 @@ def rod(
         raise MeshError(f"the grading of a rod is {grading:g}: it must be from 0, for layers of one length, to 1.")
     along = _levels(float(length[-1]), profile, layers, order, grading)
     places, frames = _transported(axis, length, along)
-    radius = np.stack([np.interp(along, profile[:, 0], radii) for radii in profile[:, 1:].T], axis=1)
+    radius = np.stack([np.interp(along, profile[:, 0], semi_axis) for semi_axis in profile[:, 1:].T], axis=1)
     vertices = places[:, None] + np.einsum("sj,nj,sji->sni", radius, section, frames)
     first = np.arange(layers) * order
     levels = first[:, None] + np.arange(order + 1)
     cells = levels[:, None, None, None, :] * len(section) + squares[None, ..., None]  # (L, S, p + 1, p + 1, p + 1)
     element = BY_NODES[nodes]
     place = np.round((element.shape.nodes + 1.0) / 2.0 * order).astype(np.int64)
-    corners = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
-    used, numbers = np.unique(corners, return_inverse=True)
-    mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(corners.shape))
+    cells = cells.reshape(-1, *cells.shape[2:])[:, place[:, 0], place[:, 1], place[:, 2]]
+    used, numbers = np.unique(cells, return_inverse=True)
+    mesh = Mesh(vertices.reshape(-1, 3)[used], numbers.reshape(cells.shape))
     slopes = element.shape(element.rule[0])[1]
     if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
         raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")
@@ -87,7 +87,7 @@ def rod(
 
 
 def _levels(length: float, radii: FloatArray, layers: int, order: int, grading: float) -> FloatArray:
-    """(layers order + 1,) arc lengths [m] of the nodes of layers as long as a power of the radius says."""
+    """Returns the arc lengths (layers order + 1,) [m] of the nodes of graded layers."""
     ends = np.linspace(0.0, length, layers + 1)
     if grading != 0.0:
         fine = np.linspace(0.0, length, 1000 * layers + 1)
@@ -98,12 +98,12 @@ def _levels(length: float, radii: FloatArray, layers: int, order: int, grading: 
 
 
 def _section(core: int, rings: int, order: int) -> tuple[FloatArray, IntArray]:
-    """Nodes (n, 2) of a disc of radius one, and cells (S, order + 1, order + 1) of them, counter-clockwise.
+    """Returns nodes (n, 2) of a disc of radius one, and its cells (S, order + 1, order + 1), counter-clockwise.
 
     Args:
-        core: pieces between the nodes along a side of the square in the middle.
-        rings: pieces between its edge and the circle.
-        order: pieces along the edge of a cell.
+        core: node intervals along a side of the middle square.
+        rings: node intervals between the square and the circle.
+        order: node intervals along the edge of a cell.
     """
     side = np.linspace(-1.0, 1.0, core + 1) * _CORE / np.sqrt(2.0)
     square = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -125,7 +125,7 @@ def _section(core: int, rings: int, order: int) -> tuple[FloatArray, IntArray]:
 
 
 def _area(nodes: FloatArray, cells: IntArray) -> float:
-    """Of cells (S, p + 1, p + 1) of nodes (n, 2)."""
+    """Returns the area of cells (S, p + 1, p + 1) with nodes (n, 2)."""
     order = cells.shape[1] - 1
     shape = FACES[(order + 1) ** 2].shape
     place = np.round((shape.nodes + 1.0) / 2.0 * order).astype(np.int64)
@@ -135,7 +135,7 @@ def _area(nodes: FloatArray, cells: IntArray) -> float:
 
 
 def _transported(axis: FloatArray, length: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points (s, 3) of a polyline at arc lengths, and two unit vectors (s, 2, 3) across it there, that do not twist."""
+    """Returns points (s, 3) of a polyline at arc lengths, and two twist-free unit normals (s, 2, 3)."""
     places = np.stack([np.interp(along, length, axis[:, i]) for i in range(3)], axis=1)
     tangents = np.gradient(places, along, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)

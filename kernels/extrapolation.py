@@ -19,7 +19,7 @@ IMPROVEMENT = wp.constant(wp.float64(0.1))
 class History:
     """Corrections of the last steps."""
 
-    count: wp.array[int]  # (B) number of corrections stored, 0 to 3
+    stored: wp.array[int]  # (B) number of corrections, 0 to 3
     newest: wp.array[int]  # (B) index of the last one in the ring buffer
     order: wp.array[int]  # (B) number of corrections used for the next extrapolation
     start: wp.array2d[wp.vec3d]  # (B, N) position where inertia alone leads in the current step [m]
@@ -51,7 +51,7 @@ def record_solution(history: History, positions: wp.array2d[wp.vec3d], b: int, l
     """Stores the correction of a solution, and selects the order whose extrapolation was closest to it."""
     lanes = wp.block_dim()
     n = positions.shape[1]
-    count = history.count[b]
+    count = history.stored[b]
     place = (history.newest[b] + 1) % 3
     best = wp.int32(0)
     least = wp.float64(INFINITE)
@@ -68,5 +68,5 @@ def record_solution(history: History, positions: wp.array2d[wp.vec3d], b: int, l
         history.correction[b, place, i] = positions[b, i] - history.start[b, i]
     if lane == 0:
         history.newest[b] = place
-        history.count[b] = wp.min(count + 1, 3)
+        history.stored[b] = wp.min(count + 1, 3)
         history.order[b] = best

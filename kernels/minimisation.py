@@ -3,13 +3,13 @@
 One block of threads works on one environment. Every environment has its own phase, so that none waits for the line
 search of another:
 
-===============  ==================================================================================
-STARTING         the starting point is evaluated next
-NEEDS_DIRECTION  next: `project`, a solve with the matrix of the global step, `set_direction`
-TRIAL            the positions are a trial, which is evaluated next and tested by `accept`
-CONVERGED        the environment has converged
-FAILED           the environment has not converged and gets no further step
-===============  ==================================================================================
+==============  ====================================================================================
+START           the starting point is evaluated next
+NEED_DIRECTION  next: `project`, a solve with the matrix of the global step, `set_direction`
+LINE_SEARCH     the positions are a trial, which is evaluated next and tested by `accept`
+DONE            the environment has converged
+FAILED          the environment has not converged and gets no further step
+==============  ====================================================================================
 """
 
 import functools
@@ -24,7 +24,7 @@ from .reductions import block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
 
-STARTING, NEEDS_DIRECTION, TRIAL, CONVERGED, FAILED = (wp.constant(k) for k in range(5))
+START, NEED_DIRECTION, LINE_SEARCH, DONE, FAILED = (wp.constant(k) for k in range(5))
 FACTOR, CLAMPED_FACTOR = wp.constant(1), wp.constant(2)  # requests
 NEVER = wp.constant(2**28)  # a number of iterations that no solve reaches
 
@@ -99,8 +99,8 @@ def begin(
     """Sets the extrapolated starting point, and sums the quantities that stay constant during this solve."""
     b, lane = wp.tid()
     square = wp.float64(0.0)
-    count = history.count[b]
-    if progress.phase[b] != CONVERGED:  # The last solve failed.
+    count = history.stored[b]
+    if progress.phase[b] != DONE:  # The last solve failed.
         count = 0
     order = wp.min(history.order[b], count)
     for i in range(lane, force.shape[1], wp.block_dim()):
@@ -112,8 +112,8 @@ def begin(
         origin_out[b, i] = start
     square = block_sum(square)
     if lane == 0:
-        history.count[b] = count
-        progress.phase[b] = STARTING
+        history.stored[b] = count
+        progress.phase[b] = START
         progress.request[b] = 0
         if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
             progress.request[b] = FACTOR
@@ -136,7 +136,7 @@ def select_for_factorisation(
     """Selects the environments to factorise next, clamped or not, and deletes their L-BFGS pairs."""
     b = wp.tid()
     request = progress.request[b]
-    selected = progress.phase[b] == NEEDS_DIRECTION and request > 0
+    selected = progress.phase[b] == NEED_DIRECTION and request > 0
     active_out[b] = int(selected)
     clamp_out[b] = int(selected and request == CLAMPED_FACTOR)
     if selected:
@@ -226,7 +226,7 @@ def check_rounding(
         progress.check_rounding[b] = 0
         progress.rounding[b] = change
         if size <= change:
-            progress.phase[b] = CONVERGED
+            progress.phase[b] = DONE
 
 
 @wp.kernel
@@ -238,10 +238,10 @@ def summarise(progress: SolverProgress, summary_out: wp.array[int], active_out: 
     for b in range(lane, progress.phase.shape[0], wp.block_dim()):
         checks += wp.float64(progress.check_rounding[b])
         # A rounding check needs one more evaluation, even after the last step.
-        active_out[b] = int(progress.phase[b] < CONVERGED or progress.check_rounding[b] != 0)
-        if progress.phase[b] < CONVERGED:
+        active_out[b] = int(progress.phase[b] < DONE or progress.check_rounding[b] != 0)
+        if progress.phase[b] < DONE:
             active += ONE
-        if progress.phase[b] == NEEDS_DIRECTION:
+        if progress.phase[b] == NEED_DIRECTION:
             directions += ONE
             if progress.request[b] > 0:
                 factors += ONE
@@ -268,7 +268,7 @@ def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, iteratio
 @wp.func
 def abandon_search(progress: SolverProgress, tolerances: Tolerances, clamped: wp.array[wp.bool], b: int):
     """Ends a failed line search: requests a new factor, then a clamped one, before the environment counts as failed."""
-    progress.phase[b] = NEEDS_DIRECTION
+    progress.phase[b] = NEED_DIRECTION
     progress.stalls[b] += 1
     norm = progress.relative[b] * wp.max(progress.scale[b], tolerances.absolute)
     if may_be_rounding(progress, b, norm, progress.iterations[b], progress.stalls[b]):
@@ -339,7 +339,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
     ):
         """Computes the right-hand side of the solve in compact L-BFGS form; zero where no direction is needed."""
         b, lane = wp.tid()
-        if progress.phase[b] != NEEDS_DIRECTION:
+        if progress.phase[b] != NEED_DIRECTION:
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 right_out[b, p] = vector()
             return
@@ -381,7 +381,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is requested, once.
         """
         b, lane = wp.tid()
-        if progress.phase[b] != NEEDS_DIRECTION:
+        if progress.phase[b] != NEED_DIRECTION:
             return
         k = pairs.count[b]
         for i in range(k):
@@ -411,7 +411,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                 origin_out[b, v] = positions[b, v]
                 positions[b, v] = positions[b, v] + direction_out[b, v]
             if lane == 0:
-                progress.phase[b] = TRIAL
+                progress.phase[b] = LINE_SEARCH
                 progress.iterations[b] += 1
                 progress.since_factor[b] += 1
                 progress.halvings[b] = 0
@@ -492,7 +492,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         phase = progress.phase[b]
         lanes = wp.block_dim()
         n = positions.shape[1]
-        if phase != STARTING and phase != TRIAL:
+        if phase != START and phase != LINE_SEARCH:
             return
         energy = evaluation.energy[b]
         norm = evaluation.norm[b]
@@ -500,7 +500,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
         flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
         iterations = progress.iterations[b]
         stalls = progress.stalls[b]
-        if phase == TRIAL:
+        if phase == LINE_SEARCH:
             step = progress.step[b]
             slope = progress.slope[b]
             halvings = progress.halvings[b]
@@ -526,8 +526,8 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
                     progress.step[b] = step
                     progress.halvings[b] = halvings + 1
                     if at_rest:
-                        progress.phase[b] = CONVERGED
-                        history.count[b] = 0
+                        progress.phase[b] = DONE
+                        history.stored[b] = 0
                     elif given_up:
                         abandon_search(progress, tolerances, clamped, b)
                 return
@@ -542,7 +542,7 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             stalls = 0
         done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
         done = done and norm + scale < INFINITE
-        if phase == TRIAL and iterations == 1 and progress.force[b] == ZERO:
+        if phase == LINE_SEARCH and iterations == 1 and progress.force[b] == ZERO:
             done = done or within_rounding(tolerances, inertia, positions, direction, scale, b, lane)
         # A barrier: every thread has read the values of this environment before they are written.
         check = block_max(ZERO)
@@ -558,11 +558,11 @@ def minimisation_kernels(scalar: Any) -> SimpleNamespace:
             progress.smallest_norm[b] = wp.min(norm, smallest)
             progress.stalls[b] = stalls
             progress.check_rounding[b] = int(check)
-            progress.phase[b] = NEEDS_DIRECTION
+            progress.phase[b] = NEED_DIRECTION
             if progress.since_factor[b] >= 3 * tolerances.refactor_after:
                 progress.request[b] = FACTOR
             if done:
-                progress.phase[b] = CONVERGED
+                progress.phase[b] = DONE
             elif not wp.isfinite(relative) or iterations >= tolerances.max_iterations:
                 progress.phase[b] = FAILED
 

@@ -356,7 +356,7 @@ def test_directions_equal_the_bfgs_formula():
     minimiser.refactor(state)
     while min(map(len, pairs)) < 3 * memory:
         state = minimiser.advance(state)
-        waits = minimiser._counts["phase"] != kernels.NEEDS_DIRECTION
+        waits = minimiser._counts["phase"] != kernels.NEED_DIRECTION
         searches += int(waits.sum())
         for b in range(2):
             if waits[b]:
@@ -391,7 +391,7 @@ class OneVertex:
             setattr(self.evaluation, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
         self.evaluation.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
         self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
-        for name in ("count", "newest", "order"):
+        for name in ("stored", "newest", "order"):
             setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
         self.history.start = wp.zeros((1, 1), dtype=wp.vec3d, device="cpu")
         self.history.correction = wp.zeros((1, 3, 1), dtype=wp.vec3d, device="cpu")
@@ -401,7 +401,7 @@ class OneVertex:
         return warp_view(self.vectors[name], wp.vec3d)
 
     def accept(self):
-        self.progress.phase.fill_(kernels.TRIAL)
+        self.progress.phase.fill_(kernels.LINE_SEARCH)
         inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
         kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
         views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
@@ -443,8 +443,8 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
 @pytest.mark.parametrize(
     ("iterations", "factorisations", "clamped", "phase", "requested"),
     [
-        (5, 0, False, kernels.NEEDS_DIRECTION, kernels.FACTOR),
-        (5, 1, False, kernels.NEEDS_DIRECTION, kernels.CLAMPED_FACTOR),
+        (5, 0, False, kernels.NEED_DIRECTION, kernels.FACTOR),
+        (5, 1, False, kernels.NEED_DIRECTION, kernels.CLAMPED_FACTOR),
         (5, 1, True, kernels.FAILED, 0),
         (10, 0, False, kernels.FAILED, 0),
         (10, 1, False, kernels.FAILED, 0),

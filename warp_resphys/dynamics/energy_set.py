@@ -48,7 +48,7 @@ class EnergySet:
         method: Integrator,
         time_step: float,
     ) -> None:
-        self.placed = tuple(energies)
+        self.placed = tuple(placed)
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}

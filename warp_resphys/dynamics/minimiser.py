@@ -105,7 +105,7 @@ class Minimiser:
         tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
 
         history = kernels.History()
-        history.count, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
+        history.stored, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
         history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
 
         positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
@@ -240,7 +240,7 @@ class Minimiser:
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns directions, last residual over balancing forces, convergence and factorisations, (B,) each."""
         counts = self._counts
-        converged = counts["phase"] == kernels.CONVERGED
+        converged = counts["phase"] == kernels.DONE
         return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["factorisations"].long()
 
     def _check_and_read(self) -> Summary:

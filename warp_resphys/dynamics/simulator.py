@@ -463,7 +463,7 @@ class Simulator:
         try:
             x, report = solve(1.0, state.q if start is None else start.detach())
         except ConvergenceError as error:
-            log.info("retrying the equilibrium with loads increased in steps: %s", error)
+            log.debug("the equilibrium is computed under gradually increasing loads: %s", error)
             with torch.no_grad():
                 limited = self.settings.max_iterations < _MOST_ITERATIONS
                 near = ramp_loads(lambda share, at: solve(share, at)[0], state.q, error if limited else None)

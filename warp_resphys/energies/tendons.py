@@ -256,7 +256,7 @@ class TendonTerm(PartTerm):
         self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (.., P, N)
 
     @property
-    def _state(self) -> tuple[Any, Any]:
+    def _pull(self) -> tuple[Any, Any]:
         """Outputs of `before`: c and the tension of each tendon."""
         return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
@@ -266,7 +266,7 @@ class TendonTerm(PartTerm):
         tension, contraction, stiffness, *offsets = self.views(values)
         runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
         inputs = [active, *runs, tension, contraction, stiffness, self._toe, positions]
-        outputs = [*self._state, warp_view(self._spring, wp.vec3d)]
+        outputs = [*self._pull, warp_view(self._spring, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
@@ -274,12 +274,12 @@ class TendonTerm(PartTerm):
         tension, _, stiffness, *_ = self.views(values)
         return kernels.local_step, [
             *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),
-            *(*self._state, warp_view(self._spring, wp.vec3d), positions),
+            *(*self._pull, warp_view(self._spring, wp.vec3d), positions),
         ]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._state, positions]
+        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._pull, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -288,7 +288,7 @@ class TendonTerm(PartTerm):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
-            inputs = [s.nodes, s.gradients, self.part, self._state[0], positions]
+            inputs = [s.nodes, s.gradients, self.part, self._pull[0], positions]
             out = [warp_view(self._direction, wp.mat33d)]
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
@@ -313,7 +313,7 @@ class TendonTerm(PartTerm):
         own, (s,) = self.launcher, self.sets
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
-        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._state, *views]
+        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._pull, *views]
         outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),

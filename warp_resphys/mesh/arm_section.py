@@ -46,7 +46,7 @@ class Piece(NamedTuple):
         return np.asarray(self.centre + spoke * ((self.end - self.centre) / spoke) ** t, dtype=np.complex128)
 
     def moves(self, t: NDArray[np.float64], first: complex, last: complex, share: float = 1.0) -> ComplexArray:
-        """Returns the displacements of these points: interpolated on a line, radial by a share of the radius on an arc."""
+        """Returns displacements of these points: interpolated on a line, a share of the radius outwards on an arc."""
         if self.centre is None:
             return np.asarray(first * (1.0 - t) + last * t, dtype=np.complex128)
         moves = share * (self.points(t) - self.centre)

@@ -18,7 +18,7 @@ class Chamber:
     """A closed surface inside a body."""
 
     name: str  # name in results and messages
-    # (F, 3 | 4 | 6) vertices of the faces, as from `mesh.boundary_faces`: counter-clockwise seen from outside the solid,
+    # (F, 3 | 4 | 6) vertices of the faces as from `mesh.boundary_faces`, counter-clockwise seen from outside the solid,
     # that is, from inside the chamber
     faces: NDArray[np.int64]
 

@@ -124,8 +124,8 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
         if abs(filled - enclosed) <= _VOLUME * enclosed and np.abs(box - surface_box).max() <= _REACH * size:
             return quadratic(mesh) if order == 2 else mesh
         reason = (
-            f"{path}: tetrahedra of {size:g} m fill {1e6 * filled:.3g} of the {1e6 * enclosed:.3g} cm^3 that the surface "
-            "encloses: take a smaller size."
+            f"{path}: tetrahedra of {size:g} m fill {1e6 * filled:.3g} of the {1e6 * enclosed:.3g} cm^3 that the "
+            "surface encloses: take a smaller size."
         )
     raise MeshError(reason)
 

@@ -58,10 +58,10 @@ def test_the_loop_on_the_device_is_that_of_the_host(name, start, tolerance, fact
         trajectory = s.rollout(start(s), 8)
         return trajectory.final, trajectory.reports
 
-    found, reports = rolled()
-    expected, wanted = host(rolled)
-    torch.testing.assert_close(found.q, expected.q, rtol=0.0, atol=0.0)
-    for one, other in zip(reports, wanted, strict=True):
+    trajectory, reports = rolled()
+    expected, expected_reports = host(rolled)
+    torch.testing.assert_close(trajectory.q, expected.q, rtol=0.0, atol=0.0)
+    for one, other in zip(reports, expected_reports, strict=True):
         assert one.iterations.tolist() == other.iterations.tolist()
         assert one.factorisations.tolist() == other.factorisations.tolist()
         assert bool(one.converged.all())
@@ -74,8 +74,8 @@ def test_an_indefinite_hessian_is_clamped_where_it_is(factors, host, device):
         state = s.step(compressed(s))[0]
         return state.q, s.workspace(3).solver("dynamics", s.settings).hessian.clamped.tolist()
 
-    (q, clamped), (expected, wanted) = begun(), host(begun)
-    assert clamped == wanted == [False, True, False]
+    (q, clamped), (expected, expected_clamped) = begun(), host(begun)
+    assert clamped == expected_clamped == [False, True, False]
     torch.testing.assert_close(q, expected, rtol=0.0, atol=0.0)
 
 
@@ -95,12 +95,12 @@ def test_a_solve_is_one_launch(monkeypatch, device):
 def test_a_failure_is_said_and_mends_itself(device):
     s = simulator("quasi_newton", device, max_iterations=25)
     calm = bent(s)
-    wanted = s.step(calm)[0]
+    expected = s.step(calm)[0]
     wild = calm.v.clone()
     wild[1] += 1e3
     with pytest.raises(ConvergenceError, match="environment 1 of 3"):
         s.step(State(calm.q, wild))
-    torch.testing.assert_close(s.step(calm)[0].q, wanted.q, rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(s.step(calm)[0].q, expected.q, rtol=0.0, atol=1e-9)
 
 
 def test_tendons_have_the_host_in_the_loop(device):

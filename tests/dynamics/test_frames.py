@@ -28,8 +28,8 @@ def test_an_affine_map_has_the_rotation_of_its_polar_decomposition_everywhere(ki
     stretch = np.array([[1.4, 0.2, 0.0], [0.2, 0.6, 0.1], [0.0, 0.1, 0.9]])
     q = deformed(body, turn @ stretch)
     frames = VertexFrames(body, 0.01, q)
-    found = frames.rotations(q)
-    np.testing.assert_allclose(found[0], np.broadcast_to(turn, found[0].shape), atol=1e-12)
+    rotations = frames.rotations(q)
+    np.testing.assert_allclose(rotations[0], np.broadcast_to(turn, rotations[0].shape), atol=1e-12)
     force = torch.randn(q.shape, dtype=q.dtype, generator=torch.Generator().manual_seed(0))
     v = 0.0 * q
     np.testing.assert_allclose(frames.to_world(q, v, force)[0].numpy(), force[0].numpy() @ turn.T, atol=1e-12)
@@ -43,9 +43,9 @@ def test_a_twisted_beam_turns_from_slice_to_slice():
     x = body.mesh.vertices - [0.0, 0.01, 0.01]
     angles = np.radians(900.0) * x[:, 0]  # 90 degrees at the end
     q = torch.as_tensor(Rotation.from_euler("x", angles[:, None]).apply(x))[None]
-    found = VertexFrames(body, 0.01, q).rotations(q)[0].numpy()
+    rotations = VertexFrames(body, 0.01, q).rotations(q)[0].numpy()
     inside = (x[:, 0] > 0.01) & (x[:, 0] < 0.09)
-    turned = Rotation.from_matrix(found[inside]).as_euler("xyz")[:, 0]
+    turned = Rotation.from_matrix(rotations[inside]).as_euler("xyz")[:, 0]
     np.testing.assert_allclose(turned, angles[inside], atol=np.radians(1.5))
 
 
@@ -110,7 +110,7 @@ SWINGS = [
 def poses_of_two(steps=20):
     """(K + 1, 2, 6)."""
     return torch.from_numpy(
-        np.stack([prescribed(parse(MotionSettings, each), STEP * np.arange(steps + 1)) for each in SWINGS], 1)
+        np.stack([prescribed(parse(MotionSettings, swing), STEP * np.arange(steps + 1)) for swing in SWINGS], 1)
     )
 
 
@@ -131,8 +131,8 @@ class TestBaseFrame:
         base, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(2)
         q, v, force = (torch.randn(2, 7, 3, dtype=torch.float64, generator=random) for _ in range(3))
         for k in (0, 1, 7, 20, 25):
-            for found, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
-                torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-11)
+            for actual, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
+                torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-11)
             torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
 
     def test_a_window_has_the_frames_of_its_steps(self):
@@ -140,11 +140,11 @@ class TestBaseFrame:
         q, v = (torch.randn(2, 5, 3, dtype=torch.float64, generator=random) for _ in range(2))
         part = whole.during(torch.tensor([1, 0]), torch.tensor([0, 17]), 4)  # of the second body, then of the first
         for k in range(4):
-            found = part.enter(q, v, k)
+            windowed = part.enter(q, v, k)
             for row, (body, step) in enumerate([(1, k), (0, 17 + k)]):
                 expected = whole.enter(q[row].expand(2, -1, -1), v[row].expand(2, -1, -1), step)
-                for field, wanted in zip(found, expected, strict=True):
-                    torch.testing.assert_close(field[row], wanted[body], rtol=0.0, atol=1e-12)
+                for field, whole_field in zip(windowed, expected, strict=True):
+                    torch.testing.assert_close(field[row], whole_field[body], rtol=0.0, atol=1e-12)
 
     def test_a_roll_out_does_not_depend_on_how_base_and_gravity_are_turned_together(self):
         mesh = box_hexahedra(divisions=(3, 1, 1))
@@ -153,7 +153,7 @@ class TestBaseFrame:
         place = np.array([0.2, 0.1, -0.3])
         force = 0.02 * torch.randn(rest.shape, dtype=rest.dtype, generator=torch.Generator().manual_seed(1))
         fixed = select_vertices(mesh, x=0.0)
-        found = []
+        motions = []
         for rotation, at in ((Rotation.identity(), 0.0 * place), (turn, place)):
             body = Body(mesh, fixed)
             sim = Simulator(body, time_step=STEP, gravity=rotation.apply([0.0, 0.0, -9.81]), relative_tolerance=1e-12)
@@ -164,9 +164,9 @@ class TestBaseFrame:
             held = Inputs(fixed_positions=q[:, fixed])
             for k in range(10):
                 state, _ = sim.step(state, held.plus(predict(state, k)))
-            found.append((rotation.inv().apply(state.q[0].numpy() - at), rotation.inv().apply(state.v[0].numpy())))
-        assert np.abs(found[0][0] - mesh.vertices).max() > 1e-3
-        for first, second in zip(*found, strict=True):
+            motions.append((rotation.inv().apply(state.q[0].numpy() - at), rotation.inv().apply(state.v[0].numpy())))
+        assert np.abs(motions[0][0] - mesh.vertices).max() > 1e-3
+        for first, second in zip(*motions, strict=True):
             np.testing.assert_allclose(first, second, atol=1e-8)
 
 
@@ -174,9 +174,9 @@ def test_what_networks_are_told_of_a_base_are_its_velocities_and_gravity():
     times = STEP * np.arange(21)
     velocity, rate = np.array([0.1, -0.2, 0.3]), np.array([0.0, 0.0, 2.0])
     poses = torch.from_numpy(np.concatenate([times[:, None] * velocity, times[:, None] * rate], 1))[:, None]
-    told = base_movement(poses, STEP, torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64))[:, 0].numpy()
+    movement = base_movement(poses, STEP, torch.tensor([0.0, -9.81, 0.0], dtype=torch.float64))[:, 0].numpy()
     turned = Rotation.from_rotvec(times[:, None] * rate)
-    np.testing.assert_allclose(told[:, :3], turned[:-1].inv().apply(velocity), atol=1e-12)
-    np.testing.assert_allclose(told[:, 3:6], np.tile(rate, (20, 1)), rtol=1e-4)
-    np.testing.assert_allclose(told[1:, 6:12], told[:-1, :6], atol=1e-15)
-    np.testing.assert_allclose(told[:, 12:], turned[1:].inv().apply([0.0, -1.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(movement[:, :3], turned[:-1].inv().apply(velocity), atol=1e-12)
+    np.testing.assert_allclose(movement[:, 3:6], np.tile(rate, (20, 1)), rtol=1e-4)
+    np.testing.assert_allclose(movement[1:, 6:12], movement[:-1, :6], atol=1e-15)
+    np.testing.assert_allclose(movement[:, 12:], turned[1:].inv().apply([0.0, -1.0, 0.0]), atol=1e-12)

@@ -153,8 +153,8 @@ def test_a_difference_is_as_good_as_rounding_allows_and_says_how_good(scale, rou
         return math.exp(scale * step) / (3.5 + scale * step) + rounding * float(torch.randn(1, generator=random))
 
     exact = scale * (1.0 / 3.5 - 1.0 / 3.5**2)
-    found, uncertainty = central_difference(function)
-    assert abs(found - exact) < max(1e-8 * exact, 20.0 * rounding)
+    numerical, uncertainty = central_difference(function)
+    assert abs(numerical - exact) < max(1e-8 * exact, 20.0 * rounding)
     assert uncertainty < max(1e-8 * exact, 20.0 * rounding)
 
 
@@ -264,9 +264,9 @@ def test_static_equilibrium(kind):
 def test_static_equilibrium_does_not_depend_on_where_it_starts():
     s = simulator()
     start = pose(s, "bent", 1).q.requires_grad_(True)
-    found = s.static_equilibrium(start=start)
-    torch.testing.assert_close(found.q.detach(), s.static_equilibrium().q, rtol=0.0, atol=1e-10)
-    assert not found.q.requires_grad
+    state = s.static_equilibrium(start=start)
+    torch.testing.assert_close(state.q.detach(), s.static_equilibrium().q, rtol=0.0, atol=1e-10)
+    assert not state.q.requires_grad
 
 
 def test_fixed_velocities_and_positions_of_fixed_vertices_have_no_hidden_influence():
@@ -284,10 +284,10 @@ def test_gradients_add_up_over_a_shared_parameter():
     s = simulator()
     state = pose(s, "bent", 3)
     shared = torch.tensor(2e5, dtype=torch.float64, requires_grad=True)
-    each = torch.full((3, 1), 2e5, dtype=torch.float64, requires_grad=True)
+    separate = torch.full((3, 1), 2e5, dtype=torch.float64, requires_grad=True)
     weights = noise(*state.q.shape)
     gradients = []
-    for e in (shared, each):
+    for e in (shared, separate):
         q = s.rollout(state, 2, parameters={"youngs_modulus": e}).q[-1]
         gradients.append(torch.autograd.grad((weights * q).sum(), e)[0])
     torch.testing.assert_close(gradients[0], gradients[1].sum(), rtol=1e-9, atol=0.0)

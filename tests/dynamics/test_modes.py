@@ -58,7 +58,7 @@ def test_a_ring_whose_axes_weigh_the_same_has_one_basis(waves):
     radial = np.stack([0.0 * angles, np.cos(angles), np.sin(angles)], 1)
     pair = np.stack([np.cos(waves * angles), np.sin(waves * angles)], 1) / np.sqrt(12.0)
     shapes = (radial[:, :, None] * pair[:, None]).reshape(-1, 2)
-    found = [fix_signs(align_degenerate_modes(np.ones(2), turn(shapes, seed), radial, 1e-4)) for seed in range(4)]
-    assert max(np.abs(other - found[0]).max() for other in found) < 1e-12
+    bases = [fix_signs(align_degenerate_modes(np.ones(2), turn(shapes, seed), radial, 1e-4)) for seed in range(4)]
+    assert max(np.abs(other - bases[0]).max() for other in bases) < 1e-12
     apart = align_degenerate_modes(np.array([1.0, 1.1]), shapes, radial, 1e-4)
     np.testing.assert_allclose(np.abs(apart), np.abs(shapes), atol=1e-12)

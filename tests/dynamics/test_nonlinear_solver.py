@@ -48,8 +48,8 @@ def test_linear_solvers_find_the_same_step():
     for kind in ("banded", "tiled", "dense", "sparse", "multigrid"):
         s = simulator(linear_solver=kind)
         results.append(s.step(pose(s, "bent", 2))[0].q)
-    for found in results[1:]:
-        torch.testing.assert_close(found, results[0], rtol=0.0, atol=1e-10)
+    for result in results[1:]:
+        torch.testing.assert_close(result, results[0], rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -57,15 +57,15 @@ def test_linear_solvers_find_the_same_step():
 def test_factors_in_single_precision_lead_to_the_same_residual(name, poissons_ratio, device):
     """And take hardly more iterations: 1e-8 is a hundredth of what float32 resolves of these forces."""
     material = replace(MATERIAL, poissons_ratio=poissons_ratio)
-    found = {}
+    results = {}
     for factors in ("double", "single"):
         s = simulator(name, material, device=device, relative_tolerance=1e-8, factors=factors, max_iterations=5000)
         trajectory = s.rollout(pose(s, "bent", 2), 4)
         assert all(float(report.relative_residual.max()) <= 1e-8 for report in trajectory.reports)
-        found[factors] = trajectory.q, sum(int(report.iterations.sum()) for report in trajectory.reports)
-    torch.testing.assert_close(found["single"][0], found["double"][0], rtol=0.0, atol=1e-8)
-    assert found["single"][0].dtype == torch.float64
-    assert found["single"][1] <= 1.25 * found["double"][1]
+        results[factors] = trajectory.q, sum(int(report.iterations.sum()) for report in trajectory.reports)
+    torch.testing.assert_close(results["single"][0], results["double"][0], rtol=0.0, atol=1e-8)
+    assert results["single"][0].dtype == torch.float64
+    assert results["single"][1] <= 1.25 * results["double"][1]
 
 
 def test_solver_finds_the_minimum_and_reports_it():
@@ -162,9 +162,9 @@ def test_float32_runs_and_agrees(name, device):
         device=device,
     )
     reference = double.rollout(pose(double, "bent", 2), 3).q
-    found = single.rollout(pose(single, "bent", 2), 3)
-    assert found.q.dtype == torch.float32
-    torch.testing.assert_close(found.q.double(), reference, rtol=0.0, atol=2e-5)
+    trajectory = single.rollout(pose(single, "bent", 2), 3)
+    assert trajectory.q.dtype == torch.float32
+    torch.testing.assert_close(trajectory.q.double(), reference, rtol=0.0, atol=2e-5)
 
 
 @pytest.fixture
@@ -189,11 +189,11 @@ def test_float32_converges_for_a_nearly_incompressible_solid(pulled_beam, name, 
     make, held = pulled_beam
     reference = make(device=device).rollout(State(held.q.to(device), held.v.to(device)), 20)
     single = make(solver=name, relative_tolerance=tolerance, dtype=torch.float32, device=device)
-    found = single.rollout(State(single.tensor(held.q), single.tensor(held.v)), 20)
-    assert all(bool(r.converged.all()) for r in found.reports)
-    assert max(float(r.relative_residual.max()) for r in found.reports) <= tolerance
-    assert found.q.dtype == torch.float32
-    torch.testing.assert_close(found.q.double(), reference.q, rtol=0.0, atol=2e-8)
+    trajectory = single.rollout(State(single.tensor(held.q), single.tensor(held.v)), 20)
+    assert all(bool(r.converged.all()) for r in trajectory.reports)
+    assert max(float(r.relative_residual.max()) for r in trajectory.reports) <= tolerance
+    assert trajectory.q.dtype == torch.float32
+    torch.testing.assert_close(trajectory.q.double(), reference.q, rtol=0.0, atol=2e-8)
 
 
 def test_float32_gradients_of_a_nearly_incompressible_solid(pulled_beam):
@@ -215,10 +215,10 @@ def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
     make, held = pulled_beam
     start = State(held.q + 1000.0, held.v)
     exact = make(0.495, solver="newton").step(start)[0]
-    found, report = make(0.495, solver="projective_dynamics").step(start)
+    state, report = make(0.495, solver="projective_dynamics").step(start)
     assert bool(report.converged)
     assert float(report.relative_residual) < 1.5e-6
-    torch.testing.assert_close(found.q, exact.q, rtol=0.0, atol=2e-10)
+    torch.testing.assert_close(state.q, exact.q, rtol=0.0, atol=2e-10)
 
 
 @pytest.mark.parametrize("linear_solver", ["banded", "tiled", "dense", "sparse", "multigrid"])
@@ -229,20 +229,20 @@ def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_sol
         pytest.skip("banded factors are the CPU's")
     s = simulator(name, device=device, linear_solver=linear_solver, on_failure="count", max_iterations=500)
     calm = pose(s, "bent", 2)
-    wanted = [s.step(calm)]
-    wanted.append(s.step(wanted[0][0]))
+    expected = [s.step(calm)]
+    expected.append(s.step(expected[0][0]))
     wild = calm.v.clone()
     wild[0] += speed
     new, report = s.step(State(calm.q, wild))
     assert bool(report.converged[1])
     assert bool(torch.isfinite(new.q).all())
-    torch.testing.assert_close(new.q[1], wanted[0][0].q[1], rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(new.q[1], expected[0][0].q[1], rtol=0.0, atol=1e-9)
     state = State(torch.stack([calm.q[0], new.q[1]]), torch.stack([calm.v[0], new.v[1]]))
     for step in range(2):
         state, report = s.step(state)
         assert bool(report.converged.all())
-        assert int(report.iterations.max()) <= 2 * max(int(r.iterations.max()) for _, r in wanted)
-        torch.testing.assert_close(state.q[0], wanted[step][0].q[0], rtol=0.0, atol=1e-9)
+        assert int(report.iterations.max()) <= 2 * max(int(r.iterations.max()) for _, r in expected)
+        torch.testing.assert_close(state.q[0], expected[step][0].q[0], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", SOLVERS)

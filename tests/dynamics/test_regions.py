@@ -53,8 +53,10 @@ def test_gradients_by_the_constants_of_a_region(name):
     value = torch.tensor([float(simulator.constants[name])], dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(loss(value), value)
     with torch.no_grad():
-        found, uncertain = central_difference(lambda x: float(loss(value * (1.0 + 1e-3 * x))))
-    assert float(1e-3 * (gradient * value).detach()) == pytest.approx(found, abs=3.0 * uncertain + 1e-6 * abs(found))
+        expected, uncertain = central_difference(lambda x: float(loss(value * (1.0 + 1e-3 * x))))
+    assert float(1e-3 * (gradient * value).detach()) == pytest.approx(
+        expected, abs=3.0 * uncertain + 1e-6 * abs(expected)
+    )
 
 
 def test_regions_with_a_material_cover_every_cell_once():
@@ -126,8 +128,8 @@ def test_a_rigid_box_turns_as_eulers_equations_say(integrator, order):
         v = torch.linalg.cross(torch.as_tensor(spin).expand_as(arm), arm)
         q = simulator.rollout(State(start.q, v), steps).q[-1, 0].numpy()
         assert deviation(mesh, np.arange(2), q)[0] < 1e-4
-        wanted = arm[0].numpy() @ turn.T + start.q.mean(1).numpy()
-        errors.append(np.abs(q - wanted).max())
+        expected = arm[0].numpy() @ turn.T + start.q.mean(1).numpy()
+        errors.append(np.abs(q - expected).max())
     assert np.log2(errors[0] / errors[1]) > order - 0.3
     assert errors[1] < (2e-2, 2e-3)[order - 1]
 
@@ -151,8 +153,8 @@ def test_gradients_through_a_rigid_part(name):
         one = central_difference(lambda x: float(loss(value * (1.0 + 1e-2 * x), load)))
         two = central_difference(lambda x: float(loss(value, load + 1e-1 * x)))
     slopes = (1e-2 * by_value * value.detach(), 1e-1 * by_load)
-    for found, (wanted, uncertain) in zip(slopes, (one, two), strict=True):
-        assert float(found) == pytest.approx(wanted, abs=3.0 * uncertain + 1e-6 * abs(wanted))
+    for slope, (expected, uncertain) in zip(slopes, (one, two), strict=True):
+        assert float(slope) == pytest.approx(expected, abs=3.0 * uncertain + 1e-6 * abs(expected))
 
 
 def test_boxes_that_are_glued_bend_like_one():
@@ -178,8 +180,8 @@ def test_modes_and_stiffness_of_a_body_with_a_rigid_part():
     other = Simulator(clamped(), stiff)
     force = np.zeros((3 * body.n_vertices, 1))
     force[-1] = 1e-3
-    moved, wanted = (RestStiffness(s).displacements(force) for s in (simulator, other))
-    np.testing.assert_allclose(moved, wanted, atol=1e-3 * np.abs(wanted).max())
+    moved, expected = (RestStiffness(s).displacements(force) for s in (simulator, other))
+    np.testing.assert_allclose(moved, expected, atol=1e-3 * np.abs(expected).max())
     assert vibration_modes(simulator, 4).shape == (3 * body.n_vertices, 4)
 
 

@@ -32,15 +32,15 @@ def test_an_equilibrium_that_is_far_is_reached_under_growing_loads():
     """Where all of them at once take too many iterations; with a gradient as if they had not."""
     mesh = box_hexahedra((0.12, 0.02, 0.02), (6, 2, 2))
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
-    found = []
+    results = []
     for most in (2000, 8):
         modulus = torch.full((1, 1), 5e4, dtype=torch.float64, requires_grad=True)
         simulator = Simulator(body, Corotated(5e4, 0.45), solver=SolverSettings(max_iterations=most))
         q = simulator.static_equilibrium(parameters={"youngs_modulus": modulus}).q
         q[..., 2].mean().backward()
-        found.append((q.detach(), modulus.grad))
-    assert float((found[0][0] - simulator.rest_positions).abs().max()) > 0.05
-    torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-9)
+        results.append((q.detach(), modulus.grad))
+    assert float((results[0][0] - simulator.rest_positions).abs().max()) > 0.05
+    torch.testing.assert_close(results[1], results[0], rtol=1e-6, atol=1e-9)
 
 
 def test_a_clamp_moved_at_constant_speed_has_that_velocity_with_every_integrator():

@@ -51,7 +51,7 @@ def rolled(motion, rows, **settings):
 
 @pytest.mark.parametrize(
     ("name", "linear_solver"),
-    [("newton", "banded"), *(("quasi_newton", each) for each in ("banded", "tiled", "dense", "sparse"))],
+    [("newton", "banded"), *(("quasi_newton", linear) for linear in ("banded", "tiled", "dense", "sparse"))],
 )
 def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
     """Its directions, line searches and factors are its own: nothing depends on its neighbours."""
@@ -71,10 +71,10 @@ def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
 @pytest.mark.parametrize(("count", "linear_solver"), [(2, "banded"), (3, "banded"), (3, "tiled"), (3, "sparse")])
 def test_threads_change_nothing(motion, monkeypatch, count, linear_solver):
     results = []
-    for each in (1, count):
-        threads(monkeypatch, each)
+    for number in (1, count):
+        threads(monkeypatch, number)
         sim = simulator(linear_solver=linear_solver)
-        assert len(sim.workspace(SIZE).shards) == (0 if each == 1 else count)
+        assert len(sim.workspace(SIZE).shards) == (0 if number == 1 else count)
         start, forces, modulus = motion
         leaves = [
             t.clone().requires_grad_() for t in (start.q, start.v, forces, modulus, torch.tensor([1000.0]).double())
@@ -155,5 +155,5 @@ def test_shards_cover_the_batch(monkeypatch):
     assert shards_of(64, torch.device("cuda")) == []
     for batch in (4, 9, 64):
         rows = shards_of(batch, cpu)
-        assert [i for each in rows for i in range(batch)[each]] == list(range(batch))
+        assert [i for part in rows for i in range(batch)[part]] == list(range(batch))
         assert len(rows) == min(4, batch // 2)

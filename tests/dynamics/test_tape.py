@@ -92,10 +92,10 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
     assert len(rollout.reports) == STEPS
     seeds = [wp.from_torch(w.contiguous(), dtype=wp.vec3d) for w in weights]
     tape.backward(grads={rollout.q: seeds[0], rollout.v: seeds[1]})
-    for (name, value), wanted in zip(arrays.items(), expected, strict=True):
+    for (name, value), gradient in zip(arrays.items(), expected, strict=True):
         got = wp.to_torch(value.grad)
-        assert torch.linalg.norm(got - wanted) <= 1e-12 * torch.linalg.norm(wanted), name
-        assert torch.linalg.norm(wanted) > 0.0, name
+        assert torch.linalg.norm(got - gradient) <= 1e-12 * torch.linalg.norm(gradient), name
+        assert torch.linalg.norm(gradient) > 0.0, name
 
 
 def taped_loss(simulator: Simulator, strength: wp.array, modulus: wp.array) -> tuple[wp.Tape, wp.array]:

@@ -38,7 +38,7 @@ def evaluated(mesh):
 def test_they_find_what_threads_of_vertices_find(name, monkeypatch):
     expected = evaluated(MESHES[name])
     monkeypatch.setattr(Launcher, "by_cells", True)
-    found = evaluated(MESHES[name])
-    for one, other in zip(found, expected, strict=True):
+    results = evaluated(MESHES[name])
+    for one, other in zip(results, expected, strict=True):
         assert float(other.abs().max()) > 0.0
         torch.testing.assert_close(one, other, rtol=0.0, atol=1e-12 * float(other.abs().max()))

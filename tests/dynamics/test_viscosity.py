@@ -44,13 +44,13 @@ def test_a_load_creeps_as_the_standard_linear_solid(integrator):
     (ratio, time), h = CREEPING.prony[0], 0.01
     light = replace(CREEPING, density=1e-3)  # without inertia
     simulator = Simulator(CLAMPED, light, h, WEIGHTLESS, integrator, TIGHT)
-    found = sag(simulator.rollout(simulator.rest_state(), 60, pull(1e-4)).q[1:, 0])
+    sags = sag(simulator.rollout(simulator.rest_state(), 60, pull(1e-4)).q[1:, 0])
     end = sag(simulator.static_equilibrium(pull(1e-4)).q[0])
     t = h * torch.arange(1, 61, dtype=torch.float64)
-    wanted = 1.0 - ratio / (1.0 + ratio) * torch.exp(-t / (time * (1.0 + ratio)))
-    np.testing.assert_allclose(found / end, wanted, atol=1e-2)
-    np.testing.assert_allclose((found / end)[20:], wanted[20:], atol=4e-3)
-    assert float(found[0] / end) < 0.7  # without creep it would be there at once
+    expected = 1.0 - ratio / (1.0 + ratio) * torch.exp(-t / (time * (1.0 + ratio)))
+    np.testing.assert_allclose(sags / end, expected, atol=1e-2)
+    np.testing.assert_allclose((sags / end)[20:], expected[20:], atol=4e-3)
+    assert float(sags[0] / end) < 0.7  # without creep it would be there at once
 
 
 def test_a_small_vibration_has_the_complex_modulus():
@@ -78,19 +78,19 @@ def test_a_small_vibration_has_the_complex_modulus():
     omega = complex(omega_0)
     for _ in range(100):
         omega = omega_0 * cmath.sqrt(1.0 + ratio * 1j * omega * time / (1.0 + 1j * omega * time))
-    found = exponent(replace(ELASTIC, prony=[(ratio, time)]))
+    rate = exponent(replace(ELASTIC, prony=[(ratio, time)]))
     assert omega.imag > 3.0  # otherwise nothing is seen
-    assert found[0] == pytest.approx(omega.real, rel=5e-3)
-    assert found[1] == pytest.approx(omega.imag, rel=0.03)
+    assert rate[0] == pytest.approx(omega.real, rel=5e-3)
+    assert rate[1] == pytest.approx(omega.imag, rel=0.03)
 
 
 def test_a_branch_much_shorter_than_a_step_is_kelvin_voigt_viscosity():
     ratio, time = 50.0, 1e-4
     state = pose(Simulator(CLAMPED, ELASTIC), "bent", 1)
     maxwell, kelvin = replace(ELASTIC, prony=[(ratio, time)]), replace(ELASTIC, stiffness_damping=ratio * time)
-    found = [Simulator(CLAMPED, m, solver=TIGHT).rollout(state, 5).q[-1] for m in (maxwell, kelvin, ELASTIC)]
-    torch.testing.assert_close(found[0], found[1], rtol=0.0, atol=1e-9)
-    assert float((found[1] - found[2]).abs().max()) > 1e-4
+    positions = [Simulator(CLAMPED, m, solver=TIGHT).rollout(state, 5).q[-1] for m in (maxwell, kelvin, ELASTIC)]
+    torch.testing.assert_close(positions[0], positions[1], rtol=0.0, atol=1e-9)
+    assert float((positions[1] - positions[2]).abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("implicit_euler", 1), ("bdf2", 2), ("midpoint", 2)])
@@ -125,7 +125,7 @@ def test_a_roll_out_goes_on_from_its_last_state(integrator):
     whole = simulator.rollout(simulator.rest_state(2), 8, pull(0.2, 2))
     half = simulator.rollout(simulator.rest_state(2), 4, pull(0.2, 2)).final
     assert half.memory["viscous_strain"].shape[:2] == (2, 2)
-    again = State.from_tensors({name: each.clone() for name, each in half.tensors().items()})
+    again = State.from_tensors({name: tensor.clone() for name, tensor in half.tensors().items()})
     torch.testing.assert_close(simulator.rollout(again, 4, pull(0.2, 2)).q[-1], whole.q[-1], rtol=0.0, atol=1e-11)
     relaxed = replace(again, memory={})
     assert float((simulator.rollout(relaxed, 4, pull(0.2, 2)).q[-1] - whole.q[-1]).abs().max()) > 1e-5
@@ -164,8 +164,8 @@ def test_gradients_of_what_the_branches_carry():
     carried = state.memory["viscous_strain"].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(carried), carried)
     with torch.no_grad():
-        wanted, _ = central_difference(lambda step: float(loss(carried + step * direction)))
-    assert float((gradient * direction).sum()) == pytest.approx(wanted, rel=1e-6)
+        expected, _ = central_difference(lambda step: float(loss(carried + step * direction)))
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-6)
 
 
 def test_branches_without_modulus_have_a_gradient():
@@ -180,8 +180,8 @@ def test_branches_without_modulus_have_a_gradient():
     (gradient,) = torch.autograd.grad(loss(zero), zero)
     step = torch.full((1, 1), 1e-5, dtype=torch.float64)
     with torch.no_grad():
-        wanted = (4.0 * loss(step) - loss(2.0 * step) - 3.0 * loss(0.0 * step)) / 2e-5
-    assert float(gradient) == pytest.approx(float(wanted), rel=1e-4)
+        expected = (4.0 * loss(step) - loss(2.0 * step) - 3.0 * loss(0.0 * step)) / 2e-5
+    assert float(gradient) == pytest.approx(float(expected), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -216,14 +216,14 @@ def test_configured_branches_are_those_of_the_material():
 
 def test_what_a_step_left_behind_has_no_part_in_a_pose():
     """Buffers of an earlier, viscous step are in no derivative of an equilibrium."""
-    found = []
+    gradients = []
     for steps in (0, 3):
         simulator = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
         simulator.rollout(pose(simulator, "bent", 1), steps) if steps else None
         modulus = torch.full((1, 1), 2e4, dtype=torch.float64, requires_grad=True)
         sag(simulator.static_equilibrium(pull(0.2), {"youngs_modulus": modulus}).q).sum().backward()
-        found.append(float(modulus.grad))
-    assert found[0] == pytest.approx(found[1], rel=1e-9)
+        gradients.append(float(modulus.grad))
+    assert gradients[0] == pytest.approx(gradients[1], rel=1e-9)
 
 
 def test_single_precision_keeps_its_type():

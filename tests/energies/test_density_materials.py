@@ -63,26 +63,26 @@ def responses(mesh, material, at):
     parameters = {"youngs_modulus": e, "poissons_ratio": nu}
     here = s.linearise(state, parameters={name: value.detach() for name, value in parameters.items()})
     x = state.q + 2e-4 * torch.sin(1e4 * state.q)
-    found = [here.residual(x)]
+    results = [here.residual(x)]
     here.update(x)
     potential = s.workspace(2).potential
-    found += [blocks.clone() for blocks in potential.tangents]
+    results += [blocks.clone() for blocks in potential.tangents]
     potential.update_tangent(torch.ones(2, dtype=torch.bool))
-    found += [blocks.clone() for blocks in potential.tangents]
+    results += [blocks.clone() for blocks in potential.tangents]
     end, _ = s.step(state, parameters=parameters)
     loss = (1e3 * torch.cos(torch.arange(3.0) + 1.0) * (end.q - state.q)).sum() + end.v.sum()
-    return [*found, *torch.autograd.grad(loss, [e, nu])]
+    return [*results, *torch.autograd.grad(loss, [e, nu])]
 
 
 @pytest.mark.parametrize("poissons_ratio", [0.3, 0.499])
 @pytest.mark.parametrize("at", ["rest", "bent"])
 @pytest.mark.parametrize("kind", MESHES)
 def test_a_described_material_is_the_hand_written_one(kind, at, poissons_ratio):
-    found = [
+    results = [
         responses(MESHES[kind], replace(material, poissons_ratio=poissons_ratio), at)
         for material in (Described(1e5, **DAMPED), StableNeoHookean(1e5, **DAMPED))
     ]
-    for number, (one, other) in enumerate(zip(*found, strict=True)):
+    for number, (one, other) in enumerate(zip(*results, strict=True)):
         # A gradient's error is that of the tangent times the ratio of the largest and the smallest stiffness.
-        relative = 1e-6 if number >= len(found[0]) - 2 else 2e-9
+        relative = 1e-6 if number >= len(results[0]) - 2 else 2e-9
         torch.testing.assert_close(one, other, rtol=0.0, atol=relative * float(other.abs().max()))

@@ -31,11 +31,11 @@ def pulled(slides):
     rest = s.rest_positions[s.fixed]
     moves = torch.as_tensor(slides)[:, None, None] * torch.as_tensor(np.isin(s.fixed.numpy(), RIGHT))[:, None]
     targets = rest + moves * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    state, found = s.rest_state(), []
+    state, deflections = s.rest_state(), []
     for target in targets:
         state, _ = s.step(state, Inputs(fixed_positions=target[None]))
-        found.append(float(state.memory["bristle_deflection"]))
-    return np.array(found)
+        deflections.append(float(state.memory["bristle_deflection"]))
+    return np.array(deflections)
 
 
 def test_the_force_approaches_the_friction_force_as_an_exponential():

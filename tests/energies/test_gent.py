@@ -17,7 +17,7 @@ MU, LIMIT, BULK = 90e3, 8.0, 90e8
 def pulled(stretches, material):
     """(T,) nominal stresses of a bar that is free at its sides [Pa], by the force that balances each stretch."""
     s = Simulator(Body(CUBE, fixed=select_vertices(CUBE, x=0.0)), material, gravity=WEIGHTLESS, solver=TIGHT)
-    here, found = s.linearise(s.rest_state(), parameters={"density": 1e-9}), []
+    here, stresses = s.linearise(s.rest_state(), parameters={"density": 1e-9}), []
     for stretch in stretches:
         # Nearly incompressible: the sides follow from what little the volume changes, by J - 1 = p / lambda.
         across = stretch**-0.5
@@ -27,8 +27,8 @@ def pulled(stretches, material):
             sideways = float(residual[select_vertices(CUBE, y=0.01), 1].sum())
             force = float(residual[select_vertices(CUBE, x=0.01), 0].sum())
             across -= sideways / (BULK * 1e-4 * stretch**2 * across**2)
-        found.append(force / 1e-4)
-    return np.array(found)
+        stresses.append(force / 1e-4)
+    return np.array(stresses)
 
 
 def test_uniaxial_tension_is_that_of_the_closed_form():
@@ -68,9 +68,9 @@ def test_the_limit_is_found_from_a_static_pull():
     def length(limit):
         return s.static_equilibrium(Inputs(force), {"limit": limit}).q[0, :, 0].max()
 
-    wanted, limit = length(torch.tensor(5.0)).detach(), torch.tensor(6.0, dtype=torch.float64, requires_grad=True)
+    target, limit = length(torch.tensor(5.0)).detach(), torch.tensor(6.0, dtype=torch.float64, requires_grad=True)
     for _ in range(5):
-        miss = length(limit) - wanted
+        miss = length(limit) - target
         (slope,) = torch.autograd.grad(miss, limit)
         limit = (limit - miss.detach() / slope).detach().requires_grad_()
     assert limit.item() == pytest.approx(5.0, rel=1e-6)

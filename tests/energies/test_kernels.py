@@ -88,8 +88,8 @@ def reference_unimodular(f):
         return ((d - s) ** 2).sum(), np.array([slope[0] - slope[2], slope[1] - slope[2]])
 
     starts = [(a, b) for a in (-0.7, 0.0, 0.7) for b in (-0.7, 0.0, 0.7)]
-    found = [scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts]
-    best = min(found, key=lambda result: result.fun).x
+    results = [scipy.optimize.minimize(distance, start, jac=True, options={"gtol": 1e-12}) for start in starts]
+    best = min(results, key=lambda result: result.fun).x
     return u * np.exp([best[0], best[1], -best.sum()]) @ vt
 
 
@@ -110,8 +110,8 @@ def reference_energy(f, model):
 
 def test_polar_rotation_is_the_nearest_rotation(device):
     stress, _ = stress_and_energy(GRADIENTS, shape=0.5, volume=0.0, device=torch.device(device))
-    wanted = [u @ vt for u, _, vt in map(signed_svd, GRADIENTS)]
-    np.testing.assert_allclose(GRADIENTS - stress, wanted, atol=1e-12)
+    rotations = [u @ vt for u, _, vt in map(signed_svd, GRADIENTS)]
+    np.testing.assert_allclose(GRADIENTS - stress, rotations, atol=1e-12)
 
 
 def test_nearest_unimodular_matrix_has_determinant_one_and_is_the_nearest(device):
@@ -193,10 +193,10 @@ def test_clamped_tangent_is_the_eigenvalue_clamp_at_every_point(model):
     np.testing.assert_allclose(exact, exact.transpose(0, 2, 1), atol=1e-9 * np.abs(exact).max())
     values, vectors = np.linalg.eigh(exact)
     assert (values[:, 0] < -0.1).sum() > len(values) / 4  # otherwise there is nothing to clamp
-    wanted = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0), vectors)
+    expected = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0), vectors)
     everywhere = torch.ones(potential.batch, dtype=torch.bool)
     clamped = dense_tangent(potential, everywhere)
-    np.testing.assert_allclose(clamped, wanted, atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_allclose(clamped, expected, atol=1e-9 * np.abs(exact).max())
 
 
 def test_each_environment_is_clamped_on_its_own():

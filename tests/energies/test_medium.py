@@ -58,10 +58,10 @@ def test_a_body_that_sinks_reaches_its_terminal_velocity(mesh):
     """Where its weight, less that of what it displaces, is rho / 2 v^2 times its drag coefficients and areas."""
     normal, tangential, density = 1.1, 0.3, 800.0
     sim = simulator(Medium(density, normal=normal, tangential=tangential), MESHES[mesh], gravity=9.81)
-    found = sim.rollout(sim.rest_state(), 200).v[-1, 0, :, 2]
+    speeds = sim.rollout(sim.rest_state(), 200).v[-1, 0, :, 2]
     resistance = 0.5 * density * (normal * ACROSS + tangential * ALONG)
-    wanted = math.sqrt((1.0 - density / 1000.0) * MASS * 9.81 / resistance)
-    assert float(found.mean()) == pytest.approx(-wanted, rel=2e-3)
+    expected = math.sqrt((1.0 - density / 1000.0) * MASS * 9.81 / resistance)
+    assert float(speeds.mean()) == pytest.approx(-expected, rel=2e-3)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -81,11 +81,11 @@ def test_added_mass_shares_a_push(integrator):
     push = torch.zeros_like(sim.rest_positions)[None]
     masses = sim.prepare().mass
     push[..., 2] = force * masses / masses.sum()
-    found = sim.rollout(sim.rest_state(), steps, Inputs(external_force=push)).v[-1, 0, :, 2] @ (
+    speed = sim.rollout(sim.rest_state(), steps, Inputs(external_force=push)).v[-1, 0, :, 2] @ (
         masses[0] / masses.sum()
     )
-    wanted = force / (MASS + 1000.0 * layer * ACROSS) * steps * sim.time_step
-    assert float(found) == pytest.approx(wanted, rel=0.01)
+    expected = force / (MASS + 1000.0 * layer * ACROSS) * steps * sim.time_step
+    assert float(speed) == pytest.approx(expected, rel=0.01)
 
 
 def test_what_is_as_heavy_as_the_medium_floats():
@@ -148,9 +148,9 @@ def test_the_tangent_is_the_derivative_of_the_force():
     direction[:, sim.fixed] = x[:, sim.fixed] = 0.0
     x[:, sim.fixed] = rest.q[:, sim.fixed]
     step = 1e-8
-    wanted = (lines.residual(x + step * direction) - lines.residual(x - step * direction)) / (2.0 * step)
+    expected = (lines.residual(x + step * direction) - lines.residual(x - step * direction)) / (2.0 * step)
     lines.factorise(x)
-    torch.testing.assert_close(lines.product(direction), wanted, rtol=1e-4, atol=1e-5 * float(wanted.abs().max()))
+    torch.testing.assert_close(lines.product(direction), expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize(

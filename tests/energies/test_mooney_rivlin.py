@@ -23,8 +23,8 @@ RUBBER = MooneyRivlin(36e3, 8e3, 4e6, mass_damping=0.5, stiffness_damping=2e-3)
 
 def gradients():
     random = np.random.default_rng(0)
-    found = [np.eye(3) + spread * random.normal(size=(8, 3, 3)) for spread in (0.02, 0.3, 0.8)]
-    return np.concatenate([np.eye(3)[None], *found, [np.diag([1.0, 1.2, 0.0]), np.diag([1.1, 0.9, -0.2])]])
+    gradients = [np.eye(3) + spread * random.normal(size=(8, 3, 3)) for spread in (0.02, 0.3, 0.8)]
+    return np.concatenate([np.eye(3)[None], *gradients, [np.diag([1.0, 1.2, 0.0]), np.diag([1.1, 0.9, -0.2])]])
 
 
 def potential_of(f):
@@ -78,8 +78,8 @@ def test_tangent_and_its_clamp():
     exact = tangent(potential_of(f), None)
     direction = np.random.default_rng(2).normal(size=f.shape)
     slope = (response(f + step * direction)[1] - response(f - step * direction)[1]) / (2 * step)
-    found = (exact @ direction.reshape(-1, 9, 1)).reshape(f.shape)
-    np.testing.assert_allclose(found, slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+    product = (exact @ direction.reshape(-1, 9, 1)).reshape(f.shape)
+    np.testing.assert_allclose(product, slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
     values, vectors = np.linalg.eigh(exact)
     assert (values < -0.1).any()
     clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
@@ -121,8 +121,8 @@ def test_a_bar_that_is_stretched():
     stretch = np.array([0.5, 0.8, 1.0, 1.5, 3.0])
     across = stretch**-0.5
     _, stress = response(np.stack([np.diag([x, y, y]) for x, y in zip(stretch, across, strict=True)]))
-    found = stress[:, 0, 0] - across / stretch * stress[:, 1, 1]  # less the pressure that keeps the sides free
-    np.testing.assert_allclose(found, 2.0 * (stretch - stretch**-2) * (MODULI[0] + MODULI[1] / stretch), atol=1e-12)
+    tension = stress[:, 0, 0] - across / stretch * stress[:, 1, 1]  # less the pressure that keeps the sides free
+    np.testing.assert_allclose(tension, 2.0 * (stretch - stretch**-2) * (MODULI[0] + MODULI[1] / stretch), atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "value"), [("c10", -1), ("bulk_modulus", 0)])

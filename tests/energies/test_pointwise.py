@@ -112,7 +112,7 @@ def acting(s, batch=2):
 
 @pytest.mark.parametrize("at", ["rest", "bent"])
 def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
-    found = []
+    results = []
     for energy in (FIBRES, Fibre()):
         s = simulator(energy)
         state, stiffness = pose(s, at, 2), torch.full((2, 1), 4e4, dtype=torch.float64, requires_grad=True)
@@ -124,8 +124,8 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
         product = here.product(torch.sin(50.0 * x))
         end, _ = s.step(state, inputs, {"muscle_stiffness": stiffness})
         leaves = [*inputs.actuation.values(), stiffness]
-        found.append([residual, product, *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves)])
-    for one, other in zip(*found, strict=True):
+        results.append([residual, product, *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves)])
+    for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=2e-9, atol=1e-9 * float(other.abs().max()))
 
 
@@ -140,8 +140,8 @@ def test_a_clamped_tangent_has_no_negative_eigenvalue():
     p.update_tangent(torch.tensor([True, False]))
     values, vectors = torch.linalg.eigh(exact[0, :, 0])
     assert float(values.min()) < -1.0
-    wanted = vectors @ torch.diag_embed(values.clamp_min(0.0)) @ vectors.mT
-    torch.testing.assert_close(p.tangents[-1][0, :, 0], wanted, rtol=0.0, atol=1e-9 * float(values.max()))
+    expected = vectors @ torch.diag_embed(values.clamp_min(0.0)) @ vectors.mT
+    torch.testing.assert_close(p.tangents[-1][0, :, 0], expected, rtol=0.0, atol=1e-9 * float(values.max()))
     torch.testing.assert_close(p.tangents[-1][1], exact[1])
 
 

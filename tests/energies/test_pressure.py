@@ -189,14 +189,14 @@ def test_held_pressure_is_computed_in_float64_where_states_are_float32():
     double, single = (chambers_of(simulator(dtype=dtype), 2) for dtype in (torch.float64, torch.float32))
     q = moved(simulator()).float().requires_grad_()
     pressure = torch.tensor([[1e4, -3e3], [2e3, 5e3]], requires_grad=True)
-    exact_q, exact_pressure = (each.detach().double().requires_grad_() for each in (q, pressure))
-    found, exact = single.force(q, pressure), double.force(exact_q, exact_pressure)
-    assert torch.equal(found, exact.float())
+    exact_q, exact_pressure = (tensor.detach().double().requires_grad_() for tensor in (q, pressure))
+    force, exact = single.force(q, pressure), double.force(exact_q, exact_pressure)
+    assert torch.equal(force, exact.float())
     assert torch.equal(single.conjugates(q), double.conjugates(exact_q).float())
-    weights = noise(*found.shape, seed=5).float()
-    gradients = torch.autograd.grad(found, (q, pressure), weights)
-    wanted = torch.autograd.grad(exact, (exact_q, exact_pressure), weights.double())
-    assert all(torch.equal(each, one.float()) for each, one in zip(gradients, wanted, strict=True))
+    weights = noise(*force.shape, seed=5).float()
+    gradients = torch.autograd.grad(force, (q, pressure), weights)
+    expected = torch.autograd.grad(exact, (exact_q, exact_pressure), weights.double())
+    assert all(torch.equal(gradient, one.float()) for gradient, one in zip(gradients, expected, strict=True))
 
 
 def test_batch_under_pressure_equals_single_runs():

@@ -40,7 +40,7 @@ def simulator(length=0.2, compliance=0.0, material=SOFT, mesh=BEAM, tied=TIP, st
 
 
 def weight(*kilograms):
-    return Inputs(payload=torch.tensor([[each] for each in kilograms], dtype=torch.float64))
+    return Inputs(payload=torch.tensor([[mass] for mass in kilograms], dtype=torch.float64))
 
 
 def swing(sim, angle, steps, mass=0.05, length=0.2):
@@ -49,38 +49,38 @@ def swing(sim, angle, steps, mass=0.05, length=0.2):
     tied = rest.q[:, TIP].mean(1, keepdim=True)
     offset = length * torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=torch.float64)
     state = replace(rest, memory={"payload_position": tied + offset, "payload_velocity": torch.zeros_like(tied)})
-    found = [offset]
+    offsets = [offset]
     for _ in range(steps):
         state, _ = sim.step(state, weight(mass))
-        found.append((state.memory["payload_position"] - state.q[:, TIP].mean(1, keepdim=True))[0, 0])
-    return torch.stack(found)
+        offsets.append((state.memory["payload_position"] - state.q[:, TIP].mean(1, keepdim=True))[0, 0])
+    return torch.stack(offsets)
 
 
 def test_a_weight_on_a_rigid_body_is_a_pendulum():
     """A quarter of the period 2 pi sqrt(L / g) (1 + a^2 / 16) after it is let go, it is below, on a taut string."""
     length, angle, step = 0.2, 0.4, 0.001
     quarter = 0.5 * math.pi * math.sqrt(length / G) * (1.0 + angle**2 / 16.0)
-    found = swing(simulator(length, 0.0, RIGID, step=step, integrator="bdf2"), angle, round(2 * quarter / step))
-    crossing = int(torch.argmax((found[:, 0] < 0.0).int()))
+    motion = swing(simulator(length, 0.0, RIGID, step=step, integrator="bdf2"), angle, round(2 * quarter / step))
+    crossing = int(torch.argmax((motion[:, 0] < 0.0).int()))
     assert crossing * step == pytest.approx(quarter, abs=2 * step)
-    torch.testing.assert_close(found.norm(dim=1), torch.full_like(found[:, 0], length), rtol=0.0, atol=2e-4)
-    assert float(found[-1, 0]) == pytest.approx(-length * math.sin(angle), rel=0.01)
+    torch.testing.assert_close(motion.norm(dim=1), torch.full_like(motion[:, 0], length), rtol=0.0, atol=2e-4)
+    assert float(motion[-1, 0]) == pytest.approx(-length * math.sin(angle), rel=0.01)
 
 
 def test_a_compliant_string_bounces():
     """Below what it is tied to the weight oscillates with the period 2 pi sqrt(m c)."""
     mass, compliance, step = 0.05, 0.01, 5e-4
-    found = swing(simulator(0.2, compliance, RIGID, step=step, toe=1e-6, integrator="midpoint"), 0.0, 300)
-    bounce, time = found[:, 2] + 0.2 + mass * G * compliance, step * torch.arange(301, dtype=torch.float64)
-    wanted = mass * G * compliance * torch.cos(time / math.sqrt(mass * compliance))
-    torch.testing.assert_close(bounce, wanted, rtol=0.0, atol=0.02 * mass * G * compliance)
+    motion = swing(simulator(0.2, compliance, RIGID, step=step, toe=1e-6, integrator="midpoint"), 0.0, 300)
+    bounce, time = motion[:, 2] + 0.2 + mass * G * compliance, step * torch.arange(301, dtype=torch.float64)
+    expected = mass * G * compliance * torch.cos(time / math.sqrt(mass * compliance))
+    torch.testing.assert_close(bounce, expected, rtol=0.0, atol=0.02 * mass * G * compliance)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_body_that_falls_faster_than_its_weight_leaves_it_behind(integrator):
     """The tip of a beam that is let go straight does: the weight falls freely, and the beam knows nothing of it."""
     sim, steps = simulator(integrator=integrator), 4
-    loaded, bare = (sim.rollout(sim.rest_state(), steps, weight(each)) for each in (0.05, 0.0))
+    loaded, bare = (sim.rollout(sim.rest_state(), steps, weight(mass)) for mass in (0.05, 0.0))
     torch.testing.assert_close(loaded.q, bare.q, rtol=0.0, atol=1e-5)
     fallen = float(sim.rest_positions[TIP, 2].mean()) - 0.2 - float(loaded.final.memory["payload_position"][0, 0, 2])
     assert fallen == pytest.approx(0.5 * G * (steps * sim.time_step) ** 2, rel=0.3)
@@ -92,10 +92,10 @@ def test_a_taut_string_moves_its_weight_with_the_body():
     sim, mass = simulator(0.5, 1e-4, integrator="bdf2"), 0.05
     start = sim.static_equilibrium(weight(1.3 * mass))
     glued = replace(sim, body=Body(BEAM, fixed=CLAMP, point_masses=[PointMass(mass, TIP)]))
-    found, wanted = sim.rollout(start, 120, weight(mass)).q, glued.rollout(State(start.q, start.v), 120).q
-    moved = (wanted - wanted[0])[:, 0, TIP, 2].mean(1)
+    q, expected = sim.rollout(start, 120, weight(mass)).q, glued.rollout(State(start.q, start.v), 120).q
+    moved = (expected - expected[0])[:, 0, TIP, 2].mean(1)
     assert float(moved.max()) > 3e-3  # It does swing.
-    torch.testing.assert_close((found - wanted)[:, 0, TIP, 2].mean(1), torch.zeros_like(moved), rtol=0.0, atol=2e-4)
+    torch.testing.assert_close((q - expected)[:, 0, TIP, 2].mean(1), torch.zeros_like(moved), rtol=0.0, atol=2e-4)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -122,8 +122,8 @@ def test_gradients(integrator, start, device):
     sim = Simulator(body, material, time_step=0.01, integrator=integrator, solver=solver, device=device)
     rows = check_gradients(sim, start, steps=5)
     own = {row.parameter: row for row in rows if row.parameter.startswith(("payload", "string"))}
-    each = ("", ", each string", ", each environment")
-    assert [*own] == ["payload", *(f"string_{name}{kind}" for name in ("length", "compliance") for kind in each)]
+    kinds = ("", ", each string", ", each environment")
+    assert [*own] == ["payload", *(f"string_{name}{kind}" for name in ("length", "compliance") for kind in kinds)]
     # A difference across a string that tightens tells less than the adjoint.
     wrong = {
         row.parameter: row.relative_error
@@ -139,7 +139,7 @@ def test_states_travel():
     final = sim.rollout(sim.rest_state(), 3, weight(0.05)).final
     again = State.from_tensors(final.tensors())
     assert torch.equal(again.memory["payload_position"], final.memory["payload_position"])
-    first, second = (simulator().step(each, weight(0.05))[0] for each in (final, again))
+    first, second = (simulator().step(state, weight(0.05))[0] for state in (final, again))
     assert torch.equal(first.q, second.q)
     assert torch.equal(first.memory["payload_velocity"], second.memory["payload_velocity"])
 

@@ -59,8 +59,8 @@ def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
     angle, shortening = bend * 0.2, 1.0 - pull / (modulus * 1e-4)
     assert angle > 0.2  # no small rotation
     for vertex, x in zip(middle, (0.1, 0.2), strict=True):
-        wanted = [math.sin(bend * x) / bend * shortening, 0.005, 0.005 + (1.0 - math.cos(bend * x)) / bend]
-        np.testing.assert_allclose(q[vertex], wanted, atol=0.02 * abs(wanted[2] - 0.005))
+        expected = [math.sin(bend * x) / bend * shortening, 0.005, 0.005 + (1.0 - math.cos(bend * x)) / bend]
+        np.testing.assert_allclose(q[vertex], expected, atol=0.02 * abs(expected[2] - 0.005))
 
 
 def hanging_cosserat_rod(pull, offsets, end, length, radius, modulus, density, count=1001):
@@ -76,7 +76,7 @@ def hanging_cosserat_rod(pull, offsets, end, length, radius, modulus, density, c
     below = -9.81 * density * area * (length - s)  # N
     for _ in range(200):
         tangent, normal = (
-            np.stack(each, 1) for each in ([np.sin(angle), -np.cos(angle)], [np.cos(angle), np.sin(angle)])
+            np.stack(components, 1) for components in ([np.sin(angle), -np.cos(angle)], [np.cos(angle), np.sin(angle)])
         )
         place = cumulative_trapezoid(stretch[:, None] * tangent, dx=h, axis=0, initial=0.0)
         path = np.gradient(place + offset * normal, h, axis=0)
@@ -94,14 +94,14 @@ def hanging_cosserat_rod(pull, offsets, end, length, radius, modulus, density, c
 def test_a_tapering_tendon_curls_a_hanging_rod_as_the_theory_of_rods_has_it():
     shape = {"length": 0.2, "radius": 0.008, "modulus": 264e3, "density": 1070.0}
     offsets, end = (0.006, 0.003), 0.16  # m; the tendon ends before the rod does
-    wanted, angle = hanging_cosserat_rod(3.0, offsets, end, **shape)
+    expected, angle = hanging_cosserat_rod(3.0, offsets, end, **shape)
     assert angle > 0.9
     mesh = rod([[0, 0, 0], [0, 0, -0.2]], [[0.0, 0.008], [0.2, 0.008]], layers=10)
     tendons = Tendons([np.linspace([offsets[0], 0.0, 0.0], [offsets[1], 0.0, -end], 41)])
     body = Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=(tendons,))
     sim = Simulator(body, Corotated(264e3, 0.0, density=1070.0), gravity=(0.0, 0.0, -9.81), solver=TIGHT)
     tip = sim.static_equilibrium(tension(3.0)).q[0].numpy()[select_vertices(mesh, z=-0.2)].mean(axis=0)
-    np.testing.assert_allclose(tip[[0, 2]], wanted, atol=0.005 * 0.2)
+    np.testing.assert_allclose(tip[[0, 2]], expected, atol=0.005 * 0.2)
     assert abs(tip[1]) < 1e-9
 
 
@@ -130,8 +130,8 @@ def test_a_length_that_is_commanded_needs_the_tension_that_leads_there():
     sim = simulator(route(0.018), stiffness=3e3)
     by_length = sim.static_equilibrium(Inputs(tendon_contraction=torch.tensor([[3e-3]], dtype=torch.float64)))
     stretched = tendon_length(sim, by_length.q) - SIZE[0] + 3e-3
-    found = 3e3 * (stretched - 0.5e-4)  # past the toe of 0.1 mm
-    by_tension = simulator(route(0.018)).static_equilibrium(tension(found))
+    force = 3e3 * (stretched - 0.5e-4)  # past the toe of 0.1 mm
+    by_tension = simulator(route(0.018)).static_equilibrium(tension(force))
     torch.testing.assert_close(by_length.q, by_tension.q, rtol=0.0, atol=1e-9)
 
 
@@ -148,8 +148,8 @@ def test_guides_are_where_they_were_put(kind):
     """Also between the vertices, and where the body's surface bounds them."""
     places = np.array([[0.001, 0.003, 0.0171], [0.0433, 0.01, 0.02], [0.118, 0.0199, 0.0001]])
     (points,) = Tendons([places]).points(kind)
-    found = np.einsum("pki,pk->pi", kind.vertices[points.nodes], points.gradients[:, 0, :, 0])
-    np.testing.assert_allclose(found, np.diff(places, axis=0), atol=1e-12)
+    segments = np.einsum("pki,pk->pi", kind.vertices[points.nodes], points.gradients[:, 0, :, 0])
+    np.testing.assert_allclose(segments, np.diff(places, axis=0), atol=1e-12)
 
 
 ACROSS = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # a beam's tendons
@@ -182,14 +182,14 @@ def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
     drive = drive.replace(tendon_contraction=torch.tensor([[4e-3]], dtype=torch.float64))
     tendons = Tendons([route(0.013, depth=0.013)], stiffness=2000.0, directions=[tapering])
     sims = [
-        Simulator(Body(BEAM, CLAMP, energies=(each,)), SOFT, gravity=WEIGHTLESS, solver=settings)
-        for each in (tendons, tendons.rerouted([offset]))
+        Simulator(Body(BEAM, CLAMP, energies=(own,)), SOFT, gravity=WEIGHTLESS, solver=settings)
+        for own in (tendons, tendons.rerouted([offset]))
     ]
     given = {f"tendon_offset_{number}": value for number, value in enumerate(offset, 1)}
-    found, wanted = (sim.step(sim.rest_state(), drive, its)[0].q for sim, its in zip(sims, (given, None), strict=True))
-    torch.testing.assert_close(found, wanted, rtol=0.0, atol=1e-9)
-    assert float((wanted - sims[0].rest_positions).abs().max()) > 1e-3
-    assert float((sims[0].step(sims[0].rest_state(), drive)[0].q - wanted).abs().max()) > 1e-4
+    q, expected = (sim.step(sim.rest_state(), drive, its)[0].q for sim, its in zip(sims, (given, None), strict=True))
+    torch.testing.assert_close(q, expected, rtol=0.0, atol=1e-9)
+    assert float((expected - sims[0].rest_positions).abs().max()) > 1e-3
+    assert float((sims[0].step(sims[0].rest_state(), drive)[0].q - expected).abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
@@ -215,10 +215,10 @@ def test_the_hessian_has_what_couples_the_pieces_of_a_tendon(offset):
     direction = torch.randn(there.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     direction[:, sim.fixed] = 0.0
     step = 1e-7
-    wanted = (lines.residual(there.q + step * direction) - lines.residual(there.q - step * direction)) / (2.0 * step)
+    expected = (lines.residual(there.q + step * direction) - lines.residual(there.q - step * direction)) / (2.0 * step)
     lines.factorise(there.q)
     product = lines.product(direction)
-    torch.testing.assert_close(product, wanted, rtol=1e-5, atol=1e-5 * float(wanted.abs().max()))
+    torch.testing.assert_close(product, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
     solved = lines.solve(product.reshape(1, -1, 1)).view_as(direction)
     torch.testing.assert_close(solved, direction, rtol=1e-7, atol=1e-7)
     matrix, _ = lines.matrix(there.q)
@@ -238,7 +238,7 @@ def test_a_taut_tendon_makes_a_beam_stiffer():
     force = torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
     force[:, TIP, 2] = -1e-3 / len(TIP)
     ends = [s.static_equilibrium(pulled.plus(force)).q[0] - s.rest_positions for s in (bare, held)]
-    sags = [float(each[TIP, 2].mean()) for each in ends]
+    sags = [float(positions[TIP, 2].mean()) for positions in ends]
     assert 0.0 < sags[1] / sags[0] < 0.8
 
 
@@ -249,8 +249,8 @@ def test_forces_are_reconstructed_beside_a_tendon():
     force[:, TIP, 1] = 2e-3
     state = sim.rest_state()
     there, _ = sim.step(state, acting.plus(force))
-    found = make_reconstructor(sim, "gauss_newton", 0.0, 1e-9, 30).step(state, there.q, acting)
-    torch.testing.assert_close(found.force, force, rtol=0.0, atol=1e-6)
+    step = make_reconstructor(sim, "gauss_newton", 0.0, 1e-9, 30).step(state, there.q, acting)
+    torch.testing.assert_close(step.force, force, rtol=0.0, atol=1e-6)
 
 
 def test_a_tendon_cannot_be_held():

@@ -107,9 +107,9 @@ def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, out
     section = ArmGeometry(
         (0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025
     ).section(0.025)
-    fine = [area(each) for each in polygons(section, 1e-4)]
+    fine = [area(polygon) for polygon in polygons(section, 1e-4)]
     for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
-        np.testing.assert_allclose([area(each) for each in polygons(section, size)], fine, rtol=1e-12)
+        np.testing.assert_allclose([area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12)
         assert all(0.0 < growth < most for growth in section.growth(section.divisions(size)))
 
 
@@ -266,7 +266,7 @@ def test_shipped_arms(option, count):
 
 def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
     rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) file=(\S+)`", (SHIPPED / "README.md").read_text())
-    assert {name for _, _, name in rows} == {each.name for each in SHIPPED.iterdir() if each.name.endswith(".msh")}
+    assert {name for _, _, name in rows} == {path.name for path in SHIPPED.iterdir() if path.name.endswith(".msh")}
     for size, layers, name in rows:
         mesh, surfaces = mesh_arm(ArmGeometry(), float(size), layers=float(layers))
         with resources.as_file(SHIPPED / name) as path:
@@ -288,7 +288,7 @@ def test_unknown_shipped_arm():
 
 def test_generated_arm_is_configured():
     arm = configured("mesh=arm_generated", "mesh.chambers=4", "mesh.size=0.012")
-    assert ArmGeometry(**{each.name: getattr(arm, each.name) for each in fields(ArmGeometry)}) == ArmGeometry(
+    assert ArmGeometry(**{item.name: getattr(arm, item.name) for item in fields(ArmGeometry)}) == ArmGeometry(
         chambers=4
     )
     assert len(find_chambers(build_mesh(arm))) == 8

@@ -102,11 +102,11 @@ def test_what_is_no_rod_is_refused(arguments, said):
 def test_points_are_found_in_their_cells(mesh):
     random = np.random.default_rng(0)
     inside = random.uniform([0.0, 0.01, 0.005], [0.1, 0.02, 0.015], (30, 3))
-    found = locate(mesh, inside)
+    places = locate(mesh, inside)
     np.testing.assert_allclose(
-        np.einsum("pk,pki->pi", found.weights, mesh.vertices[mesh.cells[found.cells]]), inside, atol=1e-12
+        np.einsum("pk,pki->pi", places.weights, mesh.vertices[mesh.cells[places.cells]]), inside, atol=1e-12
     )
-    np.testing.assert_allclose(found.weights.sum(1), 1.0, atol=1e-12)
-    assert found.outside.max() == 0.0
+    np.testing.assert_allclose(places.weights.sum(1), 1.0, atol=1e-12)
+    assert places.outside.max() == 0.0
     beside = locate(mesh, inside + [0.0, 0.02, 0.0])
     assert beside.outside[inside[:, 1] > 0.015].min() > 1e-3

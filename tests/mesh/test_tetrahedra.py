@@ -56,7 +56,7 @@ def test_surfaces_within_are_chambers(tmp_path):
         assert cell_volumes(mesh).sum() == pytest.approx(1e-9 * (outer.volume - 2 * 8400.0), rel=0.02)
         chambers = find_chambers(mesh)
         assert len(chambers) == 2
-        centres = sorted(mesh.vertices[np.unique(each.faces)].mean(axis=0)[0] for each in chambers)
+        centres = sorted(mesh.vertices[np.unique(chamber.faces)].mean(axis=0)[0] for chamber in chambers)
         np.testing.assert_allclose(centres, [-0.009, 0.009], atol=5e-4)
 
 

@@ -124,12 +124,7 @@ class Linearisation:
 
 
 class _ShiftedHessian:
-    """Factors of I + scale H on the free vertices of a batch.
-
-    Args:
-        workspace: workspace of the batch.
-        linear_solver: name of the linear solver.
-    """
+    """Factors of I + scale H on the free vertices of a batch, by the named linear solver."""
 
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:
         p, k = workspace.potential, workspace.pattern

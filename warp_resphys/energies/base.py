@@ -34,6 +34,7 @@ from ..stepping.state import ImplicitStage, State
 from .launcher import Launcher, warp_view
 
 Values = Mapping[str, torch.Tensor | None]
+Adjoint = Callable[[], dict[str, torch.Tensor]]  # computes derivatives by values, by name
 
 
 def value_of(values: Values, name: str) -> torch.Tensor:
@@ -294,6 +295,7 @@ class Term(ABC):
     """
 
     couples_cells = False
+    _kernels: Any  # with ``local_step`` and ``tangent``
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
         self.launcher, self.sets = launcher, tuple(sets)
@@ -320,21 +322,23 @@ class Term(ABC):
         return None
 
     @abstractmethod
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        """Returns the inputs that the kernels ``local_step`` and ``tangent`` have in common."""
+
     def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
         """Returns the kernel of stress and energy, and its inputs after ``active``."""
+        return self._kernels.local_step, self._arguments(s, values, positions)
 
-    @abstractmethod
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
         """Returns the kernel of the tangent's blocks, and its inputs after ``active`` and ``clamp``."""
+        return self._kernels.tangent, self._arguments(s, values, positions)
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:
         """Returns an upper bound (1 or B, P) of the tangent's eigenvalues at small strains, times the volume [J]."""
 
     @abstractmethod
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         """Returns a function that computes -z . d residual / d value at positions x, by name, from the buffers.
 
         Args:

@@ -10,7 +10,7 @@ of the layer of medium that moves with the surface [m]. The force acts at the en
 normals of its start, so that it derives from a convex potential and drag is dissipative.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -28,7 +28,7 @@ from ..mesh.mesh import Mesh, boundary_faces
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 
 
@@ -158,24 +158,19 @@ class BoundMedium(BoundEnergy):
 class MediumTerm(Term):
     """Kernels of the medium."""
 
+    _kernels = kernels
+
     @property
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         places = dict.fromkeys(("medium_reference", "medium_target", "medium_area"), (self.n_points, 3))
         return {**places, "medium_coefficients": (1, 4)}
 
+    @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         *places, coefficients = (value_of(values, name) for name in self.shapes)
         views = [warp_view(place, wp.vec3d) for place in places]
         return [s.nodes, s.gradients, *views, warp_view(coefficients, wp.vec4d), s.points_per_cell, positions]
-
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, self._arguments(s, values, positions)
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -183,9 +178,7 @@ class MediumTerm(Term):
         return area.norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
 
     @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         """Implements `Term.adjoint` by differentiating the energy twice in torch."""
         (s,) = self.sets
         nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)

@@ -1,6 +1,6 @@
 """Terms on points that belong to parts, such as chambers, tendons or muscles, with values for each part."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..fem.elements import Points
-from .base import PointSet, Term, Values, value_of
+from .base import Adjoint, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 
 
@@ -24,14 +24,7 @@ class PartPoints(Points):
 
 
 class PartTerm(Term):
-    """A term on one set of `PartPoints`.
-
-    Args:
-        launcher: launcher of the potential.
-        sets: one set of points.
-        shapes: shapes of the values of a step, without the batch.
-        count: number of parts.
-    """
+    """A term on one set of `PartPoints` of ``count`` parts, with the `shapes` of its values."""
 
     def __init__(
         self, launcher: Launcher, sets: Sequence[PointSet], shapes: Mapping[str, tuple[int, ...]], count: int
@@ -103,6 +96,7 @@ class ReadingTerm(PartTerm):
         first = np.arange(len(part)) if name in self._per_point else part
         return np.stack([first * n + k for k in range(n)])
 
+    @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         pointers = [value_of(values, name).data_ptr() for name in self._shapes for _ in self._columns[name]]
         addresses = self.launcher.upload(np.array(pointers, dtype=np.uint64), wp.uint64)
@@ -110,17 +104,7 @@ class ReadingTerm(PartTerm):
         return [s.nodes, s.gradients, self.weights, *read, *self._extra, s.points_per_cell, positions]
 
     @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.tangent, self._arguments(s, values, positions)
-
-    @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points, self._kernels.values._length_)
         inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]

@@ -6,7 +6,7 @@ sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces are oriented into the chamb
 pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -20,7 +20,7 @@ from ..kernels import pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity
-from .base import Energy, PointSet, Values
+from .base import Adjoint, Energy, PointSet, Values
 from .launcher import Launcher, warp_view
 from .part_terms import PartPoints, PartTerm
 
@@ -81,23 +81,18 @@ class Pressure(Energy):
 class PressureTerm(PartTerm):
     """Kernels of pressure."""
 
-    @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        surface = [s.nodes, s.gradients, self.weights, self.part]
-        return kernels.local_step, [*surface, *self.views(values), s.points_per_cell, positions]
+    _kernels = kernels
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, self.step(s, values, positions)[1]
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        return [s.nodes, s.gradients, self.weights, self.part, *self.views(values), s.points_per_cell, positions]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
         return torch.zeros_like(self.weight)[None]
 
     @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         del values
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points)

@@ -10,7 +10,7 @@ with the barycentric coordinates w: mass and inertia tensor of the cells are exa
 that of a rigid body.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -30,21 +30,26 @@ from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import Corotated
 from .solid import VISCOUS, SolidTerm
 
 
 @dataclass(frozen=True)
-class PointInertia(Energy):
-    """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
+class _OnOwnPoints(Energy):
+    """An energy on one set of points that is given and does not depend on the mesh."""
 
     own_points: Points
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
         return (self.own_points,)
+
+
+@dataclass(frozen=True)
+class PointInertia(_OnOwnPoints):
+    """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PointInertiaTerm":
@@ -110,6 +115,8 @@ class BoundRigidInertia(BoundInertia):
 class PointInertiaTerm(Term):
     """Kernels of the inertia of points."""
 
+    _kernels = kernels
+
     @property
     @override
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
@@ -119,8 +126,8 @@ class PointInertiaTerm(Term):
         return [warp_view(value_of(values, "inertia"), wp.float64), warp_view(value_of(values, "target"), wp.vec3d)]
 
     @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.local_step, [s.nodes, s.gradients, *self._views(values), s.points_per_cell, positions]
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        return [s.nodes, s.gradients, *self._views(values), s.points_per_cell, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -132,9 +139,7 @@ class PointInertiaTerm(Term):
         return value_of(values, "inertia")
 
     @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, (s,) = self.launcher, self.sets
         by_inertia, by_target = own.zeros(self.n_points), own.zeros(self.n_points, 3)
         fields = [warp_view(field, wp.vec3d) for field in (positions, direction)]
@@ -150,15 +155,11 @@ class PointInertiaTerm(Term):
 
 
 @dataclass(frozen=True)
-class Rigidity(Energy):
+class Rigidity(_OnOwnPoints):
     """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a rotation."""
 
     own_points: SolidPoints  # a single point with the volume of the part
     stiffness: float  # kappa [Pa]
-
-    @override
-    def points(self, mesh: Mesh) -> tuple[Points, ...]:
-        return (self.own_points,)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> SolidTerm:

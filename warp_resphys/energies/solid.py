@@ -1,6 +1,6 @@
 """Energy of a solid: elasticity, and viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -19,7 +19,7 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import PRONY_RATIO, PRONY_TIME, Material
 from .viscosity import Viscosity
@@ -209,14 +209,7 @@ class BoundSolid(BoundEnergy):
 
 
 class SolidTerm(Term):
-    """Kernels of a solid.
-
-    Args:
-        launcher: launcher of the potential.
-        sets: points of the solid.
-        material: the material.
-        carried: (P, T) volume of the points for each modulus [m^3].
-    """
+    """Kernels of a solid, whose points have the volumes ``carried`` (P, T) for each modulus of the material [m^3]."""
 
     def __init__(
         self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: NDArray[np.float64]
@@ -235,8 +228,8 @@ class SolidTerm(Term):
         shapes = ((points, self._moduli), (2,), (points, 3, 3), (points,))
         return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
 
+    @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        """Returns the arguments that the kernels share."""
         stiffness, viscosity, strain, dilation = (value_of(values, name) for name in self.shapes)
         views = [
             warp_view(stiffness[:, s.own], self._vector),
@@ -247,14 +240,6 @@ class SolidTerm(Term):
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
 
     @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.local_step, self._arguments(s, values, positions)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return self._kernels.tangent, self._arguments(s, values, positions)
-
-    @override
     def curvature(self, values: Values) -> torch.Tensor:
         return value_of(values, "stiffness") @ self._curvature
 
@@ -263,9 +248,7 @@ class SolidTerm(Term):
         return value_of(values, "stiffness")[..., self._curvature > 0.0].flatten(1).sum(1)
 
     @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, shapes = self.launcher, self.shapes
         out = {name: own.zeros(*shape) for name, shape in {**shapes, "viscosity": (self.n_points, 2)}.items()}
         types = dict(zip(shapes, (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))

@@ -17,7 +17,7 @@ X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a a
 offsets must be small compared with the cells. L_0 is the length of the offset tendon.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -32,7 +32,7 @@ from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PointSet, Values, value_of
+from .base import Adjoint, Energy, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
 from .part_terms import PartPoints, PartTerm
 
@@ -225,15 +225,10 @@ def _difference(
 
 
 class TendonTerm(PartTerm):
-    """Kernels of tendons.
-
-    Args:
-        launcher: launcher of the potential.
-        sets: segments.
-        tendons: the tendons.
-    """
+    """Kernels of tendons, on the set of their segments."""
 
     couples_cells = True
+    _kernels = kernels
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], tendons: Tendons) -> None:
         (s,) = sets
@@ -270,12 +265,10 @@ class TendonTerm(PartTerm):
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
-    def step(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         tension, _, stiffness, *_ = self.views(values)
-        return kernels.local_step, [
-            *(s.nodes, s.gradients, self._first, self.part, tension, stiffness),
-            *(*self._pull, warp_view(self._spring, wp.vec3d), positions),
-        ]
+        runs = [s.nodes, s.gradients, self._first, self.part]
+        return [*runs, tension, stiffness, *self._pull, warp_view(self._spring, wp.vec3d), positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -307,9 +300,7 @@ class TendonTerm(PartTerm):
         return stretching + (stiffness * columns * self._one_hot.sum(0))[:, self.part_of]
 
     @override
-    def adjoint(
-        self, values: Values, positions: torch.Tensor, direction: torch.Tensor
-    ) -> Callable[[], dict[str, torch.Tensor]]:
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, (s,) = self.launcher, self.sets
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)

@@ -14,7 +14,7 @@ import torch
 from scipy.linalg import cython_lapack
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver, SeparateFactors, bandwidth_reducing_order
+from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors, bandwidth_reducing_order
 
 _LETTERS = {torch.float64: "d", torch.float32: "s"}
 
@@ -80,9 +80,7 @@ class BandedSolver(LinearSolver):
         self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         bands = values.reshape(-1, self.n, self.bandwidth + 1)
         kind, factorise = (_Cholesky, self._cholesky) if definite else (_LU, self._lu)
         return kind(self, bands, factorise, idle, before)

@@ -20,7 +20,7 @@ import torch
 from typing_extensions import override
 
 from .banded import BandedSolver
-from .linear_solver import Factor, Indices, LinearSolver
+from .linear_solver import Factor, Indices, LinearSolver, Mask
 from .sparse import SparseSolver
 
 _HUB = 4.0  # a hub has more than this many times the median number of neighbours
@@ -73,9 +73,7 @@ class BorderedSolver(LinearSolver):
         self.band_size = n - len(border) * k
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         if not definite:
             return _Reordered(self, self._sparse.factor(self._to_sparse(values), definite=False))
         banded, border = values.split([self.band.n_values, self.n_values - self.band.n_values], -1)
@@ -140,7 +138,7 @@ class _Bordered(Factor):
         inner: Factor,
         cross: torch.Tensor,
         corner: torch.Tensor,
-        idle: torch.Tensor | None,
+        idle: Mask,
         before: "_Bordered | None",
     ) -> None:
         if idle is not None and before is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver
+from .linear_solver import Factor, Indices, LinearSolver, Mask
 
 
 class DenseSolver(LinearSolver):
@@ -18,9 +18,7 @@ class DenseSolver(LinearSolver):
         self.n_values = self.n * self.n
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         factor = DenseFactor(values.reshape(-1, self.n, self.n), definite)
         if idle is not None and isinstance(before, DenseFactor) and definite:
             factor.keep(before, idle)

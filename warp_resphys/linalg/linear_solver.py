@@ -19,6 +19,7 @@ from typing_extensions import override
 from ..io.errors import InputError
 
 Indices = NDArray[np.int64]
+Mask = torch.Tensor | None  # (B,) bool
 _MOST_VALUES = 2**31 // 8 - 1  # Warp strides are 32-bit byte counts.
 
 
@@ -214,9 +215,7 @@ class LinearSolver(ABC):
         return factor if columns is None else CorrectedFactor(factor, columns, self.dofs)
 
     @abstractmethod
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         """Returns the factor of the matrices A; `before` is None unless a matrix is idle."""
 
     @cached_property

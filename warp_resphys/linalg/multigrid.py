@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .conjugate_gradients import Iterate, conjugate_gradients
-from .linear_solver import Factor, Indices, SeparateFactors
+from .linear_solver import Factor, Indices, Mask, SeparateFactors
 from .sparse import SparseSolver, sparse_lu
 
 FloatArray = NDArray[np.float64]
@@ -56,9 +56,7 @@ class MultigridSolver(SparseSolver):
         self._cycles: dict[tuple[int, int], _Cycle] = {}
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         if not definite:
             return super()._factorise(values, definite, idle, before)
         entries = self.mirrored(values).double()

@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 import torch
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver, SeparateFactors
+from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
 
 _COLUMNS = 128  # most right-hand sides per call of CHOLMOD on a GPU
 
@@ -37,9 +37,7 @@ class SparseSolver(LinearSolver):
         return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         entries = self.mirrored(values)
         cholespy = _cholespy() if definite else None
         if cholespy is not None:

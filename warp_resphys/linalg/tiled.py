@@ -12,7 +12,7 @@ from typing_extensions import override
 from ..kernels.modules import launch_stream, shareable
 from ..kernels.tiled_cholesky import BLOCK, TILE, tiled_kernels
 from .dense import DenseFactor
-from .linear_solver import Factor, Indices, LinearSolver, bandwidth_reducing_order
+from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth_reducing_order
 
 
 class TiledSolver(LinearSolver):
@@ -45,9 +45,7 @@ class TiledSolver(LinearSolver):
         self.kernels = tiled_kernels(self.scalar)
 
     @override
-    def _factorise(
-        self, values: torch.Tensor, definite: bool, idle: torch.Tensor | None, before: Factor | None
-    ) -> Factor:
+    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         values[:, self._padding] = 1.0
         whole = None if definite else values.clone()
         active = torch.ones(len(values), device=values.device, dtype=torch.int32)

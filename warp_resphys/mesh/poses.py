@@ -1,12 +1,12 @@
-"""Deformed shapes given by a formula."""
+"""Deformed shapes in closed form."""
 
 import torch
 
 
 def twisted(positions: torch.Tensor, angles: torch.Tensor, axis: int = 0) -> torch.Tensor:
-    """(B, N, 3) a body (N, 3) [m] twisted about the centre line of its bounding box along an axis.
+    """Returns positions (B, N, 3) of a body (N, 3) [m] twisted about the centre line of its bounding box along an axis.
 
-    Every cross-section turns as a whole, by an angle that grows linearly from zero at the low end to one of (B,) [rad].
+    Cross-sections rotate by an angle that grows linearly from zero at the lower end to (B,) [rad] at the upper end.
     """
     low, high = positions.amin(0), positions.amax(0)
     centred = positions - 0.5 * (low + high)

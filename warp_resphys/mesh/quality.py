@@ -1,4 +1,4 @@
-"""How well shaped the cells of a mesh are, and how large."""
+"""Quality and volumes of the cells of a mesh."""
 
 import numpy as np
 
@@ -7,13 +7,11 @@ from .mesh import FloatArray, IntArray, Mesh
 
 
 def scaled_jacobian(mesh: Mesh) -> FloatArray:
-    """Smallest scaled Jacobian of each cell (Knupp 2000): 1 for a cube or a regular tetrahedron, 0 for a flat cell.
+    """Returns the smallest scaled Jacobian of each cell (M,) (Knupp 2000), from -1 to 1.
 
-    At each corner, it is the volume that the edges there span, over the product of their lengths. A tetrahedron's
-    corners share one volume, and are compared by the largest product; nodes between corners are not looked at.
-
-    Returns:
-        (M,) from -1 to 1.
+    It is 1 for a cube or a regular tetrahedron, 0 for a flat cell. At a corner, it is the volume spanned by the edges,
+    over the product of their lengths. All corners of a tetrahedron span the same volume, and the largest product
+    counts. Nodes between corners are ignored.
     """
     linear = ELEMENTS[mesh.element.linear]
     corners = mesh.vertices[mesh.cells[:, : linear.nodes]]
@@ -22,19 +20,19 @@ def scaled_jacobian(mesh: Mesh) -> FloatArray:
     spanned = np.einsum("qki,mkj->mqij", linear.shape(linear.shape.nodes)[1], corners)
     sizes = np.linalg.norm(edges, axis=-1).prod(axis=-1)
     lengths = np.linalg.norm(spanned, axis=-1).prod(axis=-1)
-    if linear.nodes == 4:  # whose Jacobian is the same everywhere; sqrt(1/2) of the product if it is regular
+    if linear.nodes == 4:  # constant Jacobian, sqrt(1/2) of the product for a regular tetrahedron
         return np.asarray(np.sqrt(2.0) * np.linalg.det(spanned[:, 0]) / sizes.max(axis=1))
     return np.asarray((np.linalg.det(spanned) / lengths).min(axis=1))
 
 
 def _spokes(edges: IntArray, corner: int) -> IntArray:
-    """(3,) the corners at the other ends of the edges of one."""
-    mine = edges[(edges == corner).any(axis=1)]
-    return np.where(mine[:, 0] == corner, mine[:, 1], mine[:, 0])
+    """Returns the corners (3,) connected to a corner by edges."""
+    own = edges[(edges == corner).any(axis=1)]
+    return np.where(own[:, 0] == corner, own[:, 1], own[:, 0])
 
 
 def cell_volumes(mesh: Mesh) -> FloatArray:
-    """Volume of each cell [m^3], (M,)."""
+    """Returns the volume of each cell, (M,) [m^3]."""
     points, weights = mesh.element.rule
     jacobians = np.einsum("qki,mkj->mqij", mesh.element.shape(points)[1], mesh.vertices[mesh.cells])
     return np.asarray(np.linalg.det(jacobians) @ weights)

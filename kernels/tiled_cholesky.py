@@ -1,16 +1,15 @@
-"""Cholesky factorisation of banded matrices in square tiles, and both sweeps of a solve: one block a matrix.
+"""Cholesky factorisation of banded matrices in square tiles, and both sweeps of a solve: one block per matrix.
 
 A matrix of n unknowns is stored by rows: row i holds the W + 1 tiles of T columns that end with its diagonal tile, so
-that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column,
-and what lies above the diagonal, are never read. In the last tiles, what is beyond n is a unit matrix.
+that entry (i, j) of the lower triangle is at column (j // T - i // T + W) T + j % T. Tiles left of the first column and
+entries above the diagonal are never read. Rows beyond n in the last tile are those of a unit matrix.
 
-The factorisation is the left-looking one by columns of tiles (Golub and Van Loan 2013, section 4.2.9). In place of a
-diagonal tile of the factor its inverse is kept: a sweep multiplies by it where substitution would wait for one row
-after another.
+The factorisation is left-looking by columns of tiles (Golub and Van Loan 2013, section 4.2.9). The inverse of each
+diagonal tile of the factor is stored instead of the tile: a sweep multiplies by it instead of a sequential
+substitution.
 
-Threads of a block have to share tiles and to wait for one another in between. Warp's own tiles do that too, through
-libraries whose compilation takes two minutes for every type; here it is a few lines of C++ that a CPU, on which a block
-is one thread, compiles as well.
+Threads of a block share tiles and synchronise. Warp's own tiles do so through libraries that take two minutes to
+compile for every type; these few lines of C++ also compile for a CPU, where a block is one thread.
 """
 
 import functools
@@ -141,7 +140,7 @@ _SOLVE: Final = (
     const int h = lane % Q;
     int some = 0;
     for (int c = lane; c < n; c += LANES) some |= (x[c] != S(0));
-    if (!RESPHYS_ANY(some)) return;  // Of an environment that needs no direction.
+    if (!RESPHYS_ANY(some)) return;  // A zero right-hand side: the environment needs no direction.
     for (int i = 0; i < tiles; ++i) {
         const int first = (i > width ? i - width : 0) * T;
         for (int r = lane / Q; r < T; r += LANES / Q) {
@@ -188,7 +187,7 @@ _SOLVE: Final = (
 
 @functools.cache
 def tiled_kernels(scalar: Any) -> SimpleNamespace:
-    """Kernels for numbers of a type, in blocks of ``BLOCK`` threads."""
+    """Returns kernels for a scalar type, in blocks of ``BLOCK`` threads."""
     module = named_module(f"tiles.{scalar.__name__}")
     name = "double" if scalar is wp.float64 else "float"
 
@@ -200,11 +199,11 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def clear(
-        active: wp.array[int],  # (B) zero where nothing is to be done
-        unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but for one beyond n on the diagonal
-        matrices: wp.array2d[scalar],  # (B, as many)
+        active: wp.array[int],  # (B) zero: skip the environment
+        unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but one on the diagonal beyond n
+        matrices: wp.array2d[scalar],  # (B, length of unit)
     ):
-        """Resets matrices to `unit`, with whole blocks, which is cheaper than one thread per number."""
+        """Resets active matrices; one block per matrix, as one thread per entry would be slow for inactive ones."""
         b, lane = wp.tid()
         if active[b] != 0:
             for k in range(lane, unit.shape[0], wp.block_dim()):
@@ -212,11 +211,11 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def check(
-        active: wp.array[int],  # (B) stays one for those alone that failed, and may be clamped yet
-        clamped: wp.array[wp.bool],  # (B) matrices that are positive definite by force
-        factors: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped ones have failed
+        active: wp.array[int],  # (B) becomes zero, except for unclamped matrices that failed
+        clamped: wp.array[wp.bool],  # (B) matrices with clamped eigenvalues
+        factors: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped matrices failed
     ):
-        """Which matrices were not positive definite, one block a matrix."""
+        """Finds matrices that were not positive definite, one block per matrix."""
         b, lane = wp.tid()
         if active[b] == 0:
             return
@@ -235,7 +234,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def factor(
-        active: wp.array[int],  # (B) zero where nothing is to be done
+        active: wp.array[int],  # (B) zero: skip the environment
         matrices: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
     ):
         b, _ = wp.tid()
@@ -247,7 +246,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
         factors: wp.array3d[scalar],  # (B or 1, n rounded up to tiles, (W + 1) T)
         columns: wp.array3d[scalar],  # (B, m, n) right-hand sides, overwritten by the solutions
     ):
-        """By forward and backward substitution, one block a right-hand side."""
+        """Forward and backward substitution, one block per right-hand side."""
         b, m, _ = wp.tid()
         substitute(factors[wp.min(b, factors.shape[0] - 1)], columns[b, m])
 

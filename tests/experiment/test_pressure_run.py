@@ -431,7 +431,7 @@ def test_leaving_the_range_of_the_training_is_noticed():
     inputs = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
     watched = Range.restore(Range.of(inputs).description(), inputs)
     probe = torch.tensor([[2.4, 2.0], [2.6, 2.0], [1.0, 0.4], [1.0, torch.nan]])
-    assert watched.left(probe).tolist() == [False, True, True, False]
+    assert watched.excludes(probe).tolist() == [False, True, True, False]
 
 
 def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):

@@ -25,6 +25,7 @@ from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.metrics import marker_errors
+from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.pipeline import learning_stages
 
@@ -276,7 +277,7 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
     descents, at = [], 2
 
     def descend(self, number, start, max_evaluations, tolerance, report):
-        descents.append((self.simulator.integrator, number))
+        descents.append((self._misfit.simulator.integrator, number))
         if len(descents) == at:
             raise KeyboardInterrupt
         return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
@@ -318,8 +319,8 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
 
     monkeypatch.setattr(Identifier, "starts", starts)
     monkeypatch.setattr(Identifier, "_descend", descend)
-    monkeypatch.setattr(Identifier, "uncertainty", lambda *_: calls.append("uncertainty"))
-    monkeypatch.setattr(Identifier, "_losses_safe", losses)
+    monkeypatch.setattr(Misfit, "uncertainty", lambda *_: calls.append("uncertainty"))
+    monkeypatch.setattr(Misfit, "losses_or_infinite", losses)
     monkeypatch.setattr(identify, "_AT_ONCE", 2)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)

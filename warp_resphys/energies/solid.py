@@ -220,6 +220,8 @@ class SolidTerm(Term):
         self._moduli = len(material.rules)
         self._carried = carried
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
+        stiff = self._curvature > 0.0
+        self._stiff: torch.Tensor | slice = slice(None) if bool(stiff.all()) else stiff  # a slice copies nothing
 
     @property
     @override
@@ -245,7 +247,7 @@ class SolidTerm(Term):
 
     @override
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        return value_of(values, "stiffness")[..., self._curvature > 0.0].flatten(1).sum(1)
+        return value_of(values, "stiffness")[..., self._stiff].flatten(1).sum(1)
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:

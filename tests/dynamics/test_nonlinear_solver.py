@@ -452,7 +452,7 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
 )
 @pytest.mark.parametrize("stalls", [0, 2])
 def test_a_failed_line_search(iterations, factorisations, clamped, phase, requested, stalls):
-    """It requests a factor, then a clamped one, within the limit of iterations, and a check for rounding."""
+    """A failed line search requests a factor, then a clamped one, within the iteration limit; rounding is checked."""
     one = OneVertex(3)
     one.tolerances.max_iterations = 10
     start = {"iterations": iterations, "factorisations": factorisations, "stalls": stalls}

@@ -13,6 +13,7 @@ import torch
 from damage import flip_bit
 from main_job import IN_RUN, run
 from played_run import check_robots
+from segment_run import TRACKED
 
 import warp_resphys
 from warp_resphys import pipeline
@@ -54,7 +55,6 @@ laboratory:
     size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}
   sequences: {rest: 0.01, correlation_time: 0.03}
 """
-TRACKED = "markers.tracked={T1:[0.02,0.0,-0.1],T2:[0.0,0.02,-0.1],T3:[-0.02,-0.01,-0.1]}"
 COMMAND = [
     "experiment=tiny",
     TRACKED,

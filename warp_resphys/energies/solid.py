@@ -1,8 +1,8 @@
 """Energy of a solid: elasticity, and viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final
 
 import numpy as np
@@ -270,26 +270,58 @@ class SolidTerm(Term):
 
     def strain(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3)."""
+        return self._strain(positions)
+
+    @cached_property
+    def _strain(self) -> Callable[[torch.Tensor], torch.Tensor]:
+        """`strain`, recorded at its first use."""
         own = self.launcher
-        out = own.zeros(self.n_points, 3, 3)
-        for s in self.sets:
-            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
-            outputs = [warp_view(out[:, s.own], wp.mat33d)]
-            own.launch(own.record(kernels.strain, (own.batch, s.n_points), inputs, outputs))
-        return out
+        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
+        view = warp_view(at, wp.vec3d)
+        commands = [
+            own.record(
+                kernels.strain,
+                (own.batch, s.n_points),
+                [s.nodes, s.gradients, s.points_per_cell, view],
+                [warp_view(out[:, s.own], wp.mat33d)],
+            )
+            for s in self.sets
+        ]
+        recorded = own.capture(*commands)
+
+        def strain(positions: torch.Tensor) -> torch.Tensor:
+            at.copy_(positions)
+            own.launch(recorded)
+            return out.clone()
+
+        return strain
 
     def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
         """Returns the vector-Jacobian product (B, N, 3) of `strain` with (B, P, 3, 3)."""
+        return self._strain_adjoint(positions, adjoint)
+
+    @cached_property
+    def _strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+        """`strain_adjoint`, recorded at its first use."""
         own = self.launcher
-        out, stress = torch.zeros_like(positions), own.zeros(self.n_points, 3, 3)
-        adjoint = adjoint.contiguous()
+        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.sets[0].n_vertices, 3)
+        along, stress = own.zeros(self.n_points, 3, 3), own.zeros(self.n_points, 3, 3)
+        place, commands = warp_view(at, wp.vec3d), []
         for s in self.sets:
-            inputs = [s.nodes, s.gradients, s.points_per_cell, warp_view(positions.contiguous(), wp.vec3d)]
-            inputs.append(warp_view(adjoint[:, s.own], wp.mat33d))
-            view = warp_view(stress[:, s.own], wp.mat33d)
-            launch = own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view])
-            own.launch(launch, own.gather(s, view, out))
-        return out
+            direction, view = (warp_view(values[:, s.own], wp.mat33d) for values in (along, stress))
+            inputs = [s.nodes, s.gradients, s.points_per_cell, place, direction]
+            commands.append(own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view]))
+            commands.append(own.gather(s, view, out))
+        recorded = own.capture(*commands)
+
+        def product(positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
+            at.copy_(positions)
+            along.copy_(adjoint)
+            out.zero_()
+            own.launch(recorded)
+            return out.clone()
+
+        return product
 
 
 class GreenStrain(torch.autograd.Function):

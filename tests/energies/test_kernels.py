@@ -38,7 +38,7 @@ GRADIENTS = np.concatenate(
 def potential_of(body, model, batch, device):
     solid = Solid(body.discretisation, MATERIALS[model]())
     fixed = torch.as_tensor(body.fixed_vertices, device=device)
-    return IncrementalPotential([PlacedEnergy(solid, solid.points(body.mesh))], body.n_vertices, fixed, batch, device)
+    return IncrementalPotential([PlacedEnergy(solid, solid.points(body.mesh))], body.coordinates, fixed, batch, device)
 
 
 def unit_potential(

@@ -31,7 +31,7 @@ def potential_of(f):
     solid = Solid(TETRAHEDRON.discretisation, MooneyRivlin())
     fixed = torch.zeros(0, dtype=torch.int64)
     sets = [PlacedEnergy(solid, solid.points(TETRAHEDRON.mesh))]
-    p = IncrementalPotential(sets, 4, fixed, len(f), torch.device("cpu"))
+    p = IncrementalPotential(sets, TETRAHEDRON.coordinates, fixed, len(f), torch.device("cpu"))
     zeros = torch.zeros(len(f), 4, 3, dtype=torch.float64)
     values = {"stiffness": torch.as_tensor(MODULI).expand(len(f), 1, 3), "viscosity": zeros[:, 0, :2]}
     p.set_terms(StepTerms(zeros, zeros[..., 0], zeros, {**values, "strain_offset": None, "dilation_offset": None}))

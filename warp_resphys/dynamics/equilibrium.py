@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from ..energies.placed import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
+from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError
 from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
@@ -32,9 +33,8 @@ class Workspace:
 
     Args:
         energies: energies of the body.
-        n_vertices: N.
+        coordinates: map from control vertices to all vertices.
         fixed: (D,) fixed vertices.
-        eliminated: (H,) vertices that are not unknowns: the fixed and the dependent ones.
         pattern: block structure of the Hessian.
         batch: number of environments.
         device: device of every buffer.
@@ -47,17 +47,16 @@ class Workspace:
     def __init__(
         self,
         energies: Sequence[PlacedEnergy],
-        n_vertices: int,
+        coordinates: Coordinates,
         fixed: NDArray[np.int64],
-        eliminated: NDArray[np.int64],
         pattern: BlockPattern,
         batch: int,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
         self.fixed = torch.as_tensor(fixed, device=device)
-        masked = torch.as_tensor(eliminated, device=device)
-        self.potential = IncrementalPotential(energies, n_vertices, masked, batch, device)
+        eliminated = torch.as_tensor(np.union1d(fixed, coordinates.dependent), device=device)
+        self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._cache: dict[Any, Any] = {}
         self.shards: list[Shard] = []
@@ -305,7 +304,7 @@ def _solve(
     if len(workspace.fixed):
         start = start.clone()
         start[:, workspace.fixed] = fixed_positions
-    report = solver.solve(start, follows)
+    report = solver.solve(workspace.potential.coordinates.hold(start.double()).to(start), follows)
     return workspace.potential.positions.to(start.dtype, copy=True), report
 
 
@@ -336,7 +335,7 @@ def _adjoint(
             by_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
     return (
         (gradient - product)[:, workspace.fixed] if fixed else None,
-        terms.inertia[..., None] * z * potential.free_mask[:, None] if target else None,
+        potential.restrict(terms.inertia[..., None] * z) if target else None,
         -(z * (x - terms.target)).sum(-1) * potential.free_mask if inertia else None,
         z if force else None,
         *by_values,
@@ -356,8 +355,7 @@ def _adjoint_solution(
     Raises:
         ConvergenceError: the Hessian is singular, for example if a body can turn about its only fixed vertex.
     """
-    mask = potential.free_mask[:, None]
-    right = gradient * mask
+    right = potential.restrict(gradient)
     size = right.flatten(1).norm(dim=1)
 
     def solved(hessian: ExactHessian, rest: torch.Tensor) -> torch.Tensor:
@@ -369,7 +367,7 @@ def _adjoint_solution(
         for _ in range(1 if hessian.exact else 1 + _REFINEMENTS):
             z = z + solved(hessian, rest)
             product = potential.stiffness_product(z)
-            rest = right - (product + potential.inertia[..., None] * z) * mask
+            rest = right - potential.restrict(product + potential.inertia[..., None] * z)
             error = rest.flatten(1).norm(dim=1)
             # The refinement also ends where rounding of the product prevents progress.
             if bool(((error <= _REFINED * size) | ~(error <= 0.5 * before)).all()):

@@ -57,8 +57,9 @@ class Linearisation:
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns x with the positions of the fixed and the dependent vertices inserted."""
-        return self._coordinates.expand(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
+        """Returns x with fixed and dependent vertices in their places, and sliding vertices in their planes."""
+        held = self._coordinates.hold(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
+        return self._coordinates.expand(held)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
         """Returns g (B, N, 3) at x [N], zero at fixed vertices: the additional force for which x solves the step."""
@@ -85,7 +86,7 @@ class Linearisation:
     def product(self, direction: torch.Tensor) -> torch.Tensor:
         """Returns H d (B, N, 3) on the free vertices [N]."""
         p = self._potential
-        return (p.stiffness_product(direction) + p.inertia[..., None] * direction) * p.free_mask[:, None]
+        return p.restrict(p.stiffness_product(direction) + p.inertia[..., None] * direction)
 
     def shifted(self, scale: float) -> Factor:
         """Returns a factor of I + scale H on the free vertices; H is clamped if this is not positive definite."""

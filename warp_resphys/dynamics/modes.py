@@ -131,7 +131,7 @@ class RestStiffness:
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        if not len(simulator.fixed):
+        if not (len(simulator.fixed) or len(simulator.body.coordinates.sliding)):
             raise InputError("a body without fixed vertices follows any force without end: fix some vertices.")
         stiffness, _, free = _about_rest(simulator)
         self._matrix = stiffness

@@ -147,15 +147,17 @@ class Simulator:
         body = self.body
         self.rest_positions = self.tensor(body.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
+        if settings.name == "projective_dynamics" and len(body.coordinates.sliding):
+            raise InputError("solver is projective_dynamics, which knows no symmetry planes: choose quasi_newton.")
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
         placed = self._place_energies()
         self._set = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
         energies = self._set
-        self._eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
+        eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)
         sets = [points for item in placed for points in item.points]
-        self._pattern = BlockPattern(body.vertices, self._eliminated, sets)
+        self._pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
         self.parameters: dict[str, Quantity] = {**energies.parameters, "gravity": _GRAVITY}
         self.constants: dict[str, Any] = {**energies.constants, "gravity": [list(self.gravity)]}
         self.counts = {**energies.counts, "gravity": 3}
@@ -241,9 +243,9 @@ class Simulator:
         return self._workspaces[batch]
 
     def _make_workspace(self, batch: int) -> Workspace:
-        n, fixed = self.body.n_vertices, self.body.fixed_vertices
+        body, device = self.body, torch.device(self.device)
         return Workspace(
-            self._set.placed, n, fixed, self._eliminated, self._pattern, batch, torch.device(self.device), self.dtype
+            self._set.placed, body.coordinates, body.fixed_vertices, self._pattern, batch, device, self.dtype
         )
 
     def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
@@ -448,7 +450,7 @@ class Simulator:
             ConvergenceError: no equilibrium was found, or the body grows without bound, like an inflated one whose
                 material cannot resist the pressure.
         """
-        if not len(self.fixed):
+        if not (len(self.fixed) or len(self.body.coordinates.sliding)):
             raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
         inputs = _NO_INPUTS if inputs is None else inputs
         constants = self.prepare(parameters)

@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
+from ..fem.coordinates import Coordinates, DeviceCoordinates
 from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import PointSet, Term
@@ -40,8 +42,8 @@ class IncrementalPotential(Launcher):
 
     Args:
         energies: energies of the body.
-        n_vertices: N.
-        fixed: (D,) fixed vertices.
+        coordinates: map from control vertices to the N vertices.
+        eliminated: (H,) vertices that are not unknowns: the fixed and the dependent ones.
         batch: number of environments B.
         device: device of every buffer.
 
@@ -51,6 +53,7 @@ class IncrementalPotential(Launcher):
         stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding error [J].
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
+        coordinates: the map on the potential's device, in float64.
         evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
@@ -68,13 +71,14 @@ class IncrementalPotential(Launcher):
     def __init__(
         self,
         energies: Sequence[PlacedEnergy],
-        n_vertices: int,
-        fixed: torch.Tensor,
+        coordinates: Coordinates,
+        eliminated: torch.Tensor,
         batch: int,
         device: torch.device,
     ) -> None:
         super().__init__(batch, device)
-        self.n_vertices = n_vertices
+        self.n_vertices = n_vertices = coordinates.n_vertices
+        self.coordinates = DeviceCoordinates(coordinates, torch.empty(0, device=device, dtype=torch.float64))
         self.energies: list[Term] = []
         self.sets: list[PointSet] = []
         self._loads: list[bool] = []
@@ -92,7 +96,7 @@ class IncrementalPotential(Launcher):
             self._loads.append(energy.is_load)
         self._n_points = first
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
-        self.free_mask[fixed] = 0.0
+        self.free_mask[eliminated] = 0.0
         pairs = list(zip(energies, self.energies, strict=True))
         shapes = {name: shape for placed, term in pairs for name, shape in placed.named(term.shapes).items()}
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
@@ -142,19 +146,37 @@ class IncrementalPotential(Launcher):
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
+        project = self._projections(residual)
+        self._load_commands += project
         self._load_commands.append(
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
         )
         energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
         sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
+        self._internal_commands += project
         self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)
+
+    def _projections(self, residual: Any) -> list[Any]:
+        """Returns the launch that removes the residual normal to symmetry planes, if there are any."""
+        c = self.coordinates
+        if not len(c.sliding):
+            return []
+        planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
+        return [self.record(kernels.project, (self.batch, len(c.sliding)), planes, [residual])]
+
+    def restrict(self, field: torch.Tensor) -> torch.Tensor:
+        """Returns a field (B, N, 3, ...) that is zero at vertices without unknowns and normal to symmetry planes."""
+        mask = self.free_mask.view(-1, *[1] * (field.ndim - 2))
+        return self.coordinates.restrict(field * mask)
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers, with zero inertia and load at fixed vertices."""
         own = self.terms
         own.target.copy_(terms.target.detach())
+        if len(self.coordinates.sliding):
+            own.target.copy_(self.coordinates.hold(own.target))
         torch.mul(terms.inertia.detach(), self.free_mask, out=own.inertia)
         torch.mul(terms.force.detach(), self.free_mask[:, None], out=own.force)
         for name, buffer in own.values.items():
@@ -200,6 +222,9 @@ class IncrementalPotential(Launcher):
         parts = (term.low_rank(values, self._position_view) for term, values in pairs)
         columns = [part for part in parts if part is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
+        if self.low_rank is not None and len(self.coordinates.sliding):
+            whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
+            self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 
     @property
     def couples_cells(self) -> bool:

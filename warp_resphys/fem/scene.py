@@ -4,7 +4,6 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
 import torch
 from numpy.typing import NDArray
 
@@ -73,10 +72,7 @@ class Scene(Body):
     @cached_property
     def coordinates(self) -> Coordinates:
         """Vertices as weighted sums of control vertices."""
-        maps = [(body.coordinates, first) for _, body, first in self.members]
-        dependent = np.concatenate([own.dependent + first for own, first in maps])
-        weights = scipy.sparse.block_diag([own.weights for own, _ in maps], format="csr")
-        return Coordinates(self.n_vertices, dependent, scipy.sparse.csr_array(weights))
+        return Coordinates.joined([body.coordinates for body in self.bodies.values()])
 
     @cached_property
     def attached_mass(self) -> NDArray[np.float64]:

@@ -46,6 +46,15 @@ class PlaceSettings(_Given):
     tolerance: Positive | None = setting(None, "largest distance from the plane; null: 1e-9", "m")
 
 
+class SymmetrySettings(_Given):
+    """Symmetry planes: the mesh is one side of them, and its vertices in a plane only move within it."""
+
+    x: float | None = setting(None, "of the plane normal to x; null: none", "m")
+    y: float | None = setting(None, "of the plane normal to y", "m")
+    z: float | None = setting(None, "of the plane normal to z", "m")
+    tolerance: Positive = setting(1e-9, "largest distance of a vertex in a plane", "m")
+
+
 class BoxSettings(_Given):
     """Cells with their centres in a box."""
 
@@ -372,6 +381,7 @@ class BodySettings(Settings):
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
     fixed: PlaceSettings = setting(description="fixed vertices")
+    symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers")
     tendons: TendonSettings | None = setting(None, "tendons that pull")

@@ -10,6 +10,9 @@ import warp as wp
 from ..energies.launcher import CapturedGraph, issue, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
+from ..kernels import rounding
+from ..kernels.lbfgs import lbfgs_kernels
+from ..kernels.line_search import accept_kernel
 from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
@@ -70,7 +73,6 @@ class Minimiser:
         self._potential, self._hessian = p, hessian
         self._counts = {name: torch.zeros(b, device=p.device, dtype=torch.int32) for name in _COUNTS}
         self._sums = {name: p.zeros() for name in _SUMS}
-        self._gradient, self._direction, origin = (p.zeros(n, 3) for _ in range(3))
         self._right = torch.zeros(b, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
         summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
         # A copy on the host; on a CPU the same memory.
@@ -78,9 +80,9 @@ class Minimiser:
         self._shown = self._seen.numpy()
 
         double = dtype == torch.float64
-        own = kernels.minimisation_kernels(wp.float64 if double else wp.float32)
-        vector = wp.vec3d if double else wp.vec3f
-        progress, pairs = kernels.SolverProgress(), own.Pairs()
+        scalar, vector = (wp.float64, wp.vec3d) if double else (wp.float32, wp.vec3f)
+        own = lbfgs_kernels(scalar)
+        progress, pairs, search = kernels.SolverProgress(), own.Pairs(), kernels.LineSearch()
         evaluation, tolerances = kernels.Evaluation(), kernels.Tolerances()
         for name, values in self._counts.items():
             setattr(progress, name, warp_view(values, wp.int32))
@@ -108,30 +110,29 @@ class Minimiser:
         history.stored, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
         history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
 
-        positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
-        direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
+        search.positions = warp_view(p.positions, wp.vec3d)
+        search.origin, search.direction, search.gradient = (warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(3))
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
-        beginning = [*loads, positions, tolerances, origin_view, progress, history]
-        begin = p.record_blocks(kernels.begin, b, beginning, [])
+        begin = p.record_blocks(kernels.begin, b, [*loads, tolerances, search, progress, history], [])
         masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
         self._select = p.record(kernels.select_for_factorisation, (b,), [progress, *masks, pairs.count], [])
-        shared = [progress, pairs, vertex_at, gradient]
+        shared = [progress, pairs, vertex_at, search]
         self._project = p.record_blocks(own.project, b, shared, [right])
-        set_direction = p.record_blocks(own.set_direction, b, [*shared, right, positions], [origin_view, direction])
-        clamped = warp_view(hessian.clamped, wp.bool)
-        inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation, origin_view, direction]
-        accept = p.record_blocks(own.accept, b, [*inputs, clamped, positions, gradient, progress, pairs, history], [])
+        set_direction = p.record_blocks(own.set_direction, b, [*shared, right], [])
+        inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation]
+        inputs += [warp_view(hessian.clamped, wp.bool), search, progress, pairs, history]
+        accept = p.record_blocks(accept_kernel(scalar), b, inputs, [])
         counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
         evaluate = [*p.evaluation, accept, summarise]
         self._begin, self._evaluate = p.capture(begin, *evaluate), p.capture(*evaluate)
         self._first_trial = p.capture(set_direction, *evaluate)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
-        kept = warp_view(p.zeros(n, 3), wp.vec3d)
-        perturb = p.record_blocks(kernels.perturb, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
-        compared = [progress, kept, gradient, evaluation.residual]
-        check = p.record_blocks(kernels.check_rounding, b, compared, [positions, history])
+        kept, drawn = warp_view(p.zeros(n, 3), wp.vec3d), p.upload(signs, wp.vec3d)
+        perturb = p.record_blocks(rounding.perturb, b, [progress, drawn, search.positions], [kept])
+        compared = [progress, kept, evaluation.residual, search, history]
+        check = p.record_blocks(rounding.check_rounding, b, compared, [])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
         self._parts = SimpleNamespace(begin=begin, set_direction=set_direction, evaluate=evaluate)
         self._loop: CapturedGraph | None = None

@@ -17,18 +17,6 @@ from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
 
-_COUNTS = (
-    "phase",
-    "request",
-    "factored",
-    "check_rounding",
-    "iterations",
-    "since_factor",
-    "factorisations",
-    "halvings",
-    "stalls",
-)
-_SUMS = ("step", "slope", "energy", "scale", "relative", "smallest_norm", "rounding", "force", "stiffness")
 _PERTURBATIONS = 7  # random sign patterns for rounding checks
 
 
@@ -71,8 +59,6 @@ class Minimiser:
     ) -> None:
         p, b, n = potential, potential.batch, potential.n_vertices
         self._potential, self._hessian = p, hessian
-        self._counts = {name: torch.zeros(b, device=p.device, dtype=torch.int32) for name in _COUNTS}
-        self._sums = {name: p.zeros() for name in _SUMS}
         self._right = torch.zeros(b, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
         summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
         # A copy on the host; on a CPU the same memory.
@@ -84,10 +70,11 @@ class Minimiser:
         own = lbfgs_kernels(scalar)
         progress, pairs, search = kernels.SolverProgress(), own.Pairs(), kernels.LineSearch()
         evaluation, tolerances = kernels.Evaluation(), kernels.Tolerances()
-        for name, values in self._counts.items():
-            setattr(progress, name, warp_view(values, wp.int32))
-        for name, values in self._sums.items():
-            setattr(progress, name, warp_view(values, wp.float64))
+        self._progress: dict[str, torch.Tensor] = {}
+        for name, variable in kernels.SolverProgress.vars.items():
+            kind = variable.type.dtype
+            self._progress[name] = torch.zeros(b, device=p.device, dtype=wp.dtype_to_torch(kind))
+            setattr(progress, name, warp_view(self._progress[name], kind))
         size = max(memory, 1)
         self._refactors = refactor_after is not None
         self._history_counts = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
@@ -186,11 +173,8 @@ class Minimiser:
                 kept, its pairs are not.
         """
         p = self._potential
-        for counts in (
-            self._history_counts[0],
-            self._pair_counts,
-            *((self._counts["factored"],) if self._refactors else ()),
-        ):
+        kept = [self._history_counts[0], self._pair_counts, *([self._progress["factored"]] if self._refactors else [])]
+        for counts in kept:
             if follows is None:
                 counts.zero_()
             else:
@@ -203,7 +187,7 @@ class Minimiser:
             p.active.fill_(1)
             return
         if not self._hessian.ready():
-            self._counts["factored"].zero_()
+            self._progress["factored"].zero_()
         try:
             state = self.begin(start)
             while state.active:
@@ -240,9 +224,9 @@ class Minimiser:
 
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns directions, last residual over balancing forces, convergence and factorisations, (B,) each."""
-        counts = self._counts
-        converged = counts["phase"] == kernels.DONE
-        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["factorisations"].long()
+        state = self._progress
+        converged = state["phase"] == kernels.DONE
+        return state["iterations"].long(), state["relative"].clone(), converged, state["factorisations"].long()
 
     def _check_and_read(self) -> Summary:
         state = self._read()

@@ -10,7 +10,7 @@ import torch
 from scipy.stats import qmc
 
 from ..io.errors import ConvergenceError
-from ..learning.networks import Coder
+from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from warp_resphys.data.marker_view import FRAMES
 from warp_resphys.data.markers import KINDS
-from warp_resphys.dynamics.simulator import COUPLINGS
+from warp_resphys.dynamics.potential_terms import COUPLINGS
 from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS

@@ -14,7 +14,8 @@ from warp_resphys.energies.launcher import warp_view
 from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.kernels import minimisation as kernels
-from warp_resphys.kernels.minimisation import minimisation_kernels
+from warp_resphys.kernels.lbfgs import lbfgs_kernels
+from warp_resphys.kernels.line_search import MAX_HALVINGS, accept_kernel
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
@@ -356,7 +357,7 @@ def test_directions_equal_the_bfgs_formula():
     minimiser.refactor(state)
     while min(map(len, pairs)) < 3 * memory:
         state = minimiser.advance(state)
-        waits = minimiser._counts["phase"] != kernels.NEED_DIRECTION
+        waits = minimiser._progress["phase"] != kernels.NEED_DIRECTION
         searches += int(waits.sum())
         for b in range(2):
             if waits[b]:
@@ -379,9 +380,9 @@ class OneVertex:
     """
 
     def __init__(self, memory):
-        self.own, self.vectors = minimisation_kernels(wp.float64), {}
-        self.progress, self.pairs, self.evaluation = kernels.SolverProgress(), self.own.Pairs(), kernels.Evaluation()
-        self.tolerances, pairs = kernels.Tolerances(), self.pairs
+        self.pairs, self.vectors = lbfgs_kernels(wp.float64).Pairs(), {}
+        self.progress, self.evaluation = kernels.SolverProgress(), kernels.Evaluation()
+        self.search, self.tolerances, pairs = kernels.LineSearch(), kernels.Tolerances(), self.pairs
         for name, variable in kernels.SolverProgress.vars.items():
             setattr(self.progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
         pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
@@ -390,6 +391,8 @@ class OneVertex:
         for name in ("energy", "size", "balance", "norm"):
             setattr(self.evaluation, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
         self.evaluation.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
+        for name in kernels.LineSearch.vars:
+            setattr(self.search, name, self._vector(name))
         self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
         for name in ("stored", "newest", "order"):
             setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
@@ -403,11 +406,9 @@ class OneVertex:
     def accept(self):
         self.progress.phase.fill_(kernels.LINE_SEARCH)
         inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
-        kept = {name: self.vectors.get(name) for name in ("origin", "direction", "positions", "gradient")}
-        views = {n: self._vector(n) if v is None else warp_view(v, wp.vec3d) for n, v in kept.items()}
-        inputs = [1, self.tolerances, inertia, self.evaluation, views["origin"], views["direction"], self.clamped]
-        inputs += [views["positions"], views["gradient"], self.progress, self.pairs, self.history]
-        wp.launch_tiled(self.own.accept, dim=[1], inputs=inputs, block_dim=64, device="cpu")
+        inputs = [1, self.tolerances, inertia, self.evaluation, self.clamped, self.search]
+        inputs += [self.progress, self.pairs, self.history]
+        wp.launch_tiled(accept_kernel(wp.float64), dim=[1], inputs=inputs, block_dim=64, device="cpu")
 
     def __getitem__(self, name):
         return float(getattr(self.progress, name).numpy()[0])
@@ -417,9 +418,6 @@ class OneVertex:
 def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
     """Also where all places are taken."""
     one = OneVertex(memory)
-    one.accept()  # makes the vectors
-    one.pairs.count.zero_()
-    one.pairs.last.zero_()
     kept = []
     generator = torch.Generator().manual_seed(0)
     for step in range(9):
@@ -458,7 +456,7 @@ def test_a_failed_line_search(iterations, factorisations, clamped, phase, reques
     start = {"iterations": iterations, "factorisations": factorisations, "stalls": stalls}
     for name, value in {**start, "request": 0, "check_rounding": 0}.items():
         getattr(one.progress, name).fill_(value)
-    one.progress.halvings.fill_(kernels.MAX_HALVINGS - 1)
+    one.progress.halvings.fill_(MAX_HALVINGS - 1)
     one.progress.rounding.fill_(np.inf)
     one.evaluation.energy.fill_(np.nan)
     one.clamped.fill_(clamped)

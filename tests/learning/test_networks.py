@@ -10,18 +10,8 @@ from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.networks import (
-    NextState,
-    ResidualForce,
-    SkipMLP,
-    actuation_coder,
-    build_model,
-    build_next_state,
-    displacement_coder,
-    nodal_coder,
-    pod_coder,
-    restore,
-)
+from warp_resphys.learning.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
+from warp_resphys.learning.networks import NextState, ResidualForce, SkipMLP, build_model, build_next_state, restore
 from warp_resphys.learning.predictors import LearnedPredictor, Range
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.stepping.inputs import Inputs

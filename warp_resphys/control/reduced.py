@@ -39,9 +39,6 @@ from .polynomials import Monomials, Polynomial
 from .reduced_force import ForceAlong, ReducedForce
 from .world import BoolArray, FloatArray
 
-STATIC_ORDER: Final = 3
-TANGENT_ORDER: Final = 2
-USUAL_ORDER: Final = 1
 _REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50
 _HALVINGS: Final = 8
@@ -72,13 +69,8 @@ class ReducedState:
 
     def where(self, chosen: BoolArray, other: "ReducedState") -> "ReducedState":
         """Joins two states: this one where chosen (B,), the other one elsewhere."""
-        theirs = other.arrays()
-        return self.from_arrays(
-            {
-                key: np.where(chosen[:, None] if array.ndim > 1 else chosen, array, theirs[key])
-                for key, array in self.arrays().items()
-            }
-        )
+        pairs = ((key, array, other.arrays()[key]) for key, array in self.arrays().items())
+        return self.from_arrays({k: np.where(chosen[:, None] if a.ndim > 1 else chosen, a, b) for k, a, b in pairs})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays of the state by name, for a checkpoint."""
@@ -183,8 +175,7 @@ class ReducedModel:
             residual = a @ (z - base)[0] - force(slice(1), np.stack([z, np.zeros_like(z)]))[0]
             return residual, float(np.abs(np.linalg.solve(a, residual)).max())
 
-        z = base
-        residual, error = imbalance(z)
+        z, (residual, error) = base, imbalance(base)
         for _ in range(_ITERATIONS):
             if error < _REST_TOLERANCE * size:
                 return z, force
@@ -253,8 +244,7 @@ class ReducedModel:
         back[1:] = self.integrator == "bdf2"
         share = np.where(back, 1.0 / 3.0, 0.0).reshape(-1, 1)  # g
         step = np.where(back, 2.0 / 3.0 * h, h).reshape(-1, 1)
-        base = self.static(u)
-        a, damping = self.stiffness(u), self.damping(u)
+        base, a, damping = self.static(u), self.stiffness(u), self.damping(u)
         inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
         inverse = np.linalg.inv(inertia + a)
         pull = (a @ (base if bias is None else base + bias)[..., None])[..., 0]

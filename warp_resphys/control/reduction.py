@@ -10,16 +10,19 @@ import torch
 from scipy.stats import qmc
 
 from ..io.errors import ConvergenceError
-from ..learning.networks import Coder
+from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State
 from .polynomials import Polynomial, solve_ridge
-from .reduced import STATIC_ORDER, TANGENT_ORDER, USUAL_ORDER, ReducedModel, ReducedState
+from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
 from .world import FloatArray
 
+STATIC_ORDER: Final = 3
+TANGENT_ORDER: Final = 2
+USUAL_ORDER: Final = 1
 _LEAST_SETTLED: Final = 0.9  # share of the sampled inputs that must have an equilibrium
 _WINDOW: Final = 0.3  # length of the predictions that measure the error [s]
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from ..energies.base import BoundEnergy, EnergySite, Memory, Term
+from ..energies.explicit import ExplicitEnergy
 from ..energies.placed import PlacedEnergy
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -48,7 +49,8 @@ class EnergySet:
         method: Integrator,
         time_step: float,
     ) -> None:
-        self.placed = tuple(placed)
+        self.placed, self._rest_positions = tuple(placed), rest_positions
+        self._explicit: dict[tuple[int, str], ExplicitEnergy] = {}
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}
@@ -131,6 +133,20 @@ class EnergySet:
         for (placed, bound), term in zip(self._pairs, terms, strict=True):
             memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, term), x, q))
         return memory
+
+    def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
+        """Returns the energy with the named input for a batch size, made at its first use; see `Simulator`."""
+        if (batch, name) not in self._explicit:
+            placed = next((item for item in self.placed if name in item.input_names), None)
+            if placed is None:
+                accepted = ", ".join(self.inputs) or "none"
+                raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
+            energy, (points,) = placed.energy, placed.all_points or placed.points
+            if energy.implicit_only:
+                raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
+            q = self._rest_positions
+            self._explicit[batch, name] = ExplicitEnergy(energy, points, len(q), batch, q.device)
+        return self._explicit[batch, name]
 
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
         """Raises InputError for an unknown memory variable, a wrong shape or dtype, or values that are not finite."""

@@ -5,7 +5,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.autograd import forward_ad
 from typing_extensions import override
 
@@ -23,7 +22,6 @@ from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings, chec
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
-_LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
 _REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: target, and limit if rounding prevents the target
 
@@ -34,7 +32,7 @@ class Workspace:
     Args:
         energies: energies of the body.
         coordinates: map from control vertices to all vertices.
-        fixed: (D,) fixed vertices.
+        fixed: (D,) fixed vertices, on the device.
         pattern: block structure of the Hessian.
         batch: number of environments.
         device: device of every buffer.
@@ -48,14 +46,14 @@ class Workspace:
         self,
         energies: Sequence[PlacedEnergy],
         coordinates: Coordinates,
-        fixed: NDArray[np.int64],
+        fixed: torch.Tensor,
         pattern: BlockPattern,
         batch: int,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.fixed = torch.as_tensor(fixed, device=device)
-        eliminated = torch.as_tensor(np.union1d(fixed, coordinates.dependent), device=device)
+        self.fixed = fixed
+        eliminated = torch.as_tensor(np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device)
         self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._cache: dict[Any, Any] = {}
@@ -150,40 +148,6 @@ def equilibrium(
         x, report = _solve_shards(workspace, purpose, settings, follows, names, tensors)
     check_converged(settings, report, x)
     return x, report
-
-
-def ramp_loads(
-    solve: Callable[[float, torch.Tensor], torch.Tensor], rest: torch.Tensor, limited: ConvergenceError | None
-) -> torch.Tensor:
-    """Returns the equilibrium (B, N, 3) reached by increasing the loads from zero in steps.
-
-    Args:
-        solve: returns the equilibrium under a fraction of the loads, from an initial guess.
-        rest: (B, N, 3) equilibrium without loads [m].
-        limited: error of the solve with all loads, if a configured limit of iterations may be its cause.
-
-    Raises:
-        ConvergenceError: no equilibrium was found.
-    """
-    done, step, x = 0.0, 0.5, rest
-    while done < 1.0:
-        share = min(done + step, 1.0)
-        try:
-            x = solve(share, x)
-        except ConvergenceError as error:
-            step *= 0.5
-            if step < _LEAST_SHARE and limited is not None:
-                raise limited from None
-            if step < _LEAST_SHARE:
-                raise ConvergenceError(
-                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
-                    "lower the loads, or take a stiffer material.",
-                    x,
-                    error.report,
-                ) from None
-        else:
-            done = share
-    return x
 
 
 class _Equilibrium(torch.autograd.Function):

@@ -10,22 +10,13 @@ import warp as wp
 from ..energies.launcher import CapturedGraph, issue, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import minimisation as kernels
+from ..kernels import rounding
+from ..kernels.lbfgs import lbfgs_kernels
+from ..kernels.line_search import accept_kernel
 from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
 
-_COUNTS = (
-    "phase",
-    "request",
-    "factored",
-    "check_rounding",
-    "iterations",
-    "since_factor",
-    "factorisations",
-    "halvings",
-    "stalls",
-)
-_SUMS = ("step", "slope", "energy", "scale", "relative", "smallest_norm", "rounding", "force", "stiffness")
 _PERTURBATIONS = 7  # random sign patterns for rounding checks
 
 
@@ -68,9 +59,6 @@ class Minimiser:
     ) -> None:
         p, b, n = potential, potential.batch, potential.n_vertices
         self._potential, self._hessian = p, hessian
-        self._counts = {name: torch.zeros(b, device=p.device, dtype=torch.int32) for name in _COUNTS}
-        self._sums = {name: p.zeros() for name in _SUMS}
-        self._gradient, self._direction, origin = (p.zeros(n, 3) for _ in range(3))
         self._right = torch.zeros(b, len(hessian.vertex_at), 3, device=p.device, dtype=dtype)
         summary = torch.zeros(len(Summary._fields), device=p.device, dtype=torch.int32)
         # A copy on the host; on a CPU the same memory.
@@ -78,14 +66,15 @@ class Minimiser:
         self._shown = self._seen.numpy()
 
         double = dtype == torch.float64
-        own = kernels.minimisation_kernels(wp.float64 if double else wp.float32)
-        vector = wp.vec3d if double else wp.vec3f
-        progress, pairs = kernels.SolverProgress(), own.Pairs()
+        scalar, vector = (wp.float64, wp.vec3d) if double else (wp.float32, wp.vec3f)
+        own = lbfgs_kernels(scalar)
+        progress, pairs, search = kernels.SolverProgress(), own.Pairs(), kernels.LineSearch()
         evaluation, tolerances = kernels.Evaluation(), kernels.Tolerances()
-        for name, values in self._counts.items():
-            setattr(progress, name, warp_view(values, wp.int32))
-        for name, values in self._sums.items():
-            setattr(progress, name, warp_view(values, wp.float64))
+        self._progress: dict[str, torch.Tensor] = {}
+        for name, variable in kernels.SolverProgress.vars.items():
+            kind = variable.type.dtype
+            self._progress[name] = torch.zeros(b, device=p.device, dtype=wp.dtype_to_torch(kind))
+            setattr(progress, name, warp_view(self._progress[name], kind))
         size = max(memory, 1)
         self._refactors = refactor_after is not None
         self._history_counts = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
@@ -108,30 +97,29 @@ class Minimiser:
         history.stored, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
         history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
 
-        positions, gradient = warp_view(p.positions, wp.vec3d), warp_view(self._gradient, wp.vec3d)
-        direction, origin_view = warp_view(self._direction, wp.vec3d), warp_view(origin, wp.vec3d)
+        search.positions = warp_view(p.positions, wp.vec3d)
+        search.origin, search.direction, search.gradient = (warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(3))
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
-        beginning = [*loads, positions, tolerances, origin_view, progress, history]
-        begin = p.record_blocks(kernels.begin, b, beginning, [])
+        begin = p.record_blocks(kernels.begin, b, [*loads, tolerances, search, progress, history], [])
         masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
         self._select = p.record(kernels.select_for_factorisation, (b,), [progress, *masks, pairs.count], [])
-        shared = [progress, pairs, vertex_at, gradient]
+        shared = [progress, pairs, vertex_at, search]
         self._project = p.record_blocks(own.project, b, shared, [right])
-        set_direction = p.record_blocks(own.set_direction, b, [*shared, right, positions], [origin_view, direction])
-        clamped = warp_view(hessian.clamped, wp.bool)
-        inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation, origin_view, direction]
-        accept = p.record_blocks(own.accept, b, [*inputs, clamped, positions, gradient, progress, pairs, history], [])
+        set_direction = p.record_blocks(own.set_direction, b, [*shared, right], [])
+        inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation]
+        inputs += [warp_view(hessian.clamped, wp.bool), search, progress, pairs, history]
+        accept = p.record_blocks(accept_kernel(scalar), b, inputs, [])
         counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
         evaluate = [*p.evaluation, accept, summarise]
         self._begin, self._evaluate = p.capture(begin, *evaluate), p.capture(*evaluate)
         self._first_trial = p.capture(set_direction, *evaluate)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
-        kept = warp_view(p.zeros(n, 3), wp.vec3d)
-        perturb = p.record_blocks(kernels.perturb, b, [progress, p.upload(signs, wp.vec3d), positions], [kept])
-        compared = [progress, kept, gradient, evaluation.residual]
-        check = p.record_blocks(kernels.check_rounding, b, compared, [positions, history])
+        kept, drawn = warp_view(p.zeros(n, 3), wp.vec3d), p.upload(signs, wp.vec3d)
+        perturb = p.record_blocks(rounding.perturb, b, [progress, drawn, search.positions], [kept])
+        compared = [progress, kept, evaluation.residual, search, history]
+        check = p.record_blocks(rounding.check_rounding, b, compared, [])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
         self._parts = SimpleNamespace(begin=begin, set_direction=set_direction, evaluate=evaluate)
         self._loop: CapturedGraph | None = None
@@ -185,11 +173,8 @@ class Minimiser:
                 kept, its pairs are not.
         """
         p = self._potential
-        for counts in (
-            self._history_counts[0],
-            self._pair_counts,
-            *((self._counts["factored"],) if self._refactors else ()),
-        ):
+        kept = [self._history_counts[0], self._pair_counts, *([self._progress["factored"]] if self._refactors else [])]
+        for counts in kept:
             if follows is None:
                 counts.zero_()
             else:
@@ -202,7 +187,7 @@ class Minimiser:
             p.active.fill_(1)
             return
         if not self._hessian.ready():
-            self._counts["factored"].zero_()
+            self._progress["factored"].zero_()
         try:
             state = self.begin(start)
             while state.active:
@@ -239,9 +224,9 @@ class Minimiser:
 
     def outcome(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns directions, last residual over balancing forces, convergence and factorisations, (B,) each."""
-        counts = self._counts
-        converged = counts["phase"] == kernels.DONE
-        return counts["iterations"].long(), self._sums["relative"].clone(), converged, counts["factorisations"].long()
+        state = self._progress
+        converged = state["phase"] == kernels.DONE
+        return state["iterations"].long(), state["relative"].clone(), converged, state["factorisations"].long()
 
     def _check_and_read(self) -> Summary:
         state = self._read()

@@ -5,7 +5,6 @@ Meshes and bodies are cached by their settings, since checks, stages and reports
 
 import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -26,6 +25,7 @@ from ..fem.rigid import Glue, Rigid
 from ..fem.symmetry import SymmetryPlane
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
+from ..io.machine import find_device
 from ..io.settings import parse
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import ArmGeometry
@@ -63,17 +63,9 @@ def choose_device(name: str) -> torch.device:
     Raises:
         InputError: the device is unknown or unavailable.
     """
-    available = torch.cuda.is_available()
     if name == "auto":
-        return torch.device("cuda" if available else "cpu")
-    if not re.fullmatch(r"(cpu|cuda)(:\d+)?", name):
-        raise InputError(f"device is {name!r}: choose auto, cpu or cuda.")
-    device = torch.device(name)
-    if device.type == "cuda" and not available:
-        raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise InputError(f"device is {name!r}, but torch finds {torch.cuda.device_count()} CUDA devices.")
-    return device
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return find_device(name, "auto, cpu or cuda")
 
 
 def simulation_device(name: str) -> torch.device:

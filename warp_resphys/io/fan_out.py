@@ -295,7 +295,6 @@ def _ray(workers: Workers) -> Iterator[None]:
 
 
 _BACKENDS: Final = {"local": _local, "ray": _ray, "dask": _dask}
-BACKENDS: Final = tuple(_BACKENDS)
 
 
 def _missing(backend: str) -> str:

@@ -1,7 +1,8 @@
-"""Hardware and code version of a result, to compare computing times."""
+"""Hardware and code version of a result, to compare computing times; devices by name."""
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 from functools import lru_cache
@@ -9,12 +10,26 @@ from pathlib import Path
 
 import torch
 
+from .errors import InputError
+
 _CPU_INFO = Path("/proc/cpuinfo")
 
 
 def available_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def find_device(name: str | torch.device, choices: str = "cpu or cuda") -> torch.device:
+    """Returns the named device, or raises InputError if it is unknown or unavailable."""
+    if not re.fullmatch(r"(cpu|cuda)(:\d+)?", str(name)):
+        raise InputError(f"device is {name!r}: choose {choices}.")
+    device, count = torch.device(name), torch.cuda.device_count()
+    if device.type == "cuda" and not count:
+        raise InputError(f"device is {name!r}, but torch finds no CUDA device: choose device=cpu.")
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise InputError(f"device is {name!r}, but torch finds {count} CUDA devices.")
+    return device
 
 
 def hardware() -> dict[str, str]:

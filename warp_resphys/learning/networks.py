@@ -1,7 +1,7 @@
 """Networks that predict a residual force, or the next state, from the state.
 
-A model is a coder around a multi-layer perceptron: the coder turns (q, v) into standardised inputs and standardised
-outputs into forces. Its constants come from the training split and are saved with the weights.
+A model is a multi-layer perceptron between coders (`coders`): these turn (q, v) into standardised inputs, and
+standardised outputs into forces. Their constants come from the training split and are saved with the weights.
 """
 
 from collections.abc import Mapping
@@ -14,13 +14,10 @@ from typing_extensions import override
 from ..dynamics.modes import RestStiffness
 from ..io.errors import InputError
 from ..settings.learning import NetworkSettings
+from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
 _ARCHITECTURE = ("blocks", "layers", "width", "activation")
 ACTIVATIONS = ("normalised_elu", "silu")
-# Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
-_DEVIATION_FLOOR = 3e-3
-# Evenly spaced samples for modes: neighbours in time are nearly equal, and more samples take minutes.
-_SAMPLES_FOR_MODES = 2_000
 
 
 class SkipMLP(nn.Module):
@@ -91,114 +88,6 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str)
         modules.append(nn.Linear(n_in if i == 0 else width, width))
         modules += [nn.SiLU()] if activation == "silu" else [nn.LayerNorm(width), nn.ELU()]
     return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
-
-
-class Coder(nn.Module):
-    """An affine map between a field on the vertices and standardised coordinates: c = (x - mean) basis / scale.
-
-    Its constants are in double precision, as the states of simulations.
-
-    Args:
-        mean: (D,) flattened field at c = 0.
-        basis: (D, M) columns; None for the coordinates themselves.
-        scale: (M,) standard deviation of each coordinate.
-        dual: (D, M) columns that decode fields, with dual^T basis = 1; None for an orthonormal basis, its own dual.
-    """
-
-    mean: torch.Tensor
-    scale: torch.Tensor
-    basis: torch.Tensor | None
-    dual: torch.Tensor | None
-
-    def __init__(
-        self,
-        mean: torch.Tensor,
-        basis: torch.Tensor | None,
-        scale: torch.Tensor,
-        dual: torch.Tensor | None = None,
-    ) -> None:
-        super().__init__()
-        for name, values in (("mean", mean), ("basis", basis), ("scale", scale), ("dual", dual)):
-            self.register_buffer(name, None if values is None else values.double())
-
-    @property
-    def size(self) -> int:
-        """Number of coordinates, M."""
-        return len(self.scale)
-
-    def encode(self, field: torch.Tensor) -> torch.Tensor:
-        """Maps fields (S, N, 3) to coordinates (S, M)."""
-        x = field.flatten(1) - self.mean
-        return (x if self.basis is None else x @ self.basis) / self.scale
-
-    def decode(self, coordinates: torch.Tensor) -> torch.Tensor:
-        """Maps coordinates (S, M) to fields (S, N, 3)."""
-        x = coordinates * self.scale
-        if self.basis is not None:
-            x = x @ (self.basis if self.dual is None else self.dual).mT
-        return (x + self.mean).unflatten(1, (-1, 3))
-
-
-def pod_coder(samples: torch.Tensor, modes: int) -> Coder:
-    """Proper orthogonal decomposition about zero: the M modes with most of the energy of samples (S, N, 3).
-
-    Raises:
-        InputError: more modes than samples or coordinates, or samples that are all zero.
-    """
-    x = _thinned(samples).flatten(1).double()
-    if not bool(x.any()):
-        raise InputError(
-            f"{modes} modes were asked for of a field that is zero in all {len(x)} samples, such as the velocities of "
-            "poses: set that number of modes to 0."
-        )
-    if not 1 <= modes <= min(x.shape):
-        raise InputError(f"{modes} modes were asked for, but {len(x)} samples give 1 to {min(x.shape)}.")
-    _, _, directions = torch.linalg.svd(x, full_matrices=False)
-    basis = directions[:modes].mT.contiguous()
-    deviation = (x @ basis).square().mean(0).sqrt()
-    return Coder(torch.zeros_like(x[0]), basis, deviation.clamp_min(_DEVIATION_FLOOR * float(deviation.max())))
-
-
-def _thinned(samples: torch.Tensor) -> torch.Tensor:
-    """At most `_SAMPLES_FOR_MODES` of (S, ...) samples, evenly spaced."""
-    return samples[:: -(-len(samples) // _SAMPLES_FOR_MODES)]
-
-
-def displacement_coder(samples: torch.Tensor, stiffness: RestStiffness, modes: int) -> Coder:
-    """Coder of forces in the modes Psi of their static displacements: f = K Psi c and c = Psi^T K^-1 f.
-
-    A slender body is moved most by small forces, while large ones cancel. In modes of the forces themselves, a small
-    error of a large force moves the body further than the small forces do. In modes of K^-1 f, the error of a
-    coordinate is the error of the displacement.
-
-    Args:
-        samples: (S, N, 3) forces [N].
-        stiffness: K of the body at rest.
-        modes: number of modes, M.
-
-    Raises:
-        InputError: more modes than samples or coordinates.
-    """
-    forces = _thinned(samples).flatten(1).double()
-    displacements = torch.as_tensor(stiffness.displacements(forces.cpu().numpy().T).T.copy()).to(forces)
-    coder = pod_coder(displacements.unflatten(1, (-1, 3)), modes)
-    assert coder.basis is not None
-    psi = coder.basis.cpu().numpy()
-    basis, dual = (torch.as_tensor(part).to(forces) for part in (stiffness.displacements(psi), stiffness.forces(psi)))
-    return Coder(torch.zeros_like(forces[0]), basis, coder.scale, dual)
-
-
-def actuation_coder(samples: torch.Tensor) -> Coder:
-    """Coder of (S, A) by the root mean square of each column; zero actuation stays zero."""
-    size = samples.square().mean(0).sqrt()
-    return Coder(torch.zeros_like(size), None, torch.where(size > 0.0, size, torch.ones_like(size)))
-
-
-def nodal_coder(samples: torch.Tensor) -> Coder:
-    """Coder that standardises every coordinate of (S, N, 3), as published; constant coordinates are zero."""
-    x = samples.flatten(1)
-    deviation = x.std(0)
-    return Coder(x.mean(0), None, torch.where(deviation > 0.0, deviation, torch.ones_like(deviation)))
 
 
 class StateMap(nn.Module):
@@ -401,15 +290,9 @@ def _state_coders(settings: NetworkSettings, u: torch.Tensor, v: torch.Tensor) -
     """Coders of displacements and velocities."""
     if settings.kind == "reduced":
         pairs = ((u, settings.position_modes), (v, settings.velocity_modes))
-        position, velocity = (pod_coder(field, modes) if modes else _empty_coder(field) for field, modes in pairs)
+        position, velocity = (pod_coder(field, modes) if modes else empty_coder(field) for field, modes in pairs)
         return position, velocity
     return nodal_coder(u), nodal_coder(v)
-
-
-def _empty_coder(samples: torch.Tensor) -> Coder:
-    """Coder without coordinates, for a field that is not an input of the network."""
-    mean = samples.new_zeros(samples[0].numel())
-    return Coder(mean, mean.new_zeros(len(mean), 0), mean.new_zeros(0))
 
 
 Model = TypeVar("Model", bound=StateMap)

@@ -26,7 +26,6 @@ from .predictors import LearnedPredictor, Range
 from .replay import Replay
 from .rollout import DIVERGENCE_DISTANCE, Rollout
 
-REFINEMENTS = ("none", "solver_in_the_loop")
 _WINDOW = ("motion", "trial", "frame")
 _SMALLEST_UNIT = 1e-20  # mm^2
 

@@ -140,8 +140,7 @@ class Section:
         if room < _LEAST_ROOM * self.radius or self.inner_radius <= 0.0:
             raise MeshError(f"{where}, {self.count} chambers do not fit: make the wall, the web or the core thinner.")
         if self.core is not None:
-            gaps = {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s}
-            gap = 2.0 * gaps[self.profile]
+            gap = 2.0 * {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s}[self.profile]
             if gap < self.web * (1.0 - 1e-9):
                 raise MeshError(
                     f"{where}, a core of {1e3 * self.core:.4g} mm leaves webs of {1e3 * gap:.4g} mm between chambers, "
@@ -216,17 +215,15 @@ class Section:
 
     def motion(self, name: str) -> complex:
         """Returns the displacement of a named point per unit of growth; corners are fixed, or keep the web's width."""
-        point = self.points[name]
+        point, along = self.points[name], complex(np.exp(1j * self.half_angle))
         if name[0] in "AMCE":
             if self.profile == "sector" and name not in ("M", "A1"):
-                along = complex(np.exp(1j * self.half_angle))
                 return (point / along).real * along
             corner = self.profile == "half_disc" and name in ("A0", "C", "M")
             return 0j if corner else point - self.arc_centre
         if name[0] in "BV":
             return 0j if self.outline == "lobed" and name in ("B0", "V") else point - self._outline_centre
         if name == "W" and self.profile == "disc":  # moves with the opposite corner, as in `points`
-            along = complex(np.exp(1j * self.half_angle))
             return (2.0 if self.outline == "lobed" else 1.0) * (self.motion("C") / along).real * along
         return 0j
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -11,22 +10,19 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
-from ..data.input_response import InputResponse, response_of, with_means
-from ..dynamics.frames import BaseFrame, VertexFrames, base_movement, rotations
-from ..energies.strings import PAYLOAD, Strings
+from ..dynamics.frames import BaseFrame, VertexFrames
 from ..experiment.experiment import COROTATED
-from ..experiment.files import payload_inputs
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError
 from ..learning.feedback_equilibrium import equilibrium_under_feedback
 from ..learning.networks import NextState
-from ..learning.parameters import MASS_FACTOR, check_names, constants_of, identifiable_parameters
+from ..learning.parameters import check_names, constants_of, identifiable_parameters
 from ..learning.predictors import LearnedPredictor
 from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
-from ..stepping.inputs import Inputs
 from ..stepping.state import State
+from .commands import Commands
 from .description import Description
-from .inputs import BASE, FORCE, Given, InputReader, inputs_of
+from .inputs import Given, InputReader, inputs_of
 from .motion import Motion
 from .state import RobotState
 
@@ -89,10 +85,7 @@ class Robot:
         self.parameters = values
         spread = {name: value.expand(count) for name, value in values.items()}
         self.constants = self.simulator.prepare(constants_of(self.simulator, spread))
-        filters = self.description.filters if self._learned is not None else ()
-        self._responses = {
-            name: InputResponse(self.time_step, *response_of(name, values), filters) for name in self.driven
-        }
+        self._commands = Commands(self.simulator, self.description, self.inputs, values)
 
     def with_parameters(self, **parameters: torch.Tensor | float) -> "Robot":
         """Returns a robot with other parameters, which shares all other data with this one.
@@ -104,7 +97,7 @@ class Robot:
             InputError: an unknown name, or a value out of range.
         """
         other = object.__new__(Robot)
-        other.__dict__.update({name: value for name, value in self.__dict__.items() if name != "_payload_share"})
+        other.__dict__.update(self.__dict__)
         other._set_parameters({**self.parameters, **parameters})
         return other
 
@@ -170,7 +163,8 @@ class Robot:
             v: velocities of the same shape [m/s]; zero if omitted.
         """
         at = self._reader.field(q, "q")
-        return self._new(State(at, torch.zeros_like(at) if v is None else self._reader.field(v, "v")))
+        body = State(at, torch.zeros_like(at) if v is None else self._reader.field(v, "v"))
+        return self._commands.begin(body, {})
 
     def begin(self, batch: int = 1, **inputs: Given) -> RobotState:
         """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
@@ -186,10 +180,10 @@ class Robot:
             ConvergenceError: there is no equilibrium.
         """
         given = self._read(inputs, batch)
-        state = self._new(self.simulator.rest_state(batch), given)
+        state = self._commands.begin(self.simulator.rest_state(batch), given)
         if not len(self.simulator.fixed):
             return state
-        acting = self._acting(state, given)[0]
+        acting = self._commands.act(state, given).inputs
         return replace(state, body=self.simulator.static_equilibrium(acting, self.constants, batch=batch))
 
     def settle(self, batch: int = 1, **inputs: Given) -> RobotState:
@@ -210,17 +204,17 @@ class Robot:
             for _ in range(POSE_STEPS):
                 start = self.step(start, **inputs)
             return start
-        acting, conditions, memory, base = self._acting(start, self._read(inputs, batch))
-        predictor = self._predictor(conditions, base)
+        acting = self._commands.act(start, self._read(inputs, batch))
+        predictor = self._predictor(acting.conditions, acting.base)
 
         def force(state: State) -> torch.Tensor:
             predicted = predictor(state, 0)
             assert isinstance(predicted, torch.Tensor)
             return predicted
 
-        body = equilibrium_under_feedback(self.simulator, acting, self.constants, start.body, force)
+        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start.body, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
-        return replace(start, body=body, memory={**start.memory, **memory}, left=left)
+        return replace(start, body=body, memory={**start.memory, **acting.memory}, left=left)
 
     def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns positions (B, N, 3) of `settle` [m], and (B,) bool, which environments are in equilibrium.
@@ -253,12 +247,12 @@ class Robot:
             InputError: an unknown input or part, or values of another shape or out of range.
             ConvergenceError: the step failed, and ``on_failure`` is ``raise``.
         """
-        acting, conditions, memory, base = self._acting(state, self._read(inputs, state.batch))
+        acting = self._commands.act(state, self._read(inputs, state.batch))
         predictor = None
         if self._learned is not None:
-            predictor = self._predictor(conditions, base)
+            predictor = self._predictor(acting.conditions, acting.base)
             predictor.hidden = state.hidden
-        rollout = Rollout(self.simulator, predictor, acting, self.constants)
+        rollout = Rollout(self.simulator, predictor, acting.inputs, self.constants)
         rollout.resume(state.lost, 0)
         body = rollout.differentiable_step(state.body)
         now = rollout.lost(body)
@@ -273,7 +267,8 @@ class Robot:
         if predictor is not None and predictor.left_at is not None:
             left = left | (predictor.left_at >= 0)
         hidden = None if predictor is None else predictor.hidden
-        return RobotState(body, memory, hidden, None if base is None else base[1:], left, now)
+        base = None if acting.base is None else acting.base[1:]
+        return RobotState(body, acting.memory, hidden, base, left, now)
 
     def rollout(
         self,
@@ -326,11 +321,11 @@ class Robot:
 
     def begin_memory(self, inputs: Mapping[str, Given], batch: int = 1) -> dict[str, torch.Tensor]:
         """Returns `RobotState.memory` after constant inputs have acted for a long time."""
-        return dict(self._new(self.simulator.rest_state(batch), self._read(inputs, batch)).memory)
+        return dict(self._commands.begin(self.simulator.rest_state(batch), self._read(inputs, batch)).memory)
 
     def conditions(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
         """Inputs (B, A) of the network beside the state in a step, as `program.condition_names` lists them."""
-        return self._acting(state, self._read(inputs, state.batch))[1]
+        return self._commands.act(state, self._read(inputs, state.batch)).conditions
 
     def linearised(
         self, state: RobotState, **inputs: Given
@@ -340,77 +335,13 @@ class Robot:
         Returns:
             The (3 F, 3 F) Hessian and its inertial part (3 F,) [N/m], and the numbers of the F free vertices.
         """
-        acting = self._acting(state, self._read(inputs, state.batch))[0]
+        acting = self._commands.act(state, self._read(inputs, state.batch)).inputs
         linearised = self.simulator.linearise(state.body, acting, self.constants)
         hessian, inertia = linearised.matrix(state.q)
         return hessian, inertia, linearised.free.cpu().numpy()
 
-    # Inputs
-
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
-
-    def _new(self, body: State, given: Mapping[str, torch.Tensor] | None = None) -> RobotState:
-        """State after constant inputs (B, C), zero if omitted, have acted for a long time."""
-        memory: dict[str, torch.Tensor] = {}
-        for name, response in self._responses.items():
-            value = (given or {}).get(name)
-            zeros = body.q.new_zeros(body.batch, len(self.inputs[name].parts))
-            still = response.steady(zeros if value is None else value)
-            memory |= {f"{name}.{key}": values for key, values in still.items()}
-        base = (given or {}).get(BASE)
-        moved = self.description.told_of_base is not None or base is not None
-        at = body.q.new_zeros(body.batch, len(self.inputs[BASE].parts)) if base is None else base
-        return RobotState(body, memory, base=torch.stack([at, at]) if moved else None)
-
-    @cached_property
-    def _payload_share(self) -> torch.Tensor:
-        """Share (1, N) of a payload that hangs on each vertex."""
-        share = payload_inputs(self.simulator.body, self.description.payload_at, np.ones(1))["attached_mass"]
-        return self.simulator.tensor(share)
-
-    def _acting(
-        self, state: RobotState, given: Mapping[str, torch.Tensor]
-    ) -> tuple[Inputs, torch.Tensor | None, dict[str, torch.Tensor], torch.Tensor | None]:
-        """Simulator inputs, conditions of the network, next memory, and the base (3, B, 6) from a step ago on."""
-        fields: dict[str, torch.Tensor | None] = {FORCE: given.get(FORCE)}
-        conditions, memory = list[torch.Tensor](), dict[str, torch.Tensor]()
-        payload = given.get(PAYLOAD.name)
-        if self.description.payload_at is not None and self.description.sees_payload:
-            conditions.append(state.q.new_zeros(state.batch, 1) if payload is None else payload)
-        for name, response in self._responses.items():
-            value, own = given.get(name), f"{name}."
-            zeros = state.q.new_zeros(state.batch, len(self.inputs[name].parts))
-            remembered = {key.removeprefix(own): x for key, x in state.memory.items() if key.startswith(own)}
-            acting, means, later = response(remembered, (zeros if value is None else value)[None])
-            fields[name] = acting[0]
-            conditions += [with_means(acting[0], means[:, 0])] if name in self.description.seen else []
-            memory |= {f"{own}{key}": values for key, values in later.items()}
-        if payload is not None:
-            fields |= self._hung(payload)
-        base = state.base
-        if BASE in given or base is not None:
-            before = given[BASE].new_zeros(2, *given[BASE].shape) if base is None else base
-            base = torch.cat([before, given.get(BASE, before[1])[None]])
-            fields["fixed_positions"] = self._fixed(base[2])
-            if self.description.told_of_base is not None:
-                gravity = self.simulator.tensor(self.simulator.gravity)
-                moved = base_movement(base, self.time_step, gravity)[1]
-                conditions.append(moved[:, torch.tensor(self.description.told_of_base, device=moved.device)])
-        return Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base
-
-    def _hung(self, payload: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Inputs of the simulator for a payload (B, 1) [kg]."""
-        factor = self.parameters.get(MASS_FACTOR)
-        mass = payload if factor is None else payload * factor[:, None]
-        if any(isinstance(energy, Strings) for energy in self.simulator.body.energies):
-            return {PAYLOAD.name: mass}
-        return {"attached_mass": mass * self._payload_share}
-
-    def _fixed(self, pose: torch.Tensor) -> torch.Tensor:
-        """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""
-        rest = self.simulator.rest_positions[self.simulator.fixed]
-        return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]
 
     def _predictor(self, conditions: torch.Tensor | None, base: torch.Tensor | None) -> LearnedPredictor:
         learned = self._learned

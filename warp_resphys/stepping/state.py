@@ -1,9 +1,13 @@
 """The state of a batch, and the implicit solve of a time step."""
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
+
+from ..io.errors import InputError
+from .inputs import check_tensor
 
 _MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
@@ -22,6 +26,16 @@ class State:
     def batch(self) -> int:
         """Number of environments B."""
         return self.q.shape[0]
+
+    def check(self, vertices: int, like: torch.Tensor) -> None:
+        """Raises InputError for a wrong shape, dtype or device, or values that are not finite; not for the memory."""
+        fields = {"state.q": self.q, "state.v": self.v}
+        if self.previous is not None:
+            if not (isinstance(self.previous, tuple) and len(self.previous) == 2):
+                raise InputError("state.previous must be the pair (q, v) of the step before, or None.")
+            fields |= {f"state.previous[{i}]": values for i, values in enumerate(self.previous)}
+        for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
+            check_tensor(name, values, (self.batch, vertices, 3), unit, "vertex", like)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
         """Returns the state with a function applied to every tensor."""

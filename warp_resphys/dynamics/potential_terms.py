@@ -1,0 +1,94 @@
+"""Terms of the incremental potential: inertia, loads, and the values of the energies.
+
+Mass damping is linear in x, so it is merged with inertia and target. With explicit coupling, loads such as pressure are
+dead loads, evaluated at the start of the step.
+"""
+
+from collections.abc import Sequence
+
+import torch
+
+from ..energies.base import Term
+from ..energies.placement import DEPENDENT
+from ..energies.potential import StepTerms
+from ..fem.coordinates import DeviceCoordinates
+from ..io.errors import InputError
+from ..stepping.constants import Constants
+from ..stepping.inputs import Inputs
+from ..stepping.state import ImplicitStage, State
+from .energy_set import EnergySet
+
+COUPLINGS = ("implicit", "explicit")
+
+
+class PotentialTerms:
+    """Computes the terms of a step and of a static equilibrium, differentiable.
+
+    Args:
+        energies: all energies of the simulator.
+        coordinates: coordinates of the body.
+        coupling: as for the simulator.
+
+    Raises:
+        InputError: an unknown coupling, or explicit coupling of a follower load.
+    """
+
+    def __init__(self, energies: EnergySet, coordinates: DeviceCoordinates, coupling: str) -> None:
+        if coupling not in COUPLINGS:
+            raise InputError(f"coupling is {coupling!r}: choose one of {', '.join(COUPLINGS)}.")
+        self._energies, self._coordinates = energies, coordinates
+        explicit = energies.placed if coupling == "explicit" else ()
+        self._explicit = [name for item in explicit if item.energy.is_load for name in item.input_names]
+        followers = [name for item in explicit if item.energy.implicit_only for name in item.input_names]
+        if followers:
+            raise InputError(
+                f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
+                "implicit."
+            )
+
+    def of_step(
+        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, terms: Sequence[Term]
+    ) -> StepTerms:
+        """Returns the terms of a step; ``terms`` are the energies' kernels for the batch."""
+        batch, h = state.batch, stage.step
+        damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
+        mass, force = constants.mass, self._loads(inputs, constants, batch, False)
+        if inputs.attached_mass is not None:
+            mass = mass + inputs.attached_mass
+        values = self._energies.values(constants, inputs, batch)
+        values |= self._energies.begin_step(state, stage, inputs, constants, terms)
+        for name in self._explicit:
+            value = values[name]
+            assert value is not None
+            force = force + self._energies.explicit_energy(name, batch).force(state.q, value)
+            values[name] = torch.zeros_like(value)
+        target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
+        inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
+        dependent = self._coordinates.dependent
+        if len(dependent):
+            values[f"{DEPENDENT}inertia"] = inertia[:, dependent]
+            values[f"{DEPENDENT}target"] = target[:, dependent]
+        return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
+
+    def at_rest(self, rest: torch.Tensor, inputs: Inputs, constants: Constants, share: float) -> StepTerms:
+        """Returns the terms of a static equilibrium of the shape ``rest`` (B, N, 3), under a fraction of all loads."""
+        batch = len(rest)
+        values = self._energies.values(constants, inputs, batch)
+        for name in self._energies.inputs:
+            value = values[name]
+            values[name] = None if value is None else share * value
+        values |= self._energies.at_rest(batch)
+        force = self._coordinates.reduce(self._loads(inputs, constants, batch, True).expand(batch, -1, -1))
+        return StepTerms(rest, rest.new_zeros(rest.shape[:2]), share * force, values)
+
+    def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor:
+        """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
+        mass = constants.load_mass
+        if inputs.attached_mass is not None:
+            mass = mass + inputs.attached_mass
+        force = mass[..., None] * constants.gravity[:, None]
+        if inputs.external_force is not None:
+            force = force + inputs.external_force
+        for load in self._energies.loads(constants, inputs, batch, static):
+            force = force + load
+        return force

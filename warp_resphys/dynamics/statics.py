@@ -1,0 +1,72 @@
+"""Static equilibria, under gradually increasing loads where Newton's method does not converge under all of them."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from ..io.errors import ConvergenceError
+from .nonlinear_solver import SolveReport
+
+log = logging.getLogger(__name__)
+
+MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
+_MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
+_LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
+
+Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
+
+
+def find_equilibrium(solve: Solve, rest: torch.Tensor, start: torch.Tensor, limited: bool) -> torch.Tensor:
+    """Returns the equilibrium (B, N, 3) under all loads, differentiable [m].
+
+    Args:
+        solve: returns the equilibrium under a fraction of the loads, from an initial guess.
+        rest: (B, N, 3) equilibrium without loads [m].
+        start: (B, N, 3) initial guess [m].
+        limited: whether a configured limit of iterations may be the cause of a failure.
+
+    Raises:
+        ConvergenceError: no equilibrium was found, or the body grows without bound.
+    """
+    try:
+        x, report = solve(1.0, start)
+    except ConvergenceError as error:
+        log.debug("the equilibrium is computed under gradually increasing loads: %s", error)
+        with torch.no_grad():
+            near = _ramp_loads(solve, rest, error if limited else None)
+        x, report = solve(1.0, near)
+    length = float((rest[0].amax(0) - rest[0].amin(0)).max())
+    grown = ~((x.detach() - rest).abs().flatten(1).amax(1) < _MOST_LENGTHS * length)
+    if bool(grown.any()):
+        raise ConvergenceError(
+            f"{int(grown.sum())} of {len(x)} bodies have no equilibrium under these loads: they grow to more than "
+            f"{_MOST_LENGTHS:g} times their size; lower the loads, or take a stiffer material.",
+            x.detach(),
+            replace(report, converged=report.converged & ~grown),
+        )
+    return x
+
+
+def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None) -> torch.Tensor:
+    """Returns the equilibrium (B, N, 3) reached by increasing the loads from zero in steps, or raises ``limit``."""
+    done, step, x = 0.0, 0.5, rest
+    while done < 1.0:
+        share = min(done + step, 1.0)
+        try:
+            x, _ = solve(share, x)
+        except ConvergenceError as error:
+            step *= 0.5
+            if step < _LEAST_SHARE and limit is not None:
+                raise limit from None
+            if step < _LEAST_SHARE:
+                raise ConvergenceError(
+                    f"no equilibrium was found: under growing loads it is lost beyond {100.0 * done:.0f} % of them; "
+                    "lower the loads, or take a stiffer material.",
+                    x,
+                    error.report,
+                ) from None
+        else:
+            done = share
+    return x

@@ -1,0 +1,62 @@
+"""The energies of a simulator, from its bodies and their materials."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+from ..fem.body import Body
+from ..io.errors import InputError
+from .base import Energy
+from .materials import Material
+from .placed import PlacedEnergy
+from .rigid import PointInertia, rigid_energies
+from .solid import solids_of
+
+Materials = Mapping[str, Any]  # by name of a region or body: a material, or the materials of its regions
+DEPENDENT = "dependent_"  # prefix of the inertia of dependent vertices
+
+
+def joined_names(materials: Material | Materials) -> dict[str, Material]:
+    """Returns materials of bodies and regions by joined names, as ``finger_tip``; a single one has an empty name."""
+    if isinstance(materials, Material):
+        return {"": materials}
+    return {
+        f"{name}_{region}" if region else name: value
+        for name, own in materials.items()
+        for region, value in joined_names(own).items()
+    }
+
+
+def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEnergy]:
+    """Returns the energies of all bodies: solids, rigid parts, and the bodies' own energies.
+
+    Args:
+        whole: a body, or a `fem.scene.Scene`.
+        material: one for all bodies, or by region of the mesh, or by body of a scene.
+
+    Raises:
+        InputError: a body or a cell without material.
+    """
+    placed: list[PlacedEnergy] = []
+    for name, body, first in whole.members:
+        prefix = f"{name}_" if name else ""
+        solids = solids_of(body, _material_of(material, name))
+        energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
+        for part in body.controls:
+            energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
+        items: list[tuple[Energy, Any, str]] = [(energy, energy.points(body.mesh), own) for energy, own in energies]
+        given = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
+        items += [(energy, points, prefix) for energy, points in given]
+        placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
+    if whole.coordinates:
+        placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), DEPENDENT))
+    return placed
+
+
+def _material_of(material: Material | Materials, name: str) -> Material | Materials:
+    """Returns the material of a body, or raises InputError."""
+    if not name or isinstance(material, Material):
+        return material
+    if name not in material:
+        raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
+    own: Material | Materials = material[name]
+    return own

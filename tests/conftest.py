@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
-from main_job import IN_RUN, TINY, files, run
 
+from support.main_job import IN_RUN, TINY, files, run
 from warp_resphys import pipeline
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, render

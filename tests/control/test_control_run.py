@@ -7,11 +7,11 @@ from dataclasses import replace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from configured import check, composed
-from main_job import IN_RUN, run, run_without_report
-from sentences import offending
 
 import warp_resphys
+from support.configured import check, composed
+from support.main_job import IN_RUN, run, run_without_report
+from support.sentences import offending
 from warp_resphys import pipeline
 from warp_resphys.control import reduction
 from warp_resphys.control.controllers import LinearRecedingHorizon, OpenLoop, RecedingHorizon

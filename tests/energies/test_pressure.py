@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from chambered import BRICK, KINDS, chambered, hollow_box
 
+from support.chambered import BRICK, KINDS, chambered, hollow_box
 from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, select_vertices
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.io.errors import InputError, MeshError

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from main_job import run
-from sentences import offending
 
+from support.main_job import run
+from support.sentences import offending
 from warp_resphys import box_hexahedra, select_vertices
 from warp_resphys.experiment import ablation
 from warp_resphys.io.files import read_hdf5

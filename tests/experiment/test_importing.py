@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from configured import check, settings
 from scipy.spatial.transform import Rotation
 
+from support.configured import check, settings
 from warp_resphys import cli
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording

@@ -10,9 +10,9 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-from main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
-from sentences import offending
 
+from support.main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
+from support.sentences import offending
 from warp_resphys import box_hexahedra
 
 

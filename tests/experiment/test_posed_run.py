@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from configured import check, composed, settings
-from main_job import IN_RUN, run
-from played_run import check_robots
 
+from support.configured import check, composed, settings
+from support.main_job import IN_RUN, run
+from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError

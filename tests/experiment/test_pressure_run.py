@@ -12,11 +12,11 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from configured import check, composed, settings
-from main_job import IN_RUN, run
-from segment_run import TRACKED, place_segment
-from sentences import offending
 
+from support.configured import check, composed, settings
+from support.main_job import IN_RUN, run
+from support.segment_run import TRACKED, place_segment
+from support.sentences import offending
 from warp_resphys import pipeline
 from warp_resphys.data.actuation import InputSequences
 from warp_resphys.data.markers import bind_markers

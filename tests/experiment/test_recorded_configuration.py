@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configured import check, composed, settings
 
+from support.configured import check, composed, settings
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.reading import vertical
 from warp_resphys.experiment.trials import folds_of, split_of, trials_of

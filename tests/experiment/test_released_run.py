@@ -12,10 +12,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-from configured import settings
-from main_job import run
-from sentences import offending
 
+from support.configured import settings
+from support.main_job import run
+from support.sentences import offending
 from warp_resphys.experiment import identify, report
 from warp_resphys.experiment.experiment import LEARNED, MODELS
 from warp_resphys.experiment.folds import Fold, run_folds

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configured import check, composed
-from main_job import IN_RUN, run
-from played_run import check_robots
 
+from support.configured import check, composed
+from support.main_job import IN_RUN, run
+from support.played_run import check_robots
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5

@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from damage import flip_bit
 
+from support.damage import flip_bit
 from warp_resphys.io import atomic, files
 from warp_resphys.io.errors import DataFileError
 

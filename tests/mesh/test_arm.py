@@ -6,8 +6,8 @@ from math import pi
 
 import numpy as np
 import pytest
-from configured import composed
 
+from support.configured import composed
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.settings import parse

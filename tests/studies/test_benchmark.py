@@ -3,8 +3,8 @@
 import math
 
 import pytest
-from command_line import outcome, settings_of
 
+from support.command_line import outcome, settings_of
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json

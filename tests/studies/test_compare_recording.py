@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refusal, settings_of
 from scipy.spatial.transform import Rotation
-from sentences import offending
 
+from support.command_line import refusal, settings_of
+from support.sentences import offending
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.io.errors import DataFileError, InputError

@@ -1,7 +1,8 @@
 """The table of elements."""
 
 import pytest
-from command_line import outcome, refusal
+
+from support.command_line import outcome, refusal
 
 
 def test_table(folder):

@@ -12,9 +12,9 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-from command_line import configuration, settings_of
-from main_job import end_of
 
+from support.command_line import configuration, settings_of
+from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.report.page import error_parts, number_text

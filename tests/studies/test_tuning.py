@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configured import settings
-from main_job import IN_RUN, TINY, files, run
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
+from support.configured import settings
+from support.main_job import IN_RUN, TINY, files, run
 from warp_resphys import pipeline
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.checks import check_run

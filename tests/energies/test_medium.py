@@ -12,7 +12,6 @@ from warp_resphys import (
     Body,
     Corotated,
     Inputs,
-    Medium,
     Simulator,
     SolverSettings,
     State,
@@ -20,6 +19,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.energies.medium import Medium
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import boundary_faces, quadratic
 from warp_resphys.stepping.integrators import INTEGRATORS

@@ -10,14 +10,13 @@ from warp_resphys import (
     Body,
     Corotated,
     Inputs,
-    Muscle,
-    Muscles,
     Simulator,
     SolverSettings,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 

@@ -8,8 +8,10 @@ import torch
 import warp as wp
 
 from support.chambered import BRICK, KINDS, chambered, hollow_box
-from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, select_vertices
+from warp_resphys import Body, Corotated, Inputs, Pressure, Simulator, SolverSettings, select_vertices
 from warp_resphys.dynamics.tape import record_rollout
+from warp_resphys.energies.explicit import ExplicitEnergy
+from warp_resphys.energies.fibres import Fibres
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
 from warp_resphys.stepping.state import State
@@ -24,7 +26,7 @@ def noise(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def chambers_of(s, batch):
+def chambers_of(s, batch) -> ExplicitEnergy:
     return s.explicit_energy("pressure", batch)
 
 

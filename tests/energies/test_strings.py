@@ -16,10 +16,10 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
-    Strings,
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.energies.strings import Strings
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients

@@ -69,7 +69,7 @@ def friction(slides: wp.array[wp.float64], v: wp.vec4d, out: wp.array[wp.float64
 
 @pytest.mark.parametrize("start", [0.0, 6e-4, -9e-4])
 def test_the_energy_of_bristles_is_the_work_against_them(start):
-    """Dahl's model, dz/ds = 1 - |ds|/ds z / z_c, integrated along the slide s: the work is F_c / z_c times that of z."""
+    """In Dahl's model, dz/ds = 1 - |ds|/ds z / z_c over the slide s: F_c / z_c times the integral of z."""
     force, length, slides = 2.0, 1e-3, np.array([0.0, 3e-4, 2e-3, -5e-4, -3e-3])
     out = wp.zeros(len(slides), dtype=wp.float64, device="cpu")
     inputs = [wp.array(slides, dtype=wp.float64, device="cpu"), wp.vec4d(force, length, start, 0.05), out]

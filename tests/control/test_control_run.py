@@ -23,6 +23,7 @@ from warp_resphys.control.plan import Horizon, Limits, Planner
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
 from warp_resphys.control.sampling import Sampling
+from warp_resphys.control.stages import controllers_of
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
@@ -237,7 +238,7 @@ class TestDriving:
     def test_all_controllers_drive_and_are_measured(self, folder):
         tracking = json.loads((folder / "control.json").read_text())["tracking"]["0.4"]
         names = ["open_sysid", "open_resphys", "receding_resphys", "receding_linear", "feedback_5"]
-        assert list(tracking) == names
+        assert list(tracking) == controllers_of(control_of(folder)) == names
         with read_hdf5(folder / "driven.h5", "driven") as file:
             path, points = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points"))
             inputs = read_array(file, "circle_0.4s/inputs")

@@ -13,6 +13,7 @@ from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm_tetrahedra import tetrahedra
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
@@ -194,8 +195,8 @@ def test_surfaces_are_named_as_the_contract_says(cells):
 
 def test_tetrahedra_have_the_same_volumes():
     pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
-    mesh, surfaces = mesh_arm(ArmGeometry(), 0.005, "tetrahedra")
-    volumes = [-volume(mesh, surfaces[f"chamber_{i}"]) for i in range(1, 7)]
+    mesh = tetrahedra(ArmGeometry(), 0.005)
+    volumes = [-volume(mesh, chamber.faces) for chamber in find_chambers(mesh)]
     np.testing.assert_allclose(volumes, sopra_chambers(), rtol=0.05)
     check_mesh(quadratic(mesh))
 

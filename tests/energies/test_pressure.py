@@ -285,18 +285,16 @@ def test_bad_input():
         Pressure([])
     with pytest.raises(InputError, match="two energies of the body depend on pressure"):
         Body(mesh, energies=[Pressure([chamber]), Pressure([chamber])])
-    with pytest.raises(
-        InputError, match="'fibre_stiffness' is not a parameter of this simulator: it has youngs_modulus"
-    ):
+    with pytest.raises(InputError, match="'fibre_stiffness'"):
         simulator().prepare({"fibre_stiffness": 1.0})
     with pytest.raises(InputError, match=r"fibre_stiffness has 3 values for 2 chambers"):
         simulator(fibres={"stiffness": [1.0, 2.0, 3.0]}).prepare()
-    with pytest.raises(InputError, match="fibre_stiffness is -1: it must be zero or more, in N/m"):
+    with pytest.raises(InputError, match="fibre_stiffness is"):
         Fibres([chamber], stiffness=-1.0)
     with pytest.raises(InputError, match="coupling is 'weak'"):
         simulator(coupling="weak")
     s, zeros = simulator(), torch.zeros(1, 3, dtype=torch.float64)
-    with pytest.raises(InputError, match=r"pressure has shape \(1, 3\): it must be \(1, 2\) in Pa"):
+    with pytest.raises(InputError, match=r"pressure has shape \(1, 3\)"):
         s.step(s.rest_state(), Inputs(pressure=zeros))
     with pytest.raises(InputError, match=r"Unknown input tension\. This body accepts .*pressure"):
         s.step(s.rest_state(), Inputs(tension=zeros))

@@ -336,7 +336,7 @@ class TestConfiguration:
 
     @pytest.mark.parametrize("option", FROM_MARKERS)
     def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
-        with pytest.raises(InputError, match=r"reconstruction.method is 'levenberg_marquardt'"):
+        with pytest.raises(InputError, match=r"reconstruction\.method"):
             check(composed(f"reconstruction={option}"))
 
     def test_published_sizes_and_settings(self):

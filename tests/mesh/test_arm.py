@@ -281,9 +281,7 @@ def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
 
 
 def test_unknown_shipped_arm():
-    with pytest.raises(
-        InputError, match=r"'octopus': the arms that come with the package are arm_hexahedra_1400, arm_h"
-    ):
+    with pytest.raises(InputError, match="'octopus'"):
         build_mesh(configured("mesh=arm", "mesh.name=octopus"))
 
 

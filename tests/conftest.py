@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
-from main_job import IN_RUN, TINY, files, run
 
+from support.main_job import IN_RUN, TINY, files, run
 from warp_resphys import pipeline
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, render
@@ -16,7 +16,7 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 torch.set_num_threads(1)
 
-NUMERICAL = {"dynamics", "energies", "fem", "learning", "linalg"}  # folders of tests
+NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg"}  # folders of tests
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 

@@ -22,6 +22,7 @@ from pydantic import ConfigDict
 from warp_resphys import __version__, cli, commands, launch
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
+from warp_resphys.io.pipes import NOBODY_READS
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
 from warp_resphys.io.stages import StageInterrupted
@@ -472,10 +473,10 @@ class TestProcess:
     @pytest.mark.parametrize(
         ("arguments", "code", "lines"),
         [
-            ("--help", 141, 0),
-            ("--cfg job", 141, 0),
-            ("seed=1", 141, 0),
-            ("--multirun seed=1,2", 141, 0),
+            ("--help", NOBODY_READS, 0),
+            ("--cfg job", NOBODY_READS, 0),
+            ("seed=1", NOBODY_READS, 0),
+            ("--multirun seed=1,2", NOBODY_READS, 0),
             ("sed=1", 2, 1),
         ],
     )

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from main_job import IN_RUN, TINY
+
+from support.main_job import IN_RUN, TINY
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -49,7 +49,7 @@ def test_sequences_depend_on_the_seed_alone():
     ("settings", "message"),
     [
         ({"rest": 2.0}, "leave no time between two rests"),
-        ({"correlation": -0.6}, "no inputs of 3 parts have the correlation -0.6: it must lie above -0.5"),
+        ({"correlation": -0.6}, "no inputs of 3 parts have the correlation -0.6"),
         ({"correlation": [[1.0, 0.0], [0.0, 1.0]]}, r"correlation is .*3 rows and 3 columns"),
     ],
 )
@@ -65,7 +65,7 @@ def test_recorded_pressures_are_checked():
         check_inputs(good, PRESSURE, 6, 2e4, "a.h5")
     high = good.copy()
     high[3, 1] = 2.5e4
-    with pytest.raises(DataFileError, match=r"chamber 2 is 25 kPa in frame 3, beyond data.input_limit of 20 kPa"):
+    with pytest.raises(DataFileError, match=r"data\.input_limit"):
         check_inputs(high, PRESSURE, 2, 2e4, "a.h5")
 
 

@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
+from warp_resphys.data.camera import CameraMarkers
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 TIP = wr.select_vertices(MESH, x=0.1)
@@ -18,7 +19,7 @@ SHIFT = np.array([-0.05, 0.02, 0.4])  # m: the camera stands 0.4 m away
 
 def camera(markers=MARKERS):
     intrinsic = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
-    return wr.CameraMarkers(markers, torch.as_tensor(intrinsic @ np.column_stack([TURN, SHIFT])))
+    return CameraMarkers(markers, torch.as_tensor(intrinsic @ np.column_stack([TURN, SHIFT])))
 
 
 def beam(youngs_modulus):
@@ -73,7 +74,7 @@ def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
     # The camera looks from the middle of the beam along it: the markers at the tip are in front, the other is behind.
     looks = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     matrix = np.diag([FOCAL, FOCAL, 1.0]) @ np.column_stack([looks, -looks @ [0.08, 0.01, 0.0]])
-    sees, at = wr.CameraMarkers(MARKERS, torch.as_tensor(matrix)), torch.as_tensor(MESH.vertices)[None]
+    sees, at = CameraMarkers(MARKERS, torch.as_tensor(matrix)), torch.as_tensor(MESH.vertices)[None]
     q = at.clone().requires_grad_(True)
     shown = sees(q)
     assert shown.isnan().any(-1)[0].tolist() == [False, True, False]
@@ -84,6 +85,6 @@ def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
 
 def test_bad_input_is_named():
     with pytest.raises(wr.InputError, match=r"matrix has shape \(3, 3\)"):
-        wr.CameraMarkers(MARKERS, torch.eye(3))
+        CameraMarkers(MARKERS, torch.eye(3))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
         wr.ObservedMotion(torch.zeros(3, 1, 3, 3), observation=camera())

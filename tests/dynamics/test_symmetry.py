@@ -16,13 +16,13 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     StableNeoHookean,
-    SymmetryPlane,
     Tendons,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
 )
 from warp_resphys.dynamics.modes import vibration_modes
+from warp_resphys.fem.symmetry import SymmetryPlane
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import boundary_triangles
 from warp_resphys.studies.gradient_check import POSES, check_gradients

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
+from warp_resphys.dynamics.trajectory import Trajectory
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)
@@ -17,7 +18,8 @@ SIMULATOR = Simulator(
 
 @pytest.fixture(scope="module")
 def trajectory():
-    return SIMULATOR.rollout(SIMULATOR.rest_state(), 3)
+    moved = SIMULATOR.rollout(SIMULATOR.rest_state(), 3)
+    return Trajectory(moved.q, moved.v, moved.reports, moved.final, SIMULATOR.body, 0.01)
 
 
 def test_a_file_has_times_and_units(trajectory, tmp_path):

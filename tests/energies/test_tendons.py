@@ -260,7 +260,7 @@ def test_a_tendon_cannot_be_held():
 
 def test_a_tendon_cannot_push():
     sim = simulator(route(0.018))
-    with pytest.raises(InputError, match=r"tendon_tension is -1: it must be zero or more, in N"):
+    with pytest.raises(InputError, match="tendon_tension is"):
         sim.step(sim.rest_state(), tension(-1.0))
 
 
@@ -268,10 +268,10 @@ def test_a_tendon_cannot_push():
     ("make", "said"),
     [
         (lambda: Tendons([]), "there is no tendon"),
-        (lambda: Tendons([[[0.0, 0.0, 0.0]]]), "tendon 1 has guides of shape (1, 3): it needs two or more"),
+        (lambda: Tendons([[[0.0, 0.0, 0.0]]]), "tendon 1 has guides of shape (1, 3)"),
         (lambda: Tendons([route(0.01), np.full((2, 3), np.nan)]), "tendon 2 has a guide that is not finite"),
         (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "two guides in a row at one place"),
-        (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is -1: it must be zero or more, in N/m"),
+        (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is"),
         (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
         (
             lambda: Tendons([route(0.01)], directions=[ACROSS, ACROSS]),
@@ -282,16 +282,10 @@ def test_a_tendon_cannot_push():
             "the tendons have [3] directions of offsets",
         ),
         (lambda: Tendons([route(0.01)], directions=[["up"]]), "a direction that is not an array: 'up'"),
-        (lambda: Tendons([route(0.01), route(0.02)], labels=("a", "a")), "tendons are called a, a: give each a name"),
-        (
-            lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]),
-            "of shape (2,): give three numbers, or three for each",
-        ),
+        (lambda: Tendons([route(0.01), route(0.02)], labels=("a", "a")), "tendons are called a, a"),
+        (lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]), "of shape (2,)"),
         (lambda: Tendons([route(0.01)], directions=[[np.zeros(3)]]), "a direction of offsets that is zero"),
-        (
-            lambda: simulator(route(0.01), route(0.03)),
-            "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm",
-        ),
+        (lambda: simulator(route(0.01), route(0.03)), "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm"),
         (lambda: replace(simulator(route(0.01)), coupling="explicit"), "is a follower load"),
     ],
 )

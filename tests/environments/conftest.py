@@ -1,8 +1,8 @@
 """One small run with a laboratory, for all tests of environments."""
 
 import pytest
-from main_job import IN_RUN, run_without_report
 
+from support.main_job import IN_RUN, run_without_report
 from warp_resphys.environments.making import register
 
 RUN = [

@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 from warp_resphys.control.world import World
 from warp_resphys.environments.making import TASKS, make_vector
+from warp_resphys.environments.picture import Camera
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, RobotVectorEnv
 from warp_resphys.io.errors import InputError
@@ -192,6 +193,20 @@ class TestPictures:
         assert np.linalg.norm(blue[2].mean(axis=0) - blue[3].mean(axis=0)) > 2.0  # The second moved elsewhere.
         np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)  # The goal stays in place.
         environment.close()
+
+    @pytest.mark.usefixtures("can_draw")
+    def test_a_camera_looks_from_the_side_and_has_up_upwards(self):
+        corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]])
+        heights = []
+        for up in (1.0, -1.0):
+            camera = Camera(np.array([0.0, 0.0, up]), corners)
+            nothing = np.zeros((0, 3), dtype=np.int64)
+            (pixels,) = camera.pictures(nothing, corners[None], corners[None, :1], [corners[1:2]], [""])
+            camera.close()
+            red = np.argwhere(pixels[..., 0] > pixels[..., 2] + 40.0)
+            assert len(red) > 20
+            heights.append(red[:, 0].mean() / len(pixels))
+        assert heights[0] < 0.3 < 0.7 < heights[1]  # The goal is above the marker, or below it.
 
     def test_nothing_is_drawn_without_a_render_mode(self, folder):
         environment = make_vector("reach", folder, 1, **QUICK)

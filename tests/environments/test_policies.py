@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
-from main_job import end_of
-from sentences import offending
 
+from support.main_job import end_of
+from support.sentences import offending
 from warp_resphys import cli
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn

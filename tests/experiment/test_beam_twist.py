@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from configured import settings
 from scipy.spatial.transform import Rotation
 
+from support.configured import settings
 from warp_resphys import box_hexahedra, cli
 from warp_resphys.experiment.trials import split_of, trials_of
 from warp_resphys.io.files import read_hdf5

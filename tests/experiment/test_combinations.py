@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from main_job import IN_RUN, TINY, run
-from played_run import check_robots
-from segment_run import TRACKED, place_segment
 
+from support.main_job import IN_RUN, TINY, run
+from support.played_run import check_robots
+from support.segment_run import TRACKED, place_segment
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.settings import parse

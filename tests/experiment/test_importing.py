@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from configured import check, settings
 from scipy.spatial.transform import Rotation
 
+from support.configured import check, settings
 from warp_resphys import cli
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
@@ -22,6 +22,7 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
+from warp_resphys.experiment.observing import Observer
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
@@ -420,6 +421,20 @@ def test_one_outlier_among_six_is_left_out_and_named(shelf):
     results = shelf.bring_in()
     assert read_json(shelf.folder / REGISTRATION)["bare"]["outliers"] == ["Base - 3"]
     np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=1e-3)
+
+
+def test_registered_markers_are_where_the_body_has_them(shelf):
+    """In the frame of the body the base markers of every trial stay, and a trial without a payload shows the places."""
+    run = parse(RunSettings, shelf.config)
+    trials = trials_of(run)
+    stage = ImportStage.of(run, files={}, trials=trials, learned=None)
+    for observed in Observer(StageContext("import", shelf.folder, "", stage)).observe(trials):
+        still = observed.registration.transform.apply(observed.still)
+        reference = [*run.markers.reference.values()]
+        np.testing.assert_allclose(still[len(TIPS) :], reference, rtol=0.0, atol=1e-3)
+        np.testing.assert_allclose(observed.to_body(observed.still[: len(TIPS)], 0.0), observed.places, atol=1e-9)
+        assert observed.release is not None
+        assert observed.moving.positions.shape[1:] == (len(TIPS), 3)
 
 
 def test_a_trial_without_a_release_is_named(shelf):

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from configured import check, composed, settings
-from main_job import (
+from omegaconf import OmegaConf
+
+from support.configured import check, composed, settings
+from support.main_job import (
     CORRECTED,
     IN_RUN,
     LEARNED,
@@ -28,8 +30,6 @@ from main_job import (
     run,
     same_errors,
 )
-from omegaconf import OmegaConf
-
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment import learn, models
 from warp_resphys.experiment.build import build_simulator
@@ -336,7 +336,7 @@ class TestConfiguration:
 
     @pytest.mark.parametrize("option", FROM_MARKERS)
     def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
-        with pytest.raises(InputError, match=r"reconstruction.method is 'levenberg_marquardt'"):
+        with pytest.raises(InputError, match=r"reconstruction\.method"):
             check(composed(f"reconstruction={option}"))
 
     def test_published_sizes_and_settings(self):

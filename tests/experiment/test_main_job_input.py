@@ -10,78 +10,68 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-from main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
-from sentences import offending
 
+from support.main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
 from warp_resphys import box_hexahedra
 
 
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("overrides", "sentence"),
+        ("overrides", "key"),
         [
-            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is 0: it must be positive, in Pa."),
-            ("target.youngs_modulus=-1e5", "target: youngs_modulus is -100000: it must be positive, in Pa."),
-            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is nan: it must be positive, in Pa."),
-            ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is 0.5: it must be greater than -1 and less"),
-            (
-                "target.poissons_ratio=-1",
-                "target: poissons_ratio is -1: it must be greater than -1 and less than 0.5.",
-            ),
-            ("time_step=0", "time_step is 0: it must be positive and at most 10, in s."),
-            ("time_step=-0.01", "time_step is -0.01: it must be positive and at most 10, in s."),
-            ("experiment=beam_oscilation", "unknown experiment 'beam_oscilation', did you mean 'beam_oscillation'"),
-            ("trainer.epoch=5", "unknown key 'trainer.epoch', did you mean 'trainer.epochs'"),
-            ("+simulation.stiffness=5", "simulation: corotated has no constant 'stiffness': it has youngs_modulus, "),
-            ("simulation.youngs_modulus=soft", "simulation.youngs_modulus is 'soft': it must be a number."),
-            ("trainer.epochs=2.5", "trainer.epochs is 2.5: it must be a whole number, one or more."),
-            ("trainer.learning_rate=0", "trainer.learning_rate is 0: it must be a positive number."),
-            ("trainer.schedule=2", "trainer.schedule is 2: it must be one of cosine, step."),
-            ("trainer.step_epochs=1.5", "trainer.step_epochs is 1.5: it must be a whole number, one or more."),
-            ("refinement=solver", "unknown refinement 'solver'; known are none, solver_in_the_loop"),
-            ("refinement.kind=solver", "refinement.kind is 'solver': it must be one of none, solver"),
-            (
-                "reconstruction.regularisation=-1",
-                "reconstruction.regularisation is -1: it must be a number, zero or more.",
-            ),
-            ("network.kind=graph", "network.kind is 'graph': it must be one of reduced, nodal."),
-            ("network.force_modes=1000", "1000 modes were asked for, but 36 samples give 1 to 36."),
-            ("solver.name=gradient_descent", "solver is 'gradient_descent': choose one of"),
-            ("integrator=rk4", "integrator is 'rk4': it must be one of implicit_euler, bdf2, midpoint."),
-            ("device=tpu", "device is 'tpu': choose auto, cpu or cuda."),
-            ("device=mps", "device is 'mps': choose auto, cpu or cuda."),
-            ("dtype=float16", "dtype is 'float16': experiments need float64"),
-            ("seed=-1", "seed is -1: it must be between 0 and 2^63 - 1."),
-            ("gravity=[0,0]", "gravity is [0, 0]: it must be three finite numbers, in m/s^2."),
-            ("gravity=[0,0,inf]", "gravity is [0, 0, inf]: it must be three finite numbers, in m/s^2."),
-            ("fixed=null", "fixed is None: it must be a group of settings."),
+            ("simulation.youngs_modulus=0", "simulation: youngs_modulus is"),
+            ("target.youngs_modulus=-1e5", "target: youngs_modulus is"),
+            ("simulation.youngs_modulus=nan", "simulation: youngs_modulus is"),
+            ("simulation.poissons_ratio=0.5", "simulation: poissons_ratio is"),
+            ("target.poissons_ratio=-1", "target: poissons_ratio is"),
+            ("time_step=0", "time_step is"),
+            ("time_step=-0.01", "time_step is"),
+            ("experiment=beam_oscilation", "'beam_oscilation'"),
+            ("trainer.epoch=5", "'trainer.epoch'"),
+            ("+simulation.stiffness=5", "'stiffness'"),
+            ("simulation.youngs_modulus=soft", "simulation.youngs_modulus"),
+            ("trainer.epochs=2.5", "trainer.epochs"),
+            ("trainer.learning_rate=0", "trainer.learning_rate"),
+            ("trainer.schedule=2", "trainer.schedule"),
+            ("trainer.step_epochs=1.5", "trainer.step_epochs"),
+            ("refinement=solver", "'solver'"),
+            ("refinement.kind=solver", "refinement.kind"),
+            ("reconstruction.regularisation=-1", "reconstruction.regularisation"),
+            ("network.kind=graph", "network.kind"),
+            ("network.force_modes=1000", "1000 modes"),
+            ("solver.name=gradient_descent", "solver is"),
+            ("integrator=rk4", "integrator is"),
+            ("device=tpu", "device is"),
+            ("device=mps", "device is"),
+            ("dtype=float16", "dtype is"),
+            ("seed=-1", "seed is"),
+            ("gravity=[0,0]", "gravity is"),
+            ("gravity=[0,0,inf]", "gravity is"),
+            ("fixed=null", "fixed is"),
             ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.load.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
-            ("data.steps=0", "data.steps is 0: it must be a whole number, one or more."),
-            ("solver.relative_tolerance=1", "solver.relative_tolerance is 1: it must be more than 0 and at most 0.1."),
+            ("data.steps=0", "data.steps"),
+            ("solver.relative_tolerance=1", "solver.relative_tolerance"),
             ("tip={x:9}", "no vertex lies within 1e-09 m of x = 9 m"),
-            ("mesh.divisions=[10000,10000,1000]", "mesh.divisions gives 100,000,000,000 cells, which take"),
-            ("mesh.divisions=[1000000,1,1]", "mesh.divisions is [1000000, 1, 1]: it must be three whole numbers"),
-            ("network.width=1000000000", "network.width is 1000000000: it must be a whole number from 1 to 16,384."),
+            ("mesh.divisions=[10000,10000,1000]", "mesh.divisions"),
+            ("mesh.divisions=[1000000,1,1]", "mesh.divisions"),
+            ("network.width=1000000000", "network.width"),
             ("network.width=16000 network.layers=90 network.blocks=90", "network.width, layers and blocks make"),
             ("simulation.density=1e30", "the mesh is"),
-            ("data.weights_g.train=[]", "data.weights_g.train is empty: give the split at least one value."),
+            ("data.weights_g.train=[]", "data.weights_g.train"),
             ("data.weights_g.validation=[]", "data.weights_g.validation is empty"),
             ("data.weights_g.test=[]", "data.weights_g.test is empty"),
-            ("data.weights_g.test=[90]", "data.weights_g names 90 g twice: a trial belongs to one split only."),
-            ("data.weights_g.test=[-4]", "data.weights_g.test holds a value that is not positive: [-4.0]."),
-            ("data.weights_g.test=70", "data.weights_g.test is 70: it must be a list of numbers."),
-            (
-                "data.kind=drop",
-                "data.kind is 'drop': choose one of release_from_load, release_from_twist, moving_base.",
-            ),
+            ("data.weights_g.test=[90]", "data.weights_g"),
+            ("data.weights_g.test=[-4]", "data.weights_g.test"),
+            ("data.weights_g.test=70", "data.weights_g.test"),
+            ("data.kind=drop", "data.kind"),
             ("solver.max_iterations=1", "the newton solver stopped after 1 iterations"),
             ("reconstruction.max_iterations=1", "Gauss-Newton reconstruction moved by"),
         ],
     )
-    def test_settings(self, folder, overrides, sentence):
+    def test_settings(self, folder, overrides, key):
         code, err = run(*TINY, IN_RUN, *overrides.split(" "))
-        self.check(code, err, sentence)
+        self.check(code, err, key)
 
     @pytest.mark.parametrize("content", [None, b"", b"not a mesh", b"\x89HDF\r\n\x1a\n", "truncated", "surface"])
     def test_mesh(self, folder, content):
@@ -102,12 +92,12 @@ class TestBadInput:
         self.check(code, err, "Missing mandatory value: path (at mesh.path)")
 
     @staticmethod
-    def check(code, err, sentence):
+    def check(code, err, key):
         lines = [line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in STAGES))]
         assert code == 2
         assert len(lines) == 1
         assert lines[0].startswith("error: ")
-        assert offending(sentence) in lines[0]
+        assert key in lines[0]
         written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
         assert not written & {"metrics.json", "report.html", "resphys.safetensors", "rollouts.h5"}
         assert not [name for name in written if name.endswith(".partial")]

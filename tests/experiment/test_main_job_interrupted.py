@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from main_job import IN_RUN, REFINE, REPOSITORY, TINY, errors, run, same_errors
 
+from support.main_job import IN_RUN, REFINE, REPOSITORY, TINY, errors, run, same_errors
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.resumable import ResumableHDF5
 from warp_resphys.learning.reconstruction import LBFGSB

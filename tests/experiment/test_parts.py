@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from configured import check, composed, settings
 
+from support.configured import check, composed, settings
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.errors import InputError
 

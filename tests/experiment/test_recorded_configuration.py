@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configured import check, composed, settings
 
+from support.configured import check, composed, settings
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.reading import vertical
 from warp_resphys.experiment.trials import folds_of, split_of, trials_of
@@ -167,7 +167,7 @@ def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
     run = settings("experiment=fish_tail", "data.folder=recordings")
     assert split_of(run) == Split(train=["step"], validation=[], test=["step"])
     assert [trial.name for trial in trials_of(run)] == ["step"]
-    with pytest.raises(InputError, match=r"the trial 'step' is in data\.train and data\.test: a trial belongs to one"):
+    with pytest.raises(InputError, match=r"data\.train"):
         split_of(settings("experiment=fish_tail", "data.folder=recordings", "data.train_fraction=1"))
 
 

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from main_job import IN_RUN, run, run_without_report
 
 import warp_resphys
+from support.main_job import IN_RUN, run, run_without_report
 from warp_resphys.robot.description import Description, describe
 
 TINY = [

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from regions import beam, two_boxes
 
+from support.regions import beam, two_boxes
 from warp_resphys import Body, Mesh, box_tetrahedra, select_vertices
 from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
 from warp_resphys.fem.rigid import Glue, Rigid

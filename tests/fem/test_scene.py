@@ -10,7 +10,6 @@ from warp_resphys import (
     Inputs,
     Mesh,
     Rigid,
-    Scene,
     Simulator,
     StableNeoHookean,
     Strings,
@@ -18,6 +17,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.fem.scene import Scene
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.mesh import join
 

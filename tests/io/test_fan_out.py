@@ -81,7 +81,7 @@ def fails(task, advance):
     ("task", "error", "message"),
     [
         ("bad input", WorkerError, "^this is refused.$"),
-        ("fault", WorkerFaultError, "ZeroDivisionError: a fault of the program"),
+        ("fault", WorkerFaultError, "ZeroDivisionError"),
     ],
 )
 def test_an_error_ends_the_work(task, error, message, workers, tmp_path):

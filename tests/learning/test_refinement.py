@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from configured import settings
 
+from support.configured import settings
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings

@@ -6,13 +6,14 @@ from math import pi
 
 import numpy as np
 import pytest
-from configured import composed
 
+from support.configured import composed
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm_tetrahedra import tetrahedra
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
@@ -194,8 +195,8 @@ def test_surfaces_are_named_as_the_contract_says(cells):
 
 def test_tetrahedra_have_the_same_volumes():
     pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
-    mesh, surfaces = mesh_arm(ArmGeometry(), 0.005, "tetrahedra")
-    volumes = [-volume(mesh, surfaces[f"chamber_{i}"]) for i in range(1, 7)]
+    mesh = tetrahedra(ArmGeometry(), 0.005)
+    volumes = [-volume(mesh, chamber.faces) for chamber in find_chambers(mesh)]
     np.testing.assert_allclose(volumes, sopra_chambers(), rtol=0.05)
     check_mesh(quadratic(mesh))
 
@@ -280,9 +281,7 @@ def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
 
 
 def test_unknown_shipped_arm():
-    with pytest.raises(
-        InputError, match=r"'octopus': the arms that come with the package are arm_hexahedra_1400, arm_h"
-    ):
+    with pytest.raises(InputError, match="'octopus'"):
         build_mesh(configured("mesh=arm", "mesh.name=octopus"))
 
 

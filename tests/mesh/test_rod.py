@@ -81,7 +81,7 @@ def test_layers_are_as_long_as_the_grading_says():
         ((AXIS, [[0.3, 0.1], [0.0, 0.1]], 4), "rising arc lengths"),
         ((AXIS, 0.1, 0), "layers of a rod is 0"),
         ((AXIS, 0.1, 4, 1, 1, 10), "a rod of cells with 10 nodes"),
-        ((AXIS, 0.1, 4, 1, 1, 27, 2.0), "grading of a rod is 2: it must be from 0"),
+        ((AXIS, 0.1, 4, 1, 1, 27, 2.0), "grading of a rod is 2"),
         (([[0, 0, 0], [0, 0, 1], [0, 0.5, 0.1]], 0.4, 12), "bent more sharply than it is thick"),
     ],
 )

@@ -81,10 +81,10 @@ def test_what_is_thinner_than_the_tetrahedra_is_not_lost_silently(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"units": "inch"}, "a surface in inch filled to order 2: units are m, cm or mm"),
+        ({"units": "inch"}, "a surface in inch filled to order 2"),
         ({"order": 3}, "orders 1 or 2"),
-        ({"size": 0.0}, "the size of tetrahedra is 0.0: it must be positive"),
-        ({"units": "m"}, "the surface is 106 m across in m: check the unit"),
+        ({"size": 0.0}, "the size of tetrahedra is 0.0"),
+        ({"units": "m"}, "the surface is 106 m across in m"),
     ],
 )
 def test_arguments_that_do_not_fit(tmp_path, changes, said):
@@ -140,5 +140,5 @@ def test_bodies_beside_one_another(tmp_path):
     other = trimesh.creation.box((10.0, 10.0, 10.0))
     other.apply_translation([80.0, 0.0, 0.0])
     path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)), other)
-    with pytest.raises(MeshError, match=r"closed surfaces beside one another \(2 in all\): export one body"):
+    with pytest.raises(MeshError, match=r"closed surfaces beside one another \(2 in all\)"):
         fill_surface(path, 0.01, "mm")

@@ -1,6 +1,6 @@
 import pytest
-from report_page import FAILING
 
+from support.report_page import FAILING
 from warp_resphys.report import render
 
 

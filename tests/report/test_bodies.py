@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driven_run import LIMIT, arm_settings, bent
 from matplotlib.image import imread
-from measured_run import TRACKED, sag
 
+from support.driven_run import LIMIT, arm_settings, bent
+from support.measured_run import TRACKED, sag
 from warp_resphys.experiment.build import shipped_arm
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import box_hexahedra

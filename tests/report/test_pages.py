@@ -4,14 +4,14 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
-import measured_run as beam
 import numpy as np
 import pytest
-from chambered import hollow_box
-from driven_run import BASE, LABORATORY, MODELS, arm_settings, data, errors_of, write_run
-from measured_run import FRAMES, SECONDS, STEP, TRACKED, TRIALS, write_folds, write_recordings, write_split
-from report_page import report
 
+from support import measured_run as beam
+from support.chambered import hollow_box
+from support.driven_run import BASE, LABORATORY, MODELS, arm_settings, data, errors_of, write_run
+from support.measured_run import FRAMES, SECONDS, STEP, TRACKED, TRIALS, write_folds, write_recordings, write_split
+from support.report_page import report
 from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.experiment.report import make_folds_report, read_driven, read_film, read_recordings, read_trials

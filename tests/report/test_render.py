@@ -1,5 +1,6 @@
 """Pictures of bodies: what is drawn where, in which colours, and what is said where nothing can be drawn."""
 
+import subprocess
 import sys
 
 import matplotlib.colors
@@ -8,7 +9,7 @@ import pytest
 from matplotlib import colormaps
 
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles, box_hexahedra, box_tetrahedra
-from warp_resphys.report import render
+from warp_resphys.report import render, render_process
 from warp_resphys.report.bodies import MARGIN, SHADE, TOWARDS_VIEWER, distance_scene, largest_distances, sharp_edges
 
 MESHES = {
@@ -141,6 +142,17 @@ def test_one_process_draws_scene_after_scene():
         (first,), (both,), (again,) = (list(renderer.frames(scene)) for scene in (small, wide, small))
     np.testing.assert_array_equal(first, again)
     assert both.shape[1] == 2 * first.shape[1]
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_the_program_answers_with_the_size_and_the_pixels_of_every_frame():
+    mesh = box_hexahedra(divisions=(1, 1, 1))
+    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    program = [sys.executable, "-m", render_process.__name__]
+    out = subprocess.run(program, input=2 * render.packed(scene), capture_output=True, check=True).stdout
+    ((pixels,),) = render.draw(scene)
+    answer = np.array(pixels.shape, "<u4").tobytes() + pixels.tobytes() + bytes(12)
+    assert out == 2 * answer
 
 
 @pytest.mark.usefixtures("can_draw")

@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from report_page import report
-from vertex_run import settings, write_run
 
+from support.report_page import report
+from support.vertex_run import settings, write_run
 from warp_resphys.experiment.report import read_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json

@@ -6,14 +6,14 @@ import re
 
 import numpy as np
 import pytest
-from browser import opened as browser_of_tests
-from browser import until
-from driven_run import arm_settings
-from driven_run import write_run as write_driven
-from report_page import FAILING, Page, report
-from vertex_run import settings as vertex_settings
-from vertex_run import write_run as write_vertex
 
+from support.browser import opened as browser_of_tests
+from support.browser import until
+from support.driven_run import arm_settings
+from support.driven_run import write_run as write_driven
+from support.report_page import FAILING, Page, report
+from support.vertex_run import settings as vertex_settings
+from support.vertex_run import write_run as write_vertex
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
 from warp_resphys.report.bodies import ComparedMotion

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from configured import settings
 
+from support.configured import settings
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import (
     PUBLISHED_MM,

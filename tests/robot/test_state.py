@@ -1,12 +1,18 @@
-"""States and motions of robots, without a robot."""
+"""States, motions and inputs of robots, without a robot."""
 
 import csv
 
 import numpy as np
+import pytest
 import torch
 
+from warp_resphys import Body, Simulator, box_hexahedra
+from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.motion_files import input_columns, write_csv
+from warp_resphys.robot.inputs import InputReader, RobotInput
+from warp_resphys.robot.motion import Motion
 from warp_resphys.robot.state import RobotState
+from warp_resphys.stepping.quantity import Quantity
 from warp_resphys.stepping.state import State
 
 
@@ -52,3 +58,34 @@ def test_a_table_has_an_empty_cell_where_nothing_was_seen(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["pressure.left [Pa]"] for row in rows] == ["5", "5"]
     assert (rows[1]["A.x [m]"], rows[1]["B.z [m]"], rows[1]["time [s]"]) == ("6", "", "0.1")
+
+
+def test_markers_are_interpolated_between_steps():
+    """By polynomials of degree three whose slopes are central differences: exact for a parabola."""
+    times, wanted = 0.1 * np.arange(5), np.array([0.05, 0.13, 0.37, 0.4])
+    rows = torch.arange(6.0, dtype=torch.float64).view(1, 2, 3)
+
+    def at(t):
+        t = torch.as_tensor(t)[:, None, None, None]
+        return 1.0 + rows * t + 3.0 * t**2
+
+    q = at(times)
+    motion = Motion(None, times, q, q, q, None, q, q, {}, {}, None)
+    torch.testing.assert_close(motion.at(wanted), at(wanted))
+    with pytest.raises(InputError, match="environment is 1"):
+        motion.write_csv("a.csv", 1)
+
+
+def test_inputs_are_given_by_part_by_environment_or_for_all():
+    body = Body(box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1)))
+    pressure = RobotInput("pressure", "Pa", ("left", "right"), quantity=Quantity("pressure", "Pa", 0.0, closed=True))
+    reader = InputReader({"pressure": pressure, "payload": RobotInput("payload", "kg", ("payload",))}, Simulator(body))
+    assert reader.read("pressure", {"right": 2.0}, 2).tolist() == [[0.0, 2.0]] * 2
+    assert reader.read("pressure", [1.0, 2.0], 2).tolist() == [[1.0, 2.0]] * 2
+    assert reader.read("payload", [1.0, 2.0], 2).tolist() == [[1.0], [2.0]]
+    assert reader.read("payload", 3.0, 2).tolist() == [[3.0]] * 2
+    assert reader.series("pressure", np.zeros((5, 2)), 3).shape == (5, 3, 2)
+    assert reader.series("pressure", [1.0, 2.0], 3).shape == (1, 3, 2)
+    for wrong in ([-1.0, 0.0], [1.0], [[1.0, 2.0]] * 3, {"middle": 1.0}, [np.inf, 0.0]):
+        with pytest.raises(InputError, match="pressure"):
+            reader.read("pressure", wrong, 2)

@@ -3,8 +3,8 @@
 import math
 
 import pytest
-from command_line import outcome, settings_of
 
+from support.command_line import outcome, settings_of
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
@@ -73,7 +73,7 @@ def test_the_beam_hangs_under_the_weight(dtype):
     [
         ("benchmark.batches.cpu=[0]", "benchmark.batches.cpu"),
         ("benchmark.steps={1: 2.5}", "benchmark.steps"),
-        ("benchmark.projective_dynamics.steps=2.5", "benchmark.projective_dynamics.steps is 2.5"),
+        ("benchmark.projective_dynamics.steps=2.5", "benchmark.projective_dynamics.steps"),
         ("benchmark.solvers=[]", "benchmark.solvers"),
         ("benchmark.materials=[{E: 1.0}]", "benchmark.materials.*E"),
         ("+benchmark.colour=red", "benchmark.colour"),

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from command_line import outcome, refusal, settings_of
 
+from support.command_line import outcome, refusal, settings_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.device_check import DeviceCheck, bounded, experiment_checks, trajectory_checks
 

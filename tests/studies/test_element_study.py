@@ -1,7 +1,11 @@
 """The table of elements."""
 
 import pytest
-from command_line import outcome, refusal
+
+from support.command_line import outcome, refusal
+from warp_resphys import Body, Corotated, Simulator, select_vertices
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.studies.elements import sag_mm
 
 
 def test_table(folder):
@@ -15,6 +19,15 @@ def test_table(folder):
     for element in ("27-node hexahedra", "10-node tetrahedra"):  # near the limit of refinement, as others are not yet
         assert sags[element, "centre"] == pytest.approx(-6.77, rel=0.02)
     assert sags["20-node hexahedra", "centre"] == pytest.approx(-6.77, rel=0.06)
+
+
+def test_the_sag_is_that_of_a_slender_beam():
+    """A tip's sag of rho g A L^4 / (8 E I) under the beam's weight."""
+    length, width, modulus, density = 0.2, 0.01, 1e7, 1000.0
+    mesh = box_hexahedra((length, width, width), (20, 1, 1), nodes=27)
+    beam = Simulator(Body(mesh, select_vertices(mesh, x=0.0)), Corotated(modulus, 0.0, density=density))
+    expected = density * 9.80709 * width**2 * length**4 / (8.0 * modulus * width**4 / 12.0)
+    assert sag_mm(beam) == pytest.approx(-1e3 * expected, rel=0.01)
 
 
 def test_too_fine(folder):

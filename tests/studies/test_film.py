@@ -4,8 +4,8 @@ import h5py
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from main_job import end_of
 
+from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.studies.film import motion_of
 

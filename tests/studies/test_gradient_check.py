@@ -3,9 +3,9 @@
 import io
 
 import pytest
-from command_line import outcome, refusal
 from rich.console import Console
 
+from support.command_line import outcome, refusal
 from warp_resphys.studies.gradient_check import GradientRow, gradient_sheet
 
 SMALL = ["mesh.divisions=[2,1,1]", "gradcheck.steps=1", "gradcheck.batch=1", "gradcheck.poses=[bent]"]

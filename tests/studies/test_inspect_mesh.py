@@ -3,9 +3,9 @@ import re
 import meshio
 import numpy as np
 import pytest
-from command_line import outcome, refusal, settings_of
 from matplotlib.image import imread
 
+from support.command_line import outcome, refusal, settings_of
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refusal, settings_of
 from matplotlib.colors import to_rgb
 
+from support.command_line import refusal, settings_of
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.quality import quality
 from warp_resphys.data.recordings.reading import read_recording

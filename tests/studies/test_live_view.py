@@ -11,9 +11,9 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 import torch
-from browser import opened, until
-from main_job import end_of
 
+from support.browser import opened, until
+from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.robot.loading import load

@@ -4,8 +4,8 @@ import csv
 
 import numpy as np
 import pytest
-from command_line import outcome, settings_of
 
+from support.command_line import outcome, settings_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.mesh.arm import mesh_arm

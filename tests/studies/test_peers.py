@@ -3,8 +3,8 @@
 import importlib.util
 
 import pytest
-from command_line import outcome, refusal
 
+from support.command_line import outcome, refusal
 from warp_resphys.io.files import read_json
 from warp_resphys.studies.peers import at_equal_error
 

@@ -12,12 +12,14 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
-from command_line import configuration, settings_of
-from main_job import end_of
 
+from support.command_line import configuration, settings_of
+from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
-from warp_resphys.report.page import error_parts, number_text
+from warp_resphys.learning.metrics import PUBLISHED_MM, PublishedError
+from warp_resphys.report.page import NONE, error_parts, number_text
+from warp_resphys.studies.comparison import missing_section
 from warp_resphys.studies.rows import Reproduction
 from warp_resphys.studies.runs import Run, _Pace, execute
 
@@ -168,6 +170,14 @@ class TestPlan:
         assert code == 2
         assert err.startswith("error: only names 'sopra_fibres'")
         assert len(err.splitlines()) == 1
+
+
+def test_what_no_run_reproduces_is_listed_with_what_was_published():
+    published = {"sopra": PUBLISHED_MM["sopra"], "new": {"resphys": PublishedError(1.25, 0.5)}}
+    (table,) = missing_section(published).blocks
+    assert [row.head for row in table.rows] == ["Pneumatic arm", "new"]
+    assert [cell.text for cell in table.rows[1].cells] == [NONE, NONE, NONE, "1.25"]
+    assert len(table.columns) == 4
 
 
 def test_the_estimate_learns_from_the_runs_that_are_done(tmp_path):

@@ -1,8 +1,8 @@
 """The table of linear solvers by size."""
 
 import pytest
-from command_line import outcome, refusal
 
+from support.command_line import outcome, refusal
 from warp_resphys.io.files import read_json
 from warp_resphys.studies.sizes import exponents
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from command_line import outcome, refusal
 
+from support.command_line import outcome, refusal
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.verification import box_of_vertices, compare_with_reference, read_reference

@@ -96,10 +96,13 @@ def check_converged(settings: SolverSettings, report: SolveReport, positions: to
     if settings.on_failure != "raise" or bool(report.converged.all()):
         return
     worst = int((~report.converged).nonzero()[0])
+    other = "or raise solver.max_iterations."
+    if settings.name != "newton":
+        other = "raise solver.max_iterations, or choose solver.name=newton."
     raise ConvergenceError(
         f"the {settings.name} solver stopped after {int(report.iterations[worst])} iterations with a relative residual "
         f"of {float(report.relative_residual[worst]):.2e} in environment {worst} of {len(report.converged)}: take a "
-        "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.",
+        f"smaller time step or loads, {other}",
         positions.detach(),
         report,
     )

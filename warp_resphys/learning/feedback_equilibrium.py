@@ -45,7 +45,7 @@ def equilibrium_under_feedback(
     smallest: torch.Tensor | None = None
     for number in range(_ITERATIONS):
         previous, current = current, force(state)
-        if previous is not None and torch.equal(current, previous):  # The last solution is in equilibrium with it.
+        if previous is not None and torch.equal(current, previous) and torch.equal(force(solution), current):
             return solution
         solution = simulator.static_equilibrium(inputs.plus(current), constants, start=state.q.detach())
         change = solution.q - state.q

@@ -11,7 +11,7 @@ import pytest
 
 from warp_resphys import cli, pipeline
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
 REFINED = [*STAGES[:3], "refine_resphys", *STAGES[3:]]
 REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]

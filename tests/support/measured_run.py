@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from configured import composed
 
+from support.configured import composed
 from warp_resphys.io.files import atomic_hdf5, create, write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import summarise

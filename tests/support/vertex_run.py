@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from configured import composed
 
+from support.configured import composed
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, write_json
 from warp_resphys.io.settings import parse

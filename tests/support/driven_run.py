@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from configured import composed
-from measured_run import describe_recordings
 
+from support.configured import composed
+from support.measured_run import describe_recordings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.io.settings import parse

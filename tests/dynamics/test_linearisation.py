@@ -1,0 +1,92 @@
+"""The linearised step: its Hessian is the derivative of its residual, with a rigid part and a tendon."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, select_vertices
+from warp_resphys.dynamics.energy_set import EnergySet
+from warp_resphys.dynamics.linearisation import Linearisation
+from warp_resphys.energies.friction import BristleFriction
+from warp_resphys.energies.placement import place_energies
+from warp_resphys.io.errors import InputError
+from warp_resphys.mesh.mesh import Mesh, box_hexahedra
+from warp_resphys.stepping.integrators import INTEGRATORS
+
+BOX = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
+MESH = Mesh(BOX.vertices, BOX.cells, {"beam": np.array([0, 1]), "cap": np.array([2])})
+TENDON = Tendons([[[0.0, 0.01, 0.02], [0.03, 0.01, 0.02]]], 400.0)
+
+
+def simulator(rigid):
+    mesh = MESH if rigid else BOX
+    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
+    return Simulator(body, {"beam": Corotated(2e5)} if rigid else Corotated(2e5))
+
+
+def linearised(rigid):
+    """A step of two bent bodies, positions at which to take it, and a direction of the coordinates."""
+    s, generator = simulator(rigid), torch.Generator().manual_seed(0)
+    state = s.rest_state(2)
+    bend = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    state = s.state(state.q + 20.0 * state.q[..., :1] ** 2 * bend, 0.1 * state.q)
+    step: Linearisation = s.linearise(state, Inputs(tendon_tension=torch.tensor([[1.0], [2.0]]).double()))
+    x, zero = (step.hold(q) for q in (state.q, torch.zeros_like(state.q)))
+    noise = torch.rand(state.q.shape, generator=generator, dtype=torch.float64)
+    direction = step.hold(noise) - zero
+    return step, x, direction
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_product_matrix_and_solution_belong_to_the_derivative_of_the_residual(rigid):
+    step, x, direction = linearised(rigid)
+    h = 1e-7
+    difference = (step.residual(x + h * direction) - step.residual(x - h * direction)) / (2 * h)
+    scale = float(difference.abs().max())
+    step.update(x)
+    on_controls = difference[:, step.free]
+    torch.testing.assert_close(step.product(direction)[:, step.free], on_controls, rtol=0.0, atol=1e-6 * scale)
+    matrix, inertia = step.matrix(x)
+    flat = direction[0, step.free].flatten().numpy()
+    np.testing.assert_allclose(matrix @ flat, on_controls[0].flatten(), atol=1e-6 * scale)
+    mass = step.inertia_matrix(x)
+    if not rigid:
+        np.testing.assert_allclose(mass.diagonal(), inertia)
+    along, whole = np.tile([1.0, 0.0, 0.0], len(step.free)), np.tile([1.0, 2.0, 3.0], len(step.free))
+    assert whole @ mass @ whole == pytest.approx(14.0 * (along @ mass @ along))  # the same mass in every direction
+    step.factorise(x)
+    solved = step.solve(difference.flatten(1)[..., None])[..., 0].view_as(x)
+    torch.testing.assert_close(solved, direction, rtol=1e-4, atol=1e-6)
+
+
+def test_a_shifted_factor():
+    step, x, direction = linearised(False)
+    step.update(x)
+    right = (direction + 1e-6 * step.product(direction))[:, step.free].reshape(2, -1, 1)
+    solved = step.shifted(1e-6).solve(right).view(2, -1, 3)
+    torch.testing.assert_close(solved, direction[:, step.free], rtol=0.0, atol=1e-9)
+
+
+def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
+    mesh = Mesh(BOX.vertices, BOX.cells, {"root": np.array([0]), "tip": np.array([1, 2])})
+    friction = BristleFriction([[0, 12]], 1.0, 1e-3)
+    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[friction])
+    materials = {"root": Corotated(1e5, density=1000.0), "tip": Corotated(2e5, density=500.0)}
+    rest = torch.as_tensor(mesh.vertices)
+    energies = EnergySet(place_energies(body, materials), body, rest, INTEGRATORS["bdf2"], 0.01)
+    assert energies.constants["tip_youngs_modulus"] == 2e5
+    assert {"root_density", "tip_density", "friction_force"} <= set(energies.parameters)
+    given = {
+        name: energies.parameters[name].shaped(torch.as_tensor(v).double()) for name, v in energies.constants.items()
+    }
+    values, mass = energies.prepare({**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()})
+    volume = 0.02**3
+    np.testing.assert_allclose(mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)])
+    assert "friction_force" in values
+    energies.check_memory({"bristle_deflection": rest.new_zeros(2, 1)}, 2, rest)
+    for wrong in ({"deflection": rest.new_zeros(2, 1)}, {"bristle_deflection": rest.new_zeros(2, 3)}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            energies.check_memory(wrong, 2, rest)
+    twice = 2 * place_energies(body, materials)
+    with pytest.raises(InputError, match="two energies depend on"):
+        EnergySet(twice, body, rest, INTEGRATORS["bdf2"], 0.01)

@@ -1,0 +1,76 @@
+"""Trials that are computed in parts: an interrupted part goes on where it was, and parts are joined."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.experiment.parts import (
+    ResumableRollout,
+    padded,
+    read_parts,
+    remove_parts,
+    split_into_parts,
+    work_on,
+    workers_for,
+)
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.fan_out import Workers
+from warp_resphys.io.resumable import Field
+from warp_resphys.io.stages import StageContext
+from warp_resphys.settings.run import ParallelSettings
+from warp_resphys.stepping.state import State
+
+
+class Growing(ResumableRollout):
+    """Powers of a number of every trial, in its only coordinate; fails once at a frame."""
+
+    def __init__(self, part):
+        self.part, self.frames, self.like = part, part.frames, torch.zeros(1, dtype=torch.float64)
+        self.fields = {"power": Field((len(part.names),), "m", batch_axes=1)}
+
+    def begin(self):
+        return State(torch.ones(len(self.part.names), 1, 1).double(), torch.zeros(len(self.part.names), 1, 1).double())
+
+    def step(self, number):
+        if number == self.part.more.get("fails_at"):
+            raise KeyboardInterrupt
+        self.part.more["computed"].append((self.part.names, number))
+        growth = torch.tensor([float(name) for name in self.part.names]).double()
+        return State(self.state.q * growth[:, None, None], self.state.v)
+
+    def frame_arrays(self, number):
+        return {"power": self.state.q.flatten().numpy()}
+
+
+@pytest.mark.parametrize("settings", ["same", "other"])
+def test_an_interrupted_stage_goes_on(tmp_path, settings):
+    kept, names = {"computed": [], "fails_at": 4}, ["2", "3", "5"]
+    parts = split_into_parts(StageContext("powers", tmp_path, "same", None), names, 6, more=kept, batch=2)
+    assert [part.names for part in parts] == [("2", "3"), ("5",)]
+    with pytest.raises(KeyboardInterrupt):
+        work_on(parts, Growing, Workers(1))
+    del kept["fails_at"]
+    context = StageContext("powers", tmp_path, settings, None)
+    parts = split_into_parts(context, names, 6, more=kept, batch=2)
+    work_on(parts, Growing, Workers(1))
+    again = 0 if settings == "same" else 3
+    assert kept["computed"].count((("2", "3"), 2)) == 1 + (again > 0)
+    assert len(kept["computed"]) == 2 * 5 + again
+    np.testing.assert_array_equal(read_parts(parts, "power"), [[n**k for k in range(6)] for n in (2, 3, 5)])
+    assert all(part.done for part in parts)
+    remove_parts(context)
+    assert not any(part.done for part in parts)
+
+
+def test_shorter_trials_end_with_nan():
+    joined = padded([np.ones((1, 2, 3)), np.ones((2, 4, 3))], 3)
+    assert joined.shape == (3, 4, 3)
+    np.testing.assert_array_equal(np.isnan(joined[..., 0]), [[False] * 2 + [True] * 2, [False] * 4, [False] * 4])
+    assert padded([np.ones((1, 2), int)]).dtype == int
+
+
+def test_workers_of_clusters_are_counted_and_compute_on_cpus():
+    assert workers_for(ParallelSettings(), 3, "cpu") == Workers(3, "local", None)
+    assert workers_for(ParallelSettings(), None, "cpu").count >= 1
+    with pytest.raises(InputError, match="dask cluster"):
+        workers_for(ParallelSettings(backend="dask"), None, "cpu")

@@ -1,0 +1,112 @@
+"""Energy densities of every material: derivatives, the state at rest, and invariance under rotation."""
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.kernels.materials import corotated, gent, mooney_rivlin, stable_neo_hookean
+from warp_resphys.kernels.materials.density import density_law
+
+MU, BULK = 3.0, 7.0
+# The law, its moduli, and the Lame constants of small strains.
+GENT = density_law("gent", gent.energy_density, gent.volume_energy)
+LAWS = {
+    "corotated": (corotated, (MU, BULK), (MU, BULK / 3.0)),
+    "stable_neo_hookean": (stable_neo_hookean, (MU, BULK), (MU, BULK)),
+    "mooney_rivlin": (mooney_rivlin, (MU, 2.0, BULK), (2.0 * MU + 4.0, BULK)),
+    "gent": (GENT, (1.0, 1.0, MU, BULK, MU, 60.0, BULK), (MU, BULK - 2.0 / 3.0 * MU)),
+}
+RANDOM = np.random.default_rng(0)
+GRADIENTS = np.concatenate([np.eye(3)[None], *(np.eye(3) + s * RANDOM.normal(size=(10, 3, 3)) for s in (0.02, 0.2))])
+DIRECTION = RANDOM.normal(size=GRADIENTS.shape)
+
+
+@functools.cache
+def kernel_of(name):
+    law = LAWS[name][0]
+    module = wp.get_module(f"test_material_laws.{name}")
+    wp.set_module_options({"enable_backward": False, "max_unroll": 1}, module)
+
+    @wp.kernel(module=module)
+    def evaluate(
+        f: wp.array[wp.mat33d], df: wp.array[wp.mat33d], m: law.moduli, clamp: bool, energy_out: wp.array[wp.float64],
+        stress_out: wp.array[wp.mat33d], slopes_out: wp.array[law.moduli], tangent_out: wp.array2d[wp.mat33d],
+    ):  # fmt: skip
+        i = wp.tid()
+        energy, stress = law.response(f[i], m)
+        energy_out[i] = energy
+        stress_out[i] = stress
+        slopes_out[i] = law.slopes(f[i], df[i], m, m)
+        law.tangent(f[i], m, clamp, tangent_out[i])
+
+    return evaluate
+
+
+def response(name, f=GRADIENTS, moduli=None, clamp=False):
+    """Energies (B), stresses (B, 3, 3), slopes (B, n) and tangents (B, 9, 9)."""
+    law, own, _ = LAWS[name]
+    sizes = [(len(f), wp.float64), (len(f), wp.mat33d), (len(f), law.moduli), ((len(f), 6), wp.mat33d)]
+    out = [wp.zeros(size, dtype=kind, device="cpu") for size, kind in sizes]
+    fields = [wp.array(field, dtype=wp.mat33d, device="cpu") for field in (f, DIRECTION)]
+    wp.launch(kernel_of(name), len(f), [*fields, law.moduli(*(moduli or own)), clamp, *out], device="cpu")
+    energy, stress, slopes, blocks = (array.numpy() for array in out)
+    tangent = np.zeros((len(f), 3, 3, 3, 3))  # column and row of the stress, column and row of F
+    for number, (k, n) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
+        tangent[:, k, :, n] = blocks[:, number]
+        tangent[:, n, :, k] = blocks[:, number].transpose(0, 2, 1)
+    return energy, stress, slopes, tangent.reshape(len(f), 9, 9)
+
+
+def flat(matrices):
+    return matrices.transpose(0, 2, 1).reshape(-1, 9)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_stress_and_tangent_are_derivatives(name):
+    step = 1e-5
+    _, stress, _, tangent = response(name)
+    ahead, behind = (response(name, GRADIENTS + s * step * DIRECTION) for s in (1, -1))
+    slope = np.einsum("nij,nij->n", stress, DIRECTION)
+    np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * step), slope, rtol=1e-6, atol=1e-6)
+    product = np.einsum("nij,nj->ni", tangent, flat(DIRECTION))
+    np.testing.assert_allclose(flat(ahead[1] - behind[1]) / (2 * step), product, rtol=1e-5, atol=1e-5)
+    values, vectors = np.linalg.eigh(tangent)
+    assert (values < -0.1).any()
+    clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
+    np.testing.assert_allclose(response(name, clamp=True)[3], clamped, atol=1e-8 * np.abs(tangent).max())
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_slopes_are_the_derivatives_of_the_stress_by_the_moduli(name):
+    _, moduli, _ = LAWS[name]
+    slopes = response(name)[2]
+    for k in range(4 if name == "gent" else 0, len(moduli)):  # Those before are volumes.
+        step = 1e-4 * moduli[k]
+        ahead, behind = (
+            response(name, moduli=tuple(m + s * step * (i == k) for i, m in enumerate(moduli)))[1] for s in (1, -1)
+        )
+        expected = np.einsum("nij,nij->n", ahead - behind, DIRECTION) / (2 * step)
+        np.testing.assert_allclose(slopes[:, k], expected, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_at_rest_it_is_linear_elasticity(name):
+    energy, stress, _, tangent = (values[0] for values in response(name))
+    np.testing.assert_allclose(energy, 0.0, atol=1e-14)
+    np.testing.assert_allclose(stress, 0.0, atol=1e-14)
+    mu, lame_lambda = LAWS[name][2]
+    strain = 0.5 * (DIRECTION[0] + DIRECTION[0].T)
+    expected = 2.0 * mu * strain + lame_lambda * np.trace(strain) * np.eye(3)
+    np.testing.assert_allclose((tangent @ DIRECTION[0].T.ravel()).reshape(3, 3).T, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_rotations_of_the_body_and_of_its_rest_shape_change_nothing(name):
+    turn, before = Rotation.random(2, rng=np.random.default_rng(1)).as_matrix()
+    energy, stress, _, _ = response(name)
+    turned = response(name, turn @ GRADIENTS @ before)
+    np.testing.assert_allclose(turned[0], energy, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(turned[1], turn @ stress @ before, atol=1e-10)

@@ -1,0 +1,110 @@
+"""Functions of a 3x3 matrix against numpy and scipy, and the tangent of an isotropic energy in closed form."""
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+from warp_resphys.kernels.matrices import cofactor, nearest_unimodular, polar_rotation, signed_svd
+from warp_resphys.kernels.spectral import spectral_blocks
+
+wp.set_module_options({"enable_backward": False})
+RANDOM = np.random.default_rng(0)
+MATRICES = np.concatenate(
+    [
+        np.eye(3)[None],
+        *(np.eye(3) + spread * RANDOM.normal(size=(20, 3, 3)) for spread in (0.02, 0.3, 0.8)),
+        [np.diag([1.0, 1.2, 0.0]), np.diag([1.1, 0.9, -0.2]), np.diag([0.4, 0.5, 0.6])],
+    ]
+)
+
+
+@wp.kernel
+def decompose(
+    f: wp.array[wp.mat33d], cofactor_out: wp.array[wp.mat33d], rotation_out: wp.array[wp.mat33d],
+    unimodular_out: wp.array[wp.mat33d], u_out: wp.array[wp.mat33d], s_out: wp.array[wp.vec3d],
+    v_out: wp.array[wp.mat33d],
+):  # fmt: skip
+    i = wp.tid()
+    cofactor_out[i] = cofactor(f[i])
+    rotation_out[i] = polar_rotation(f[i])
+    unimodular_out[i] = nearest_unimodular(f[i])
+    u, s, v = signed_svd(f[i])
+    u_out[i] = u
+    s_out[i] = s
+    v_out[i] = v
+
+
+def decomposed(f):
+    """Cofactor, rotation, nearest unimodular matrix, U, s and V of every matrix."""
+    kinds = [wp.mat33d, wp.mat33d, wp.mat33d, wp.mat33d, wp.vec3d, wp.mat33d]
+    out = [wp.zeros(len(f), dtype=kind, device="cpu") for kind in kinds]
+    wp.launch(decompose, len(f), [wp.array(f, dtype=wp.mat33d, device="cpu"), *out], device="cpu")
+    return [array.numpy() for array in out]
+
+
+def test_decompositions():
+    cof, rotation, _, u, s, v = decomposed(MATRICES)
+    regular = np.abs(np.linalg.det(MATRICES)) > 1e-3
+    inverse = np.linalg.inv(MATRICES[regular]).transpose(0, 2, 1)
+    np.testing.assert_allclose(cof[regular], np.linalg.det(MATRICES[regular])[:, None, None] * inverse, atol=1e-11)
+    np.testing.assert_allclose(np.einsum("nik,nk,njk->nij", u, s, v), MATRICES, atol=1e-13)
+    np.testing.assert_allclose([np.linalg.det(u), np.linalg.det(v), np.linalg.det(rotation)], 1.0, atol=1e-12)
+    assert (np.abs(s[:, 2]) <= s[:, :2].min(1)).all()
+    upright = np.linalg.det(MATRICES) > 1e-3
+    np.testing.assert_allclose(rotation[upright], [scipy.linalg.polar(f)[0] for f in MATRICES[upright]], atol=1e-12)
+    # Of all rotations R the trace of R^T F is largest: s_1 + s_2 +- s_3.
+    np.testing.assert_allclose(np.einsum("nij,nij->n", rotation, MATRICES), s.sum(1), atol=1e-12)
+
+
+def test_the_nearest_unimodular_matrix():
+    f = MATRICES[np.linalg.det(MATRICES) > 0.0]
+    nearest = decomposed(f)[2]
+    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-12)
+    normal = np.linalg.inv(nearest).transpose(0, 2, 1)  # of the surface det D = 1
+    share = np.einsum("nij,nij->n", f - nearest, normal) / np.square(normal).sum((1, 2))
+    np.testing.assert_allclose(f - nearest, share[:, None, None] * normal, atol=1e-9)
+    distance = np.linalg.norm(f - nearest, axis=(1, 2))
+    for spread in (0.01, 0.1, 0.5):
+        other = nearest + spread * RANDOM.normal(size=f.shape)
+        other /= np.cbrt(np.linalg.det(other))[:, None, None]
+        assert (distance <= np.linalg.norm(f - other, axis=(1, 2)) + 1e-12).all()
+
+
+@wp.kernel
+def quartic_blocks(f: wp.array[wp.mat33d], shift: wp.float64, clamp: bool, blocks_out: wp.array2d[wp.mat33d]):
+    """The tangent of ||F F^T||^2 / 4 + shift / 2 ||F||^2, whose principal stresses are s^3 + shift s."""
+    n = wp.tid()
+    u, s, v = signed_svd(f[n])
+    flip, twist = wp.vec3d(), wp.vec3d()
+    normal = wp.mat33d()
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        squares = s[i] * s[i] + s[j] * s[j]
+        normal[k, k] = wp.float64(3.0) * s[k] * s[k] + shift
+        flip[k] = squares + s[i] * s[j] + shift
+        twist[k] = squares - s[i] * s[j] + shift
+    spectral_blocks(u, v, normal, flip, twist, clamp, blocks_out[n])
+
+
+def dense(f, shift, clamp):
+    """(B, 9, 9) from the six blocks; column n, row i of F is number 3 n + i."""
+    blocks = wp.zeros((len(f), 6), dtype=wp.mat33d, device="cpu")
+    wp.launch(quartic_blocks, len(f), [wp.array(f, dtype=wp.mat33d, device="cpu"), shift, clamp, blocks], device="cpu")
+    result = np.zeros((len(f), 9, 9))
+    for number, (k, n) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
+        result[:, 3 * k : 3 * k + 3, 3 * n : 3 * n + 3] = blocks.numpy()[:, number]
+        result[:, 3 * n : 3 * n + 3, 3 * k : 3 * k + 3] = blocks.numpy()[:, number].transpose(0, 2, 1)
+    return result
+
+
+def test_spectral_blocks_are_the_tangent():
+    expected = np.zeros((len(MATRICES), 9, 9))
+    for column, direction in enumerate(np.eye(9).reshape(9, 3, 3).transpose(0, 2, 1)):
+        f, t = MATRICES, MATRICES.transpose(0, 2, 1)
+        change = direction @ t @ f + f @ direction.T @ f + f @ t @ direction - 2.0 * direction
+        expected[:, :, column] = change.transpose(0, 2, 1).reshape(-1, 9)
+    np.testing.assert_allclose(dense(MATRICES, -2.0, False), expected, atol=1e-11)
+    values, vectors = np.linalg.eigh(expected)
+    assert (values < -0.1).any()
+    clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
+    np.testing.assert_allclose(dense(MATRICES, -2.0, True), clamped, atol=1e-11)

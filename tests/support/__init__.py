@@ -1,0 +1,1 @@
+"""Runs, bodies and commands that several tests share."""

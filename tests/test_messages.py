@@ -1,0 +1,60 @@
+"""The ten error messages that users meet most, word for word: what is wrong, where, and what to do."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import warp_resphys as wr
+from support.configured import check, composed
+
+BOX = wr.box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))
+FREE, CLAMPED = wr.Body(BOX), wr.Body(BOX, fixed=wr.select_vertices(BOX, x=0.0))
+
+
+def beam(body=CLAMPED, **settings):
+    return wr.Simulator(body, solver=wr.SolverSettings(**settings))
+
+
+def pushed(newtons, *shape):
+    return wr.Inputs(torch.full((1, *(shape or BOX.vertices.shape)), newtons, dtype=torch.float64))
+
+
+def collapsed():
+    vertices = BOX.vertices.copy()
+    vertices[BOX.cells[2]] = vertices[BOX.cells[2][0]]
+    return beam(wr.Body(wr.Mesh(vertices, BOX.cells)))
+
+
+MESSAGES = {
+    "unknown key 'sed', did you mean 'seed'?": lambda: check({**composed(), "sed": 1}),
+    "Unknown input presure. This body accepts external_force, fixed_positions, attached_mass.": (
+        lambda: beam().step(beam().rest_state(), wr.Inputs(presure=torch.zeros(1, 2)))
+    ),
+    "arm.vtu: there is no such mesh file": lambda: wr.read_mesh(Path("arm.vtu")),
+    "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
+    "them": collapsed,
+    "no equilibrium was found: under growing loads it is lost beyond 0 % of them; lower the loads, or take a stiffer "
+    "material.": lambda: beam().static_equilibrium(pushed(1e4)),
+    "the quasi_newton solver stopped after 1 iterations with a relative residual of SIZE in environment 0 of 1: take a "
+    "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.": (
+        lambda: beam(max_iterations=1).step(beam().rest_state(), pushed(0.1))
+    ),
+    "external_force has shape (1, 3, 3): it must be (1, 20, 3) in N.": (
+        lambda: beam().step(beam().rest_state(), pushed(0.0, 3, 3))
+    ),
+    "swing.h5 does not exist: check the path, or run the stage that writes it": lambda: wr.read_recording("swing.h5"),
+    "youngs_modulus is -100000: it must be positive, in Pa.": lambda: wr.Corotated(-1e5),
+    "a body without fixed vertices has no static equilibrium: fix some vertices.": (
+        lambda: beam(FREE).static_equilibrium()
+    ),
+}
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_message(message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(wr.ResphysError) as caught:
+        MESSAGES[message]()
+    assert re.sub(r"\d\.\d\de[+-]\d\d", "SIZE", str(caught.value)) == message

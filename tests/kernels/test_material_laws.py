@@ -8,6 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from warp_resphys.kernels.materials import corotated, gent, mooney_rivlin, stable_neo_hookean
+from warp_resphys.kernels.materials.convex import convex_law
 from warp_resphys.kernels.materials.density import density_law
 
 MU, BULK = 3.0, 7.0
@@ -19,6 +20,12 @@ LAWS = {
     "mooney_rivlin": (mooney_rivlin, (MU, 2.0, BULK), (2.0 * MU + 4.0, BULK)),
     "gent": (GENT, (1.0, 1.0, MU, BULK, MU, 60.0, BULK), (MU, BULK - 2.0 / 3.0 * MU)),
 }
+TERMS = (3.0, 2.0, 1.5, 1.0, 0.7, 0.4, BULK, 3.0)
+AXES = ((0.6, 0.0, 0.8), (0.48, 0.6, -0.64))
+LAWS["convex"] = (convex_law(0), TERMS, (8.0, 2.0 * BULK + 0.8))
+FIBRES = "convex with two families of fibres"
+ISOTROPIC = tuple(LAWS)
+LAWS[FIBRES] = (convex_law(2), (*TERMS, *AXES[0], 4.0, 2.0, 1.0, *AXES[1], 3.0, 0.0, 5.0), None)
 RANDOM = np.random.default_rng(0)
 GRADIENTS = np.concatenate([np.eye(3)[None], *(np.eye(3) + s * RANDOM.normal(size=(10, 3, 3)) for s in (0.02, 0.2))])
 DIRECTION = RANDOM.normal(size=GRADIENTS.shape)
@@ -70,9 +77,14 @@ def test_stress_and_tangent_are_derivatives(name):
     _, stress, _, tangent = response(name)
     ahead, behind = (response(name, GRADIENTS + s * step * DIRECTION) for s in (1, -1))
     slope = np.einsum("nij,nij->n", stress, DIRECTION)
-    np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * step), slope, rtol=1e-6, atol=1e-6)
+    smooth = slice(name == FIBRES, None)  # The modulus of fibres jumps at rest.
+    np.testing.assert_allclose((ahead[0] - behind[0])[smooth] / (2 * step), slope[smooth], rtol=1e-6, atol=1e-6)
     product = np.einsum("nij,nj->ni", tangent, flat(DIRECTION))
-    np.testing.assert_allclose(flat(ahead[1] - behind[1]) / (2 * step), product, rtol=1e-5, atol=1e-5)
+    difference = flat(ahead[1] - behind[1]) / (2 * step)
+    np.testing.assert_allclose(difference[smooth], product[smooth], rtol=1e-5, atol=1e-5)
+    if name == FIBRES:  # Both parts of the tangent are clamped by themselves.
+        assert np.linalg.eigvalsh(response(name, clamp=True)[3]).min() > -1e-8 * np.abs(tangent).max()
+        return
     values, vectors = np.linalg.eigh(tangent)
     assert (values < -0.1).any()
     clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
@@ -84,15 +96,16 @@ def test_slopes_are_the_derivatives_of_the_stress_by_the_moduli(name):
     _, moduli, _ = LAWS[name]
     slopes = response(name)[2]
     for k in range(4 if name == "gent" else 0, len(moduli)):  # Those before are volumes.
-        step = 1e-4 * moduli[k]
+        step = 1e-4 * max(abs(moduli[k]), 0.1)
         ahead, behind = (
             response(name, moduli=tuple(m + s * step * (i == k) for i, m in enumerate(moduli)))[1] for s in (1, -1)
         )
         expected = np.einsum("nij,nij->n", ahead - behind, DIRECTION) / (2 * step)
-        np.testing.assert_allclose(slopes[:, k], expected, rtol=1e-6, atol=1e-7)
+        smooth = slice(name == FIBRES, None)
+        np.testing.assert_allclose(slopes[smooth, k], expected[smooth], rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ISOTROPIC)
 def test_at_rest_it_is_linear_elasticity(name):
     energy, stress, _, tangent = (values[0] for values in response(name))
     np.testing.assert_allclose(energy, 0.0, atol=1e-14)
@@ -103,10 +116,31 @@ def test_at_rest_it_is_linear_elasticity(name):
     np.testing.assert_allclose((tangent @ DIRECTION[0].T.ravel()).reshape(3, 3).T, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ISOTROPIC)
 def test_rotations_of_the_body_and_of_its_rest_shape_change_nothing(name):
     turn, before = Rotation.random(2, rng=np.random.default_rng(1)).as_matrix()
     energy, stress, _, _ = response(name)
     turned = response(name, turn @ GRADIENTS @ before)
     np.testing.assert_allclose(turned[0], energy, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(turned[1], turn @ stress @ before, atol=1e-10)
+
+
+def test_fibres_turn_with_the_rest_shape():
+    turn = Rotation.random(rng=np.random.default_rng(2)).as_matrix()
+    moduli = np.array(LAWS[FIBRES][1])
+    for first in (8, 14):
+        moduli[first : first + 3] = turn @ moduli[first : first + 3]
+    energy, stress, _, _ = response(FIBRES)
+    turned = response(FIBRES, GRADIENTS @ turn.T, tuple(moduli))
+    np.testing.assert_allclose(turned[0], energy, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(turned[1], stress @ turn.T, atol=1e-10)
+
+
+def test_fibres_pull_along_their_direction_with_the_law_of_their_stretch():
+    stretch, (k2, k3, kc) = np.array([1.3, 0.8]), LAWS[FIBRES][1][11:14]
+    f = np.stack([np.eye(3) + (s - 1.0) * np.outer(AXES[0], AXES[0]) for s in stretch])
+    moduli = [0.0] * 8 + [*AXES[0], k2, k3, kc, *AXES[1], 0.0, 0.0, 0.0]
+    q = stretch**2 - 1.0
+    pull = 2.0 * stretch * np.array([2.0 * k2 * q[0] + 3.0 * k3 * q[0] ** 2, 2.0 * kc * q[1]])
+    expected = pull[:, None, None] * np.outer(AXES[0], AXES[0])
+    np.testing.assert_allclose(response(FIBRES, f, tuple(moduli))[1], expected, atol=1e-12)

@@ -25,6 +25,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.materials import corotated, gent, mooney_rivlin, stable_neo_hookean
+from ..kernels.materials.convex import ISOTROPIC, convex_law
 from ..kernels.materials.density import density_law
 from ..stepping.quantity import Parameter, Quantity
 
@@ -209,6 +210,93 @@ class Gent(DensityMaterial):
         """Returns mu and K - 2/3 mu."""
         mu = constants["shear_modulus"]
         return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
+
+
+_FIBRE = (
+    Quantity("azimuth", "rad", per="element"),
+    Quantity("elevation", "rad", per="element"),
+    Quantity("tension", "Pa", 0.0, closed=True, per="element"),
+    Quantity("stiffening", "Pa", 0.0, closed=True, per="element"),
+    Quantity("compression", "Pa", 0.0, closed=True, per="element"),
+)
+
+
+@dataclass(frozen=True)
+class FibreFamily:
+    """Fibres along e = (cos beta cos alpha, cos beta sin alpha, sin beta) at rest, with q = |F e|^2 - 1.
+
+    Numbers, or a value for each element of a curved body.
+    """
+
+    azimuth: Parameter = 0.0  # alpha [rad]
+    elevation: Parameter = 0.0  # beta [rad]
+    tension: Parameter = 0.0  # of q^2 where q > 0 [Pa]
+    stiffening: Parameter = 0.0  # of q^3 where q > 0 [Pa]
+    compression: Parameter = 0.0  # of q^2 where q < 0 [Pa]
+
+
+@dataclass(frozen=True)
+class ConvexMaterial(Material):
+    """Rubber of terms with non-negative coefficients: powers of invariants, and families of fibres.
+
+    With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993).
+    """
+
+    c10: Parameter = constant(44e3, "c10", "Pa", closed=True)  # of a [Pa]
+    c20: Parameter = constant(0.0, "c20", "Pa", closed=True)  # of a^2 [Pa]
+    c30: Parameter = constant(0.0, "c30", "Pa", closed=True)  # of a^3 [Pa]
+    c01: Parameter = constant(0.0, "c01", "Pa", closed=True)  # of b [Pa]
+    c02: Parameter = constant(0.0, "c02", "Pa", closed=True)  # of b^2 [Pa]
+    dilation: Parameter = constant(0.0, "dilation", "Pa", closed=True)  # of j^2 at shape points [Pa]
+    bulk_1: Parameter = constant(22e6, "bulk_1", "Pa", closed=True)  # of j^2 at volume points [Pa]
+    bulk_2: Parameter = constant(0.0, "bulk_2", "Pa", closed=True)  # of j^4 there [Pa]
+    fibres: Sequence[FibreFamily] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Builds the law.
+
+        Raises:
+            InputError: a coefficient is negative or not finite, or a family of fibres is not a `FibreFamily`.
+        """
+        for number, family in enumerate(self.fibres):
+            if not isinstance(family, FibreFamily):
+                raise InputError(f"fibres[{number}] is {family!r}: give a FibreFamily(azimuth, elevation, tension).")
+        count = len(self.fibres)
+        law = {
+            "law": convex_law(count),
+            "rules": ("shape",) * 6 + ("volume",) * 2 + (("mean",) * 3 + ("shape",) * 3) * count,
+            "curvature": (4.0, 0.0, 0.0, 4.0, 0.0, 2.0, 2.0, 0.0) + (0.0, 0.0, 0.0, 8.0, 0.0, 8.0) * count,
+        }
+        for name, value in law.items():
+            object.__setattr__(self, name, value)
+        super().__post_init__()
+
+    @property
+    @override
+    def quantities(self) -> dict[str, Quantity]:
+        """Constants by name; those of fibres are ``fibre_1_azimuth``, ``fibre_1_tension``, ..."""
+        names = [(f"fibre_{k + 1}_{q.name}", q) for k in range(len(self.fibres)) for q in _FIBRE]
+        return {**super().quantities, **{name: replace(q, name=name) for name, q in names}}
+
+    @property
+    @override
+    def constants(self) -> dict[str, Parameter]:
+        values = {
+            f"fibre_{k + 1}_{own.name}": getattr(family, own.name)
+            for k, family in enumerate(self.fibres)
+            for own in fields(family)
+        }
+        return {**super().constants, **values}
+
+    @override
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns the coefficients, and the direction and coefficients of each family."""
+        moduli = [constants[name] for name in list(self.own_quantities())[:ISOTROPIC]]
+        for k in range(len(self.fibres)):
+            azimuth, elevation, *own = (constants[f"fibre_{k + 1}_{q.name}"] for q in _FIBRE)
+            level = elevation.cos()
+            moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *own]
+        return tuple(moduli)
 
 
 MATERIALS: dict[str, type[Material]] = {

@@ -215,7 +215,7 @@ class SolidTerm(Term):
         self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: NDArray[np.float64]
     ) -> None:
         super().__init__(launcher, sets)
-        law = type(material).law
+        law = material.law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli = len(material.rules)
         self._carried = carried

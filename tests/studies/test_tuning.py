@@ -17,7 +17,6 @@ from optuna.trial import TrialState
 
 from support.configured import settings
 from support.main_job import IN_RUN, TINY, files, run
-from warp_resphys import pipeline
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.errors import InputError
@@ -54,10 +53,9 @@ WIDTHS = {
 
 
 @pytest.fixture
-def no_pictures(monkeypatch):
+def no_pictures(monkeypatch, no_report):
     """Pictures take most of a tiny search's time, and the report of a tiny run's."""
     monkeypatch.setattr(tuning_results, "_write_page", lambda *arguments: None)
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 def table(folder=FOLDER):

@@ -110,3 +110,21 @@ def test_rotations_of_the_body_and_of_its_rest_shape_change_nothing(name):
     turned = response(name, turn @ GRADIENTS @ before)
     np.testing.assert_allclose(turned[0], energy, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(turned[1], turn @ stress @ before, atol=1e-10)
+
+
+def test_mooney_rivlin_rubber_is_the_closed_form():
+    moduli = np.array(LAWS["mooney_rivlin"][1])
+    c = GRADIENTS.transpose(0, 2, 1) @ GRADIENTS
+    first, change = np.trace(c, axis1=1, axis2=2), np.linalg.det(GRADIENTS) - 1.0
+    second = 0.5 * (first**2 - np.trace(c @ c, axis1=1, axis2=2))
+    terms = first - 3 - 2 * change + change**2, second - 3 - 4 * change, 0.5 * change**2
+    np.testing.assert_allclose(response("mooney_rivlin")[0], moduli @ np.stack(terms), rtol=1e-10, atol=1e-12)
+
+
+def test_a_bar_of_rubber_that_is_stretched():
+    """At constant volume its nominal stress is 2 (l - l^-2) (c10 + c01 / l) at the stretch l (Rivlin 1948)."""
+    stretch = np.linspace(0.5, 3.0, len(GRADIENTS))
+    across = stretch**-0.5
+    stress = response("mooney_rivlin", np.stack([np.diag([x, y, y]) for x, y in zip(stretch, across, strict=True)]))[1]
+    tension = stress[:, 0, 0] - across / stretch * stress[:, 1, 1]  # less the pressure that keeps the sides free
+    np.testing.assert_allclose(tension, 2.0 * (stretch - stretch**-2) * (MU + 2.0 / stretch), atol=1e-12)

@@ -245,7 +245,7 @@ def recorded(tmp_path, finished, change):
         (["data.horizons=[0.06,5.0]"], "data.horizons"),
         (["data.train_fraction=1.5"], "data.train_fraction is 1.5"),
         (["data.cutoff=80.0"], "data.cutoff"),
-        (["data.input_scales=[1.0]"], "data.input_scales is [1.0]"),
+        (["data.input_scales=[1.0]"], "data.input_scales"),
         (["data.input_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
         (["laboratory.time_step=0.003"], "the first must be a multiple of the second"),
         (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),

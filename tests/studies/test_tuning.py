@@ -401,7 +401,7 @@ class TestBadInput:
             ("tune.space.trainer.gamma={low:1.0,high:0.8}", "tune.space.trainer.gamma is "),
             ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2"),
             ("tune.space.network.width=[8.5,16]", "tune: network.width is 8.5"),
-            ("+tune.space.network.depth=[1,2]", "'network.depth'"),
+            ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth'"),
             ("+tune.settings.network.width=8", "tune.settings.network.width"),
             ("simfree=3", "simfree is 3"),
             ("+simfree.network.width=-1", "simfree.network.width is -1"),

@@ -32,7 +32,7 @@ class TestBadInput:
             ("reconstruction.regularisation=-1", "reconstruction.regularisation"),
             ("network.kind=graph", "network.kind"),
             ("network.force_modes=1000", "1000 modes"),
-            ("solver.name=gradient_descent", "solver is"),
+            ("solver.name=gradient_descent", "solver.name"),
             ("integrator=rk4", "integrator is"),
             ("device=tpu", "device is"),
             ("dtype=float16", "dtype is"),

@@ -61,8 +61,8 @@ from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions
 from .report.control_section import controller_name
 from .report.page import number_text
-from .settings.body import MeshSettings
 from .settings.control import ControlSettings, FigureSettings
+from .settings.mesh import MeshSettings
 from .settings.run import RunSettings
 from .settings.stages import (
     BaselinesStage,

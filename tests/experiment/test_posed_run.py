@@ -13,7 +13,8 @@ from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
-from warp_resphys.settings.body import FileMesh, GeneratedArm, HexahedralBox, MaterialSettings, RodMesh
+from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
 from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa

@@ -18,7 +18,7 @@ from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
-from warp_resphys.settings.body import MeshGroup
+from warp_resphys.settings.mesh import MeshGroup
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
 SHAPES = [

@@ -74,6 +74,12 @@ class EnergySet:
             self.counts |= dict.fromkeys([*parameters, *inputs], energy.count)
             self.parts |= dict.fromkeys(parameters, energy.names) if energy.names else {}
             self.memory |= item.named({m.name: replace(m, name=f"{item.prefix}{m.name}") for m in bound.memory})
+        pairs = list(enumerate(self._pairs))
+        self._loading, self._stepping = (
+            [(i, pair) for i, pair in pairs if getattr(type(pair[1]), name) is not getattr(BoundEnergy, name)]
+            for name in ("load", "begin_step")
+        )
+        self._remembering = [(i, pair) for i, pair in pairs if pair[1].memory]
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
         """Returns the values that follow from the parameters, by name, and the mass of the body."""
@@ -100,7 +106,7 @@ class EnergySet:
 
     def loads(self, constants: Constants, inputs: Inputs, batch: int, static: bool) -> Iterator[torch.Tensor]:
         """Yields dead loads (1 or B, N, 3), independent of the positions [N]."""
-        for placed, bound in self._pairs:
+        for _, (placed, bound) in self._loading:
             load = bound.load(placed.own_inputs(inputs), placed.own_constants(constants), batch, static)
             if load is not None:
                 yield load
@@ -110,8 +116,8 @@ class EnergySet:
     ) -> dict[str, torch.Tensor | None]:
         """Returns the values that depend on the step, by name."""
         values: dict[str, torch.Tensor | None] = {}
-        for (placed, bound), term in zip(self._pairs, terms, strict=True):
-            values |= placed.named(bound.begin_step(placed.step(state, stage, inputs, constants, term)))
+        for i, (placed, bound) in self._stepping:
+            values |= placed.named(bound.begin_step(placed.step(state, stage, inputs, constants, terms[i])))
         return values
 
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
@@ -130,8 +136,8 @@ class EnergySet:
     ) -> dict[str, torch.Tensor]:
         """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each."""
         memory: dict[str, torch.Tensor] = {}
-        for (placed, bound), term in zip(self._pairs, terms, strict=True):
-            memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, term), x, q))
+        for i, (placed, bound) in self._remembering:
+            memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, terms[i]), x, q))
         return memory
 
     def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:

@@ -64,8 +64,8 @@ class PotentialTerms:
             values[name] = torch.zeros_like(value)
         target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
         inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
-        dependent = self._coordinates.dependent
-        if len(dependent):
+        if self._coordinates.depends:
+            dependent = self._coordinates.dependent
             values[f"{DEPENDENT}inertia"] = inertia[:, dependent]
             values[f"{DEPENDENT}target"] = target[:, dependent]
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)

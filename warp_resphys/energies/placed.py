@@ -51,7 +51,7 @@ class PlacedEnergy:
 
     def named(self, values: Mapping[str, T]) -> dict[str, T]:
         """Renames values from the energy's names to names in the simulator."""
-        return {f"{self.prefix}{name}": value for name, value in values.items()}
+        return {f"{self.prefix}{name}": value for name, value in values.items()} if self.prefix else dict(values)
 
     def own(self, values: Mapping[str, T]) -> Mapping[str, T]:
         """Selects the values of the energy, and renames them from names in the simulator to its own names."""

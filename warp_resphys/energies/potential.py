@@ -161,7 +161,7 @@ class IncrementalPotential(Launcher):
     def _projections(self, residual: Any) -> list[Any]:
         """Returns the launch that removes the residual normal to symmetry planes, if there are any."""
         c = self.coordinates
-        if not len(c.sliding):
+        if not c.slides:
             return []
         planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
         return [self.record(kernels.project, (self.batch, len(c.sliding)), planes, [residual])]
@@ -175,7 +175,7 @@ class IncrementalPotential(Launcher):
         """Copies a step's terms into the buffers, with zero inertia and load at fixed vertices."""
         own = self.terms
         own.target.copy_(terms.target.detach())
-        if len(self.coordinates.sliding):
+        if self.coordinates.slides:
             own.target.copy_(self.coordinates.hold(own.target))
         torch.mul(terms.inertia.detach(), self.free_mask, out=own.inertia)
         torch.mul(terms.force.detach(), self.free_mask[:, None], out=own.force)
@@ -183,10 +183,10 @@ class IncrementalPotential(Launcher):
             value = terms.values[name]
             if value is not None and buffer is not None:
                 buffer.copy_(value.detach())
-        self.stiffness.zero_()
-        for term, values in zip(self.energies, self.own_values, strict=True):
-            if (total := term.total_stiffness(values)) is not None:
-                self.stiffness += total
+        totals = [term.total_stiffness(values) for term, values in zip(self.energies, self.own_values, strict=True)]
+        given = [total for total in totals if total is not None]
+        if given:
+            self.stiffness.copy_(given[0] if len(given) == 1 else torch.stack(given).sum(0))
 
     @property
     def force(self) -> torch.Tensor:
@@ -222,7 +222,7 @@ class IncrementalPotential(Launcher):
         parts = (term.low_rank(values, self._position_view) for term, values in pairs)
         columns = [part for part in parts if part is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
-        if self.low_rank is not None and len(self.coordinates.sliding):
+        if self.low_rank is not None and self.coordinates.slides:
             whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 

@@ -247,7 +247,7 @@ class SolidTerm(Term):
 
     @override
     def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        return value_of(values, "stiffness")[..., self._stiff].flatten(1).sum(1)
+        return value_of(values, "stiffness")[..., self._stiff].sum((1, 2))
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:

@@ -20,7 +20,8 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
-from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, PlaceSettings, TendonSettings
+from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
+from ..settings.mesh import PlaceSettings
 from ..settings.stages import PlayedSettings
 from ..stepping.quantity import Quantity
 

@@ -34,19 +34,17 @@ from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, q
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
-from ..settings.body import (
-    BodySettings,
+from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
+from ..settings.mesh import (
     BoxesMesh,
     FileMesh,
     GeneratedArm,
     HexahedralBox,
-    MaterialSettings,
     MeshGroup,
     MeshSettings,
     PlaceSettings,
     RodMesh,
     ShippedArm,
-    SimulatorSettings,
     SurfaceMesh,
     SymmetrySettings,
     TetrahedralBox,

@@ -25,8 +25,8 @@ from ..io.memory import available_memory_gib
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
-from ..settings.body import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.learning import IdentifySettings
+from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
 from ..settings.trials import MarkerSettings, RecordedData, Trial

@@ -17,7 +17,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
-from ..settings.body import PlaceSettings
+from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
 from .actuators import DRIVING_QUANTITIES
 

@@ -16,7 +16,7 @@ from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
-from ..settings.body import PlaceSettings
+from ..settings.mesh import PlaceSettings
 from ..settings.stages import SimulateStage
 from ..settings.trials import BaseMotion, MotionSettings, MovingBase, ReleaseFromTwist, SimulatedData, Trial
 from ..stepping.inputs import Inputs

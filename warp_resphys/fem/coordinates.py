@@ -177,6 +177,8 @@ class DeviceCoordinates:
         dependent: (S,) vertices determined by control vertices.
         sliding: (R,) control vertices in symmetry planes.
         projections: (R, 3, 3) projections onto the directions along these planes.
+        depends: whether there are dependent vertices.
+        slides: whether there are sliding vertices.
     """
 
     def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
@@ -187,6 +189,7 @@ class DeviceCoordinates:
         weights = torch.sparse_coo_tensor(indices, values, matrix.shape, check_invariants=False)
         self._weights = weights.to(device=like.device, dtype=like.dtype).coalesce()  # (S, N)
         self._transposed = self._weights.mT.coalesce()
+        self.depends, self.slides = len(coordinates.dependent) > 0, len(coordinates.sliding) > 0
         self.sliding = torch.as_tensor(coordinates.sliding, device=like.device)
         self.projections, self._offsets = (
             torch.as_tensor(values).to(like) for values in (coordinates.projections, coordinates.offsets)
@@ -200,27 +203,27 @@ class DeviceCoordinates:
 
     def expand(self, r: torch.Tensor) -> torch.Tensor:
         """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
-        if not len(self.dependent):
+        if not self.depends:
             return r
         kept = r.index_fill(1, self.dependent, 0.0)
         return r.index_copy(1, self.dependent, self._times(self._weights, kept))
 
     def hold(self, r: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P r + o."""
-        if not len(self.sliding):
+        if not self.slides:
             return r
         return r.index_copy(1, self.sliding, self._project(r) + self._offsets)
 
     def restrict(self, field: torch.Tensor) -> torch.Tensor:
         """Returns forces or displacements (B, N, 3, ...) of control vertices, without those normal to planes, P f."""
-        return field.index_copy(1, self.sliding, self._project(field)) if len(self.sliding) else field
+        return field.index_copy(1, self.sliding, self._project(field)) if self.slides else field
 
     def _project(self, field: torch.Tensor) -> torch.Tensor:
         return torch.einsum("rij,brj...->bri...", self.projections, field.index_select(1, self.sliding))
 
     def reduce(self, forces: torch.Tensor) -> torch.Tensor:
         """Returns P W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
-        if not len(self.dependent):
+        if not self.depends:
             return self.restrict(forces)
         on_controls = self._times(self._transposed, forces.index_select(1, self.dependent))
         return self.restrict(forces.index_fill(1, self.dependent, 0.0) + on_controls)

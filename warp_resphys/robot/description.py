@@ -23,7 +23,8 @@ from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.predictors import Range
 from ..mesh.mesh import Mesh
-from ..settings.body import MaterialSettings, PlaceSettings, SimulatorSettings
+from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.mesh import PlaceSettings
 from ..settings.run import models_of
 from ..settings.stages import EvaluateStage
 from ..settings.trials import MarkerSettings

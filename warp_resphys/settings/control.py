@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
-from .body import Direction
+from .mesh import Direction
 from .trials import different
 
 Model = Literal["published", "simulation", "sysid_elastic", "sysid", "simfree", "resphys_uncorrected", "resphys"]

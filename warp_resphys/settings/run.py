@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from ..io.settings import Natural, Settings, Word, parse, setting
-from .body import Integrator, MaterialSettings, PhysicsSettings, PlaceSettings, SimulatorSettings
+from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings
 from .control import ControlSettings, Model
 from .learning import (
     AblationSettings,
@@ -25,6 +25,7 @@ from .learning import (
     TrainerSettings,
     TrainingSettings,
 )
+from .mesh import PlaceSettings
 from .trials import (
     BindingSettings,
     DataSettings,

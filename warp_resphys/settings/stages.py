@@ -10,14 +10,12 @@ from pydantic import Field
 
 from ..io.settings import Many, Settings, Vector
 from .body import (
-    BoxSettings,
     ChamberSettings,
     GlueSettings,
     MaterialSettings,
     MediumSettings,
     MuscleSettings,
     PartSettings,
-    PlaceSettings,
     RigidSettings,
     SimulatorSettings,
     SolveSettings,
@@ -34,6 +32,7 @@ from .learning import (
     ReleaseSettings,
     TrainingSettings,
 )
+from .mesh import BoxSettings, PlaceSettings
 from .run import PublishedSettings, RunSettings
 from .trials import (
     BindingSettings,

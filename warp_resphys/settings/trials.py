@@ -5,16 +5,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
-from .body import (
-    Direction,
-    FibreSettings,
-    Integrator,
-    LengthUnit,
-    MaterialSettings,
-    MeshSettings,
-    PlaceSettings,
-    TimeStep,
-)
+from .body import FibreSettings, Integrator, MaterialSettings, TimeStep
+from .mesh import Direction, LengthUnit, MeshSettings, PlaceSettings
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; a static pose.
 Begins = Literal["held", "released", "rest", "static"]

@@ -27,7 +27,8 @@ from ..io.progress import Progress
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, setting
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
-from ..settings.body import HexahedralBox, MeshSettings, SimulationSettings, TetrahedralBox
+from ..settings.body import SimulationSettings
+from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .run_speed import command_sheet, environment_sheet, time_commands, time_environments

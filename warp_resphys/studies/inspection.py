@@ -9,7 +9,7 @@ from pydantic import model_validator
 from ..data.recordings.reading import READERS
 from ..io.errors import InputError
 from ..io.settings import Many, Positive, Word, setting
-from ..settings.body import MeshSettings, PlaceSettings
+from ..settings.mesh import MeshSettings, PlaceSettings
 from .mesh_inspection import inspect_mesh
 from .recording_quality import RecordingInspection, inspect_recording
 

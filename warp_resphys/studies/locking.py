@@ -31,7 +31,8 @@ from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, quadratic
 from ..mesh.readers import read_mesh
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from ..settings.body import FibreSettings, GeneratedArm, MaterialSettings
+from ..settings.body import FibreSettings, MaterialSettings
+from ..settings.mesh import GeneratedArm
 from ..stepping.inputs import Inputs
 from .beam import ELEMENT_NAMES, Element
 from .tables import Sheet, show, write_csv

@@ -15,7 +15,7 @@ from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_p
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.body_picture import MeshSummary, draw_mesh
-from ..settings.body import FileMesh, GeneratedArm, MeshSettings, PlaceSettings
+from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings
 from .tables import aligned
 
 _MILLI: Final = 1e3

@@ -1,0 +1,176 @@
+"""Settings of meshes, and of places and cells on them."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field
+
+from ..io.settings import Many, Natural, Pair, Positive, Settings, Some, Vector, Word, setting
+
+Divisions = Annotated[int, Field(ge=1, le=10_000)]
+LengthUnit = Literal["m", "cm", "mm"]
+Order = Literal[1, 2]
+Nodes = Literal[8, 20, 27]
+
+
+def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise ValueError("it must be three numbers, not all zero.")
+    return vector
+
+
+def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("it must be two rising numbers, in m.")
+    return pair
+
+
+Direction = Annotated[Vector, AfterValidator(_nonzero)]
+Span = Annotated[Pair[float], AfterValidator(_rising)]
+Curve = Annotated[Many[Vector], Field(min_length=2)]
+
+
+class _Given(Settings):
+    def arguments(self) -> dict[str, Any]:
+        """Returns the keys that are not null, as arguments of a function."""
+        return {key: value for key, value in dict(self).items() if value is not None}
+
+
+class PlaceSettings(_Given):
+    """Vertices on a plane, or between two planes."""
+
+    x: float | Span | None = setting(None, "coordinate, or two between which the vertices lie", "m")
+    y: float | Span | None = setting(None, "coordinate along y, or two", "m")
+    z: float | Span | None = setting(None, "coordinate along z, or two", "m")
+    tolerance: Positive | None = setting(None, "largest distance from the plane; null: 1e-9", "m")
+
+
+class SymmetrySettings(_Given):
+    """Symmetry planes: the mesh is one side of them, and its vertices in a plane only move within it."""
+
+    x: float | None = setting(None, "of the plane normal to x; null: none", "m")
+    y: float | None = setting(None, "of the plane normal to y", "m")
+    z: float | None = setting(None, "of the plane normal to z", "m")
+    tolerance: Positive = setting(1e-9, "largest distance of a vertex in a plane", "m")
+
+
+class BoxSettings(_Given):
+    """Cells with their centres in a box."""
+
+    x: Span | None = setting(None, "lowest and highest x; null: any", "m")
+    y: Span | None = setting(None, "lowest and highest y", "m")
+    z: Span | None = setting(None, "lowest and highest z", "m")
+
+
+class HexahedralBox(Settings):
+    """A box of hexahedra."""
+
+    kind: Literal["box_hexahedra"]
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
+        description="cells along each edge"
+    )
+    nodes: Nodes = setting(8, "nodes of a cell: 8, or quadratic with 20 or 27")
+
+
+class TetrahedralBox(Settings):
+    """A box of tetrahedra, six in each of its cells."""
+
+    kind: Literal["box_tetrahedra"]
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
+        description="cells along each edge"
+    )
+    order: Order = setting(1, "2 adds edge midpoints, without which tetrahedra bend far too stiffly")
+
+
+class BoxesMesh(Settings):
+    """A body of axis-aligned boxes that touch or overlap, of hexahedra."""
+
+    kind: Literal["boxes"]
+    boxes: Some[Pair[Vector]] = setting(description="lowest and highest corner of each box", unit="m")
+    size: Positive = setting(0.01, "longest edge of a cell", "m")
+    nodes: Nodes = setting(8, "nodes of a cell")
+
+
+class FileMesh(Settings):
+    """A tetrahedral or hexahedral mesh from a file that meshio reads."""
+
+    kind: Literal["file"]
+    path: Word = setting(description="of the file")
+    units: LengthUnit = setting("m", "of the file")
+    order: Order = setting(1, "2 adds edge midpoints to linear tetrahedra")
+    drop_unreferenced: bool = setting(False, "leave out vertices that belong to no cell")
+
+
+class SurfaceMesh(Settings):
+    """The interior of a closed surface of triangles, filled with tetrahedra; closed surfaces inside it are cavities."""
+
+    kind: Literal["surface"]
+    path: Word = setting(description="of an STL, OBJ or PLY file")
+    units: LengthUnit = setting("mm", "of the file")
+    size: Positive = setting(0.01, "length of the edges of tetrahedra", "m")
+    order: Order = setting(2, "1: linear tetrahedra, which bend far too stiffly")
+
+
+class RodMesh(Settings):
+    """A round or elliptic rod of hexahedra."""
+
+    kind: Literal["rod"]
+    centreline: Curve = setting(description="points of its axis", unit="m")
+    radii: Positive | Some[Annotated[Many[float], Field(min_length=2, max_length=3)]] = setting(
+        description="one radius, or arc lengths with the radius there, linear in between; two radii for an ellipse: "
+        "along the axis that is most perpendicular to the rod at its start (the first of x, y and z), and across it",
+        unit="m",
+    )
+    layers: Divisions = setting(10, "cells along the axis")
+    core: Divisions = setting(1, "cells along a side of the core of the cross-section")
+    rings: Divisions = setting(1, "rings of cells around the core")
+    nodes: Nodes = setting(27, "nodes of a cell")
+    grading: Annotated[float, Field(ge=0.0, le=1.0)] = setting(
+        0.0, "from 0, layers of equal length, to 1, layers with lengths proportional to the radius"
+    )
+
+
+class ShippedArm(Settings):
+    """One of the arms with six chambers of the package."""
+
+    kind: Literal["arm"]
+    name: Word = setting(description="of the arm, such as arm_hexahedra_1400")
+
+
+class GeneratedArm(Settings):
+    """A pneumatic arm of given dimensions, by default those of SoPrA."""
+
+    kind: Literal["arm_generated"]
+    size: Positive = setting(0.01, "of the cells", "m")
+    cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
+    layers: Positive | None = setting(None, "length of hexahedra along the arm; null: 2.5 times the size", "m")
+    order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
+    chamber_lengths: Some[Positive] = setting((0.120, 0.120), "of the chambers of each segment", "m")
+    caps: Some[Positive] = setting((0.010, 0.021, 0.005), "solid parts before, between and after the chambers", "m")
+    radii: Some[Positive] = setting(
+        (0.0283923, 0.0212942, 0.0165622), "before the first chambers and after those of each segment", "m"
+    )
+    chambers: Natural = setting(3, "of each segment")
+    profile: Word = setting("half_disc", "half_disc, disc or sector")
+    outline: Word = setting("lobed", "lobed, around the chambers, or round")
+    wall: Positive = setting(0.004, "thickness of the wall", "m")
+    web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
+    core: Positive | None = setting(
+        None, "distance of the chambers from the axis, at the base; null: the least for the webs", "m"
+    )
+    rotations: Many[float] = setting(
+        (), "of the chambers of each segment about the axis; for tetrahedra and a round outline", "degrees"
+    )
+
+
+MeshSettings = Annotated[
+    HexahedralBox | TetrahedralBox | BoxesMesh | FileMesh | SurfaceMesh | RodMesh | ShippedArm | GeneratedArm,
+    Field(discriminator="kind"),
+]
+
+
+class MeshGroup(Settings):
+    """A mesh alone."""
+
+    mesh: MeshSettings

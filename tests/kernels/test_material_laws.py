@@ -121,6 +121,18 @@ def test_mooney_rivlin_rubber_is_the_closed_form():
     np.testing.assert_allclose(response("mooney_rivlin")[0], moduli @ np.stack(terms), rtol=1e-10, atol=1e-12)
 
 
+def test_gents_rubber_is_the_closed_form():
+    """With the parabola that continues the logarithm beyond 95 % of the limit."""
+    limit = LAWS["gent"][1][5]
+    change = np.linalg.det(GRADIENTS) - 1.0
+    x = (np.square(GRADIENTS).sum((1, 2)) - 3.0 - 2.0 * change + change**2) / limit
+    inside = np.minimum(x, 0.95)
+    beyond = (x - inside) / 0.05
+    shape = 0.5 * MU * limit * (beyond + 0.5 * beyond**2 - np.log(1.0 - inside))
+    expected = shape + 0.5 * (BULK - 2.0 / 3.0 * MU) * change**2
+    np.testing.assert_allclose(response("gent")[0], expected, rtol=1e-11, atol=1e-13)
+
+
 def test_a_bar_of_rubber_that_is_stretched():
     """At constant volume its nominal stress is 2 (l - l^-2) (c10 + c01 / l) at the stretch l (Rivlin 1948)."""
     stretch = np.linspace(0.5, 3.0, len(GRADIENTS))

@@ -7,8 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from support.main_job import IN_RUN, TINY, files, run
-from warp_resphys import pipeline
+from support.main_job import IN_RUN, TINY, files, run, without_reports
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, render
 
@@ -68,10 +67,9 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def no_report(monkeypatch):
-    """Replaces the report, which takes most of a tiny run's time and has tests of its own."""
-    for name in ("make_report", "make_folds_report"):
-        monkeypatch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
+def no_report():
+    with without_reports():
+        yield
 
 
 @pytest.fixture(scope="session")

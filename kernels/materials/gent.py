@@ -6,6 +6,7 @@ limit for large J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu
 
 import warp as wp
 
+TWO_THIRDS = wp.constant(wp.float64(2.0 / 3.0))  # in a function it would be divided in single precision
 ROOM = wp.constant(wp.float64(0.95))  # fraction of the limit above which the energy is extrapolated
 
 
@@ -24,4 +25,4 @@ def energy_density(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
 def volume_energy(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
     """Lambda / 2 (J - 1)^2."""
     change = wp.determinant(f) - wp.float64(1.0)
-    return wp.float64(0.5) * (p[2] - wp.float64(2.0 / 3.0) * p[0]) * change * change
+    return wp.float64(0.5) * (p[2] - TWO_THIRDS * p[0]) * change * change

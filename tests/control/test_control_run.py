@@ -287,9 +287,8 @@ class TestDriving:
         assert said in err
         assert err.count("\n") == 1
 
-    def test_a_new_horizon_drives_again_but_plans_nothing_again(self, folder, monkeypatch):
+    def test_a_new_horizon_drives_again_but_plans_nothing_again(self, folder, monkeypatch, no_report):
         monkeypatch.chdir(folder.parent)
-        monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
         record = folder / "stages" / "plan_resphys.json"
         before, driven = record.stat().st_mtime_ns, []
 

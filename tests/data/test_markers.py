@@ -190,7 +190,7 @@ def test_the_derivative_of_linear_ones_is_their_weights():
 def test_bad_markers(settings, sentence):
     with pytest.raises(InputError) as error:
         bind_markers(MESH, **{"positions": POINTS, "names": NAMES, **settings})
-    assert str(error.value).startswith(sentence)
+    assert sentence in str(error.value)
 
 
 def test_a_map_of_one_environment_serves_a_batch():

@@ -33,7 +33,7 @@ def test_two_coefficients_and_a_bulk_modulus_are_mooney_rivlin():
 
 @pytest.mark.parametrize("pose", POSES)
 def test_gradients_by_every_coefficient_and_direction(pose):
-    terms = {"c20": 20e3, "c30": 10e3, "c01": C01, "c02": 5e3, "dilation": 10e3, "bulk_1": 1e6, "bulk_2": 1e6}
+    terms = {"c20": 20e3, "c30": 10e3, "c01": C01, "c02": 5e3, "dilation": 10e3, "bulk_1": 1e6, "bulk_2": 1e9}
     material = ConvexMaterial(C10, **terms, fibres=FIBRES, mass_damping=0.5, stiffness_damping=1e-3)
     rows = {row.parameter: row for row in check_gradients(simulator(material), pose)}
     assert {"c02", "bulk_1", "fibre_1_azimuth", "fibre_2_tension, each element"} <= rows.keys()

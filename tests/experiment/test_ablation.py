@@ -230,10 +230,7 @@ def test_the_published_method_gives_the_same_errors(folder):
     [
         ("ablation.counts=[1,43]", "ablation.counts"),
         ("ablation.counts=[]", "ablation.counts"),
-        ("ablation.counts=[0]", "ablation.counts"),
         ("ablation.counts=[2,2]", "ablation.counts"),
-        ("ablation.counts=4", "ablation.counts is 4: it must be a list"),
-        ("ablation.counts=[1.5]", "ablation.counts"),
         ("ablation.draws=0", "ablation.draws"),
         ("ablation.modes=-1", "ablation.modes"),
         ("ablation.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),

@@ -66,9 +66,6 @@ def test_material(constants, message):
         ({"time_step": -0.01}, "time_step is -0.01: it must be positive"),
         ({"time_step": NAN}, "time_step is nan"),
         ({"time_step": INF}, "time_step is inf"),
-        ({"integrator": "euler"}, "integrator is"),
-        ({"solver": "gauss"}, "solver is"),
-        ({"relative_tolerance": 0.0}, "solver.relative_tolerance"),
         ({"dtype": torch.float16}, "torch.float16"),
     ],
 )
@@ -114,11 +111,6 @@ def test_body(options, message):
 def test_point_mass(mass, message):
     with refused(message):
         Simulator(Body(MESH, point_masses=[mass]))
-
-
-def test_volume_integration():
-    with refused("volume_integration is 'reduced': choose one of centre, full"):
-        Simulator(Body(MESH, volume_integration="reduced"))
 
 
 def arguments(simulator):

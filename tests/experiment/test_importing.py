@@ -3,7 +3,6 @@
 import json
 import logging
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from support.command_line import refusal
 from support.configured import check, settings
-from warp_resphys import cli
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
@@ -533,12 +532,7 @@ class TestCommand:
             trials = [f"++data.trials.{name}={{file: {name}.h5, payload: 0.0}}" for name in shelf.recordings]
             quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
             places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
-            arguments = ["warp-resphys", "experiment=beam_real", *places, *quiet, *trials, *overrides]
-            monkeypatch.setattr(sys, "argv", arguments)
-            with pytest.raises(SystemExit) as ended:
-                cli.main()
-            err = capsys.readouterr().err
-            assert ended.value.code == 2
+            err = refusal("experiment=beam_real", *places, *quiet, *trials, *overrides)
             assert "Traceback" not in err
             return err
 

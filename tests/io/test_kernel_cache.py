@@ -1,7 +1,5 @@
 """Warp's cache of compiled kernels if it is not writable, as in many containers."""
 
-import atexit
-import errno
 import os
 import subprocess
 import sys
@@ -9,10 +7,6 @@ import tempfile
 from pathlib import Path
 
 import pytest
-import warp as wp
-
-from warp_resphys.io.errors import InputError
-from warp_resphys.io.kernel_cache import ensure_kernel_cache
 
 PROGRAM = """
 import subprocess, sys
@@ -55,33 +49,38 @@ def test_a_cache_that_cannot_be_made_is_a_temporary_one(name, tmp_path):
     assert "Traceback" not in run.stderr
 
 
-@pytest.fixture
-def read_only(tmp_path, monkeypatch):
-    """A cache with kernels, in which no file can be made."""
-    kernels = tmp_path / "cache" / wp.config.version / "wp_warp_resphys.float64_0"
-    kernels.mkdir(parents=True)
-    (kernels / "kernels.o").write_text("compiled")
-    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "cache"))
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", None)
-    monkeypatch.setattr(atexit, "register", lambda *_, **__: None)
+READ_ONLY = """
+import errno, os, sys, tempfile
+from pathlib import Path
+import warp as wp
+from warp_resphys.io.kernel_cache import ensure_kernel_cache
 
-    def refuse(*_, **__):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+def refuse(*_, **__):
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    return kernels
-
-
-def test_kernels_of_a_cache_that_can_only_be_read_are_used(read_only, capfd):
-    ensure_kernel_cache()
-    assert "Read-only file system" in capfd.readouterr().err
-    copies = Path(wp.config.kernel_cache_dir, wp.config.version, read_only.name)
-    assert (copies / "kernels.o").read_text() == "compiled"
-    assert os.environ["WARP_CACHE_PATH"] == wp.config.kernel_cache_dir
+tempfile.TemporaryFile, tempfile.tempdir = refuse, sys.argv[1]
+kernels = Path(os.environ["WARP_CACHE_PATH"], wp.config.version, "wp_warp_resphys.float64_0")
+kernels.mkdir(parents=True)
+(kernels / "kernels.o").write_text("compiled")
+ensure_kernel_cache()
+assert os.environ["WARP_CACHE_PATH"] == wp.config.kernel_cache_dir
+print(Path(wp.config.kernel_cache_dir, wp.config.version, kernels.name, "kernels.o").read_text())
+"""
 
 
-def test_without_any_writable_folder_it_is_an_error(read_only, monkeypatch, tmp_path):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
-    with pytest.raises(InputError, match="set WARP_CACHE_PATH"):
-        ensure_kernel_cache()
+def in_a_read_only_cache(tmp_path, temporary):
+    """Output and errors of a process in whose cache no file can be made."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", READ_ONLY, str(temporary)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return done.stdout, done.stderr
+
+
+def test_kernels_of_a_cache_that_can_only_be_read_are_used(tmp_path):
+    out, err = in_a_read_only_cache(tmp_path, tmp_path)
+    assert out == "compiled\n"
+    assert "Read-only file system" in err
+
+
+def test_without_any_writable_folder_it_is_an_error(tmp_path):
+    assert "InputError: Warp's cache" in in_a_read_only_cache(tmp_path, tmp_path / "nowhere")[1]

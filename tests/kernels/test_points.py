@@ -7,10 +7,8 @@ import warp as wp
 
 from warp_resphys.kernels.point_inertia import local_step, slopes
 from warp_resphys.kernels.points import (
-    deformation_gradient,
     gather_cells,
     gather_kernels,
-    green_strain,
     line_tangent_product,
     tangent_product,
 )
@@ -72,26 +70,6 @@ def test_the_product_with_a_tangent(width):
     launch(kernel, (B, points), array(CELL_NODES.astype(np.int32), int), *fields)
     expected = np.einsum("bpkinj,bpjn->bpik", whole, seen(operators, field))
     np.testing.assert_allclose(out.numpy(), expected.squeeze(), atol=1e-12)
-
-
-@wp.kernel
-def strains(
-    positions: wp.array2d[wp.vec3d],
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    strain_out: wp.array2d[wp.mat33d],
-):
-    b, p = wp.tid()
-    strain_out[b, p] = green_strain(deformation_gradient(positions, nodes, gradients, b, p, p / POINTS))
-
-
-def test_green_strain():
-    operators, field = RANDOM.normal(size=(CELLS * POINTS, NODES, 3)), RANDOM.normal(size=(B, N, 3))
-    out = wp.zeros((B, CELLS * POINTS), dtype=MAT, device="cpu")
-    nodes = array(CELL_NODES.astype(np.int32), int)
-    launch(strains, out.shape, array(field, VEC), nodes, array(operators, VEC), out)
-    f = seen(operators, field)
-    np.testing.assert_allclose(out.numpy(), 0.5 * (f.swapaxes(2, 3) @ f - np.eye(3)), atol=1e-12)
 
 
 def test_inertia_of_points():

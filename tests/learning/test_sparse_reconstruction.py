@@ -19,8 +19,8 @@ INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 TIGHT = {"tolerance": 1e-12, "max_iterations": 40}
 
 
-def simulator(youngs_modulus=215e3, poissons_ratio=0.45, **settings):
-    return Simulator(BODY, Corotated(youngs_modulus, poissons_ratio), **{"relative_tolerance": 1e-11, **settings})
+def simulator(youngs_modulus=215e3, poissons_ratio=0.45, kind=Simulator, **settings):
+    return kind(BODY, Corotated(youngs_modulus, poissons_ratio), **{"relative_tolerance": 1e-11, **settings})
 
 
 def observation(steps=1, weights=(0.1,), **settings):
@@ -236,30 +236,29 @@ class TestLevenbergMarquardt:
         assert "damped ones follow" in caplog.text
         np.testing.assert_array_equal(result.force, damped.force)
 
-    def test_a_first_guess_that_fails_is_dropped(self, monkeypatch):
+    def test_a_first_guess_that_fails_is_dropped(self):
         observed, start = observation()
-        sim, markers = simulator(), markers_at([8])
-        solver = levenberg_marquardt(sim, markers, 1e-6, **TIGHT)
+        markers = markers_at([8])
+
+        class Fragile(Simulator):
+            def step(self, state, inputs=None, parameters=None):
+                if float(inputs.external_force.abs().max()) > 50.0:
+                    raise ConvergenceError("too much", state.q, None)
+                return super().step(state, inputs, parameters)
+
+        solver = levenberg_marquardt(simulator(kind=Fragile), markers, 1e-6, **TIGHT)
         expected = solver.step(start, markers(observed[1]))
-        step = Simulator.step
-
-        def fragile(self, state, inputs, parameters):
-            if float(inputs.external_force.abs().max()) > 50.0:
-                raise ConvergenceError("too much", state.q, None)
-            return step(self, state, inputs, parameters)
-
-        monkeypatch.setattr(Simulator, "step", fragile)
         result = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))
         np.testing.assert_allclose(result.force, expected.force, rtol=0, atol=1e-9)
 
-    def test_an_unreachable_target_is_an_error(self, monkeypatch):
+    def test_an_unreachable_target_is_an_error(self):
         observed, start = observation()
-        solver = levenberg_marquardt(simulator(), markers_at([8]), 1e-6, 1e-6, 5)
 
-        def failing(*_, **__):
-            raise ConvergenceError("no", start.q, None)
+        class Failing(Simulator):
+            def step(self, *_):
+                raise ConvergenceError("no", start.q, None)
 
-        monkeypatch.setattr(Simulator, "step", failing)
+        solver = levenberg_marquardt(simulator(kind=Failing), markers_at([8]), 1e-6, 1e-6, 5)
         with pytest.raises(ConvergenceError, match=r"reconstruction\.regularisation"):
             solver.step(start, solver.observation(observed[1]))
 
@@ -305,4 +304,4 @@ def test_bad_settings(settings, sentence):
     good = {"markers": markers_at([8]), "method": "gauss_newton", "regularisation": 1e-6, **TIGHT}
     with pytest.raises(InputError) as error:
         make_sparse_reconstructor(simulator(), **{**good, **settings})
-    assert str(error.value).startswith(sentence)
+    assert sentence in str(error.value)

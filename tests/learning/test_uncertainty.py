@@ -42,15 +42,3 @@ def test_correlated_frames_are_worth_fewer(correlation):
     same = [(rows, np.ones((rows.size, 1)), rows.size)]
     deviation = uncertainty_of(same, np.zeros((1, 1)), 1.0, {"a": BOUNDS["stiffness"]}, UNIT[:1]).deviation["a"]
     assert deviation == pytest.approx(2.0 * np.sqrt(expected / rows.size), rel=0.1)
-
-
-def test_a_prior_narrows_what_the_trials_leave_open():
-    rows = 0.1 * series(0.0, (200, 3))
-    jacobian = np.column_stack([np.ones(rows.size), np.full(rows.size, 1e-6)])
-    results = [
-        uncertainty_of([(rows, jacobian, rows.size)], np.array([[0.0, weight]]), 1.0, BOUNDS, UNIT)
-        for weight in (1.0, 10.0)
-    ]
-    wide, narrow = (result.poorest_deviation for result in results)
-    assert (wide, narrow) == pytest.approx((1.0, 0.1), rel=1e-3)
-    assert list(results[0].poorest.values()) == pytest.approx([0.0, 1.0], abs=1e-5)

@@ -8,6 +8,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.linalg.banded import BandedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.dense import DenseSolver
+from warp_resphys.linalg.sparse import SparseSolver
 from warp_resphys.linalg.tiled import TiledSolver
 
 CPU = torch.device("cpu")
@@ -19,7 +20,9 @@ def chain(count):
     return np.concatenate([nodes, nodes[1:]]), np.concatenate([nodes, nodes[:-1]])
 
 
-@pytest.mark.parametrize(("name", "kind"), [("auto", BandedSolver), ("dense", DenseSolver), ("tiled", TiledSolver)])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("auto", BandedSolver), ("dense", DenseSolver), ("sparse", SparseSolver), ("tiled", TiledSolver)]
+)
 def test_a_chain_is_solved_by_every_choice(name, kind):
     rows, cols = chain(40)
     solver = make_linear_solver(name, rows, cols, 40, 1, CPU, torch.float64)

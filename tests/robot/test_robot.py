@@ -1,6 +1,5 @@
 """A finished run as a robot: it does what the evaluation did, by names, with gradients, and from one file."""
 
-import contextlib
 import json
 import re
 import shutil
@@ -13,10 +12,9 @@ import torch
 
 import warp_resphys
 from support.damage import flip_bit
-from support.main_job import IN_RUN, run
+from support.main_job import IN_RUN, run_without_report
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
-from warp_resphys import pipeline
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.robot.program import condition_names, export_network
@@ -50,12 +48,7 @@ HIGH = 6e3  # Pa
 def made(folder, *overrides):
     place_segment(folder)
     (folder / "configs" / "experiment" / "unknown_pressures.yaml").write_text(SEGMENT)
-    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
-        for name in ("make_report", "make_folds_report"):
-            patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
-        code, err = run(*COMMAND, *overrides)
-    assert (code, err[-600:] if code else "") == (0, "")
-    return folder / "run"
+    return run_without_report(folder, *COMMAND, *overrides)
 
 
 @pytest.fixture(scope="module")

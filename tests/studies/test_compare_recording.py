@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from support.command_line import refusal, settings_of
 from support.sentences import offending
+from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.settings import parse
-from warp_resphys.studies import recording_comparison
 from warp_resphys.studies.recording_comparison import (
     ComparisonSettings,
     NominalMarker,
@@ -142,16 +142,17 @@ def test_markers_in_the_wrong_order_are_noticed():
         swing_of(recording, swapped, largest_residual=4e-3)
 
 
-def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch):
+def test_comparison_of_a_simulation_with_its_own_recording(tmp_path):
     """Release, registration, binding and estimators leave nothing of their own: the two swings are one."""
-    config = configured("recording.path=swing.c3d", "simulation.time_step=0.01", "comparison.tail_seconds=0.5")
+    path, folder = tmp_path / "swing.h5", tmp_path / "page"
+    config = configured(f"recording.path={path}", "simulation.time_step=0.01", "comparison.tail_seconds=0.5")
     tip = np.array([marker.position for marker in TIP])
     truth = simulate_swing(config, tip, 2.2)
     recording = recorded(truth.displacement, release=50)
     labels = [marker.name for marker in (*config.markers.tip, *config.markers.base)]
-    recording = Recording(tuple(labels), recording.positions, 100.0, recording.source)
-    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: recording)
-    result = compare_recording(config, tmp_path)
+    write_recording(path, Recording(tuple(labels), recording.positions, 100.0, path))
+    folder.mkdir()
+    result = compare_recording(config, folder)
     assert result["release_frame"] == pytest.approx(50.0, abs=0.3)
     difference = result["relative_difference"]
     assert difference["sag"] == pytest.approx(0.0, abs=2e-3)
@@ -159,23 +160,23 @@ def test_comparison_of_a_simulation_with_its_own_recording(tmp_path, monkeypatch
     assert difference["decay_rate"] == pytest.approx(0.0, abs=2e-2)
     assert result["marker_error_mm"] < 0.4
     assert result["simulated"]["sag_mm"] == pytest.approx(-6.42, abs=0.03)
-    written = json.loads((tmp_path / "comparison.json").read_text())
+    written = json.loads((folder / "comparison.json").read_text())
     assert written["relative_difference"] == difference
     assert parse(ComparisonSettings, written["config"]) == config
-    assert (tmp_path / "comparison.png").read_bytes().startswith(b"\x89PNG")
-    assert len(list(tmp_path.iterdir())) == 2
+    assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
+    assert len(list(folder.iterdir())) == 2
 
 
-def test_a_recording_in_which_nothing_moves_or_with_pressures_is_refused(tmp_path, monkeypatch):
-    config = configured("recording.path=swing.c3d", "recording.release_frame=50")
+def test_a_recording_in_which_nothing_moves_or_with_pressures_is_refused(tmp_path):
+    path = tmp_path / "swing.h5"
+    config = configured(f"recording.path={path}", "recording.release_frame=50")
     labels = tuple(marker.name for marker in (*config.markers.tip, *config.markers.base))
-    still = Recording(labels, recorded(np.zeros((200, 3, 3)), release=50).positions, 100.0, Path("swing.c3d"))
-    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: still)
-    with pytest.raises(DataFileError, match=r"swing\.c3d: 'Tip - 1', .* never move by more than"):
+    still = Recording(labels, recorded(np.zeros((200, 3, 3)), release=50).positions, 100.0, path)
+    write_recording(path, still)
+    with pytest.raises(DataFileError, match=r"swing\.h5: 'Tip - 1', .* never move by more than"):
         compare_recording(config, tmp_path)
-    driven = dataclasses.replace(still, actuation=np.zeros((len(still.positions), 1)))
-    monkeypatch.setattr(recording_comparison, "read_recording", lambda path: driven)
-    with pytest.raises(DataFileError, match=r"swing\.c3d holds an actuation, 1 in each frame, which nothing here"):
+    write_recording(path, dataclasses.replace(still, actuation=np.zeros((len(still.positions), 1))))
+    with pytest.raises(DataFileError, match=r"swing\.h5 holds an actuation, 1 in each frame, which nothing here"):
         compare_recording(config, tmp_path)
 
 

@@ -17,7 +17,6 @@ from optuna.trial import TrialState
 
 from support.configured import settings
 from support.main_job import IN_RUN, TINY, files, run
-from warp_resphys import pipeline
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.errors import InputError
@@ -54,10 +53,9 @@ WIDTHS = {
 
 
 @pytest.fixture
-def no_pictures(monkeypatch):
+def no_pictures(monkeypatch, no_report):
     """Pictures take most of a tiny search's time, and the report of a tiny run's."""
     monkeypatch.setattr(tuning_results, "_write_page", lambda *arguments: None)
-    monkeypatch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
 
 
 def table(folder=FOLDER):
@@ -403,7 +401,7 @@ class TestBadInput:
             ("tune.space.trainer.gamma={low:1.0,high:0.8}", "tune.space.trainer.gamma is "),
             ("tune.space.trainer.gamma={low:0.8,high:1.2}", "tune: trainer.gamma is 1.2"),
             ("tune.space.network.width=[8.5,16]", "tune: network.width is 8.5"),
-            ("+tune.space.network.depth=[1,2]", "'network.depth'"),
+            ("+tune.space.network.depth=[1,2]", "unknown key 'network.depth'"),
             ("+tune.settings.network.width=8", "tune.settings.network.width"),
             ("simfree=3", "simfree is 3"),
             ("+simfree.network.width=-1", "simfree.network.width is -1"),

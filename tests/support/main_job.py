@@ -48,10 +48,18 @@ def end_of(program, *arguments):
     return code, err.getvalue()
 
 
+@contextlib.contextmanager
+def without_reports():
+    """Replaces the reports, which take most of a tiny run's time and have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("make_report", "make_folds_report"):
+            patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
+        yield
+
+
 def run_without_report(place, *arguments):
-    """Runs a command with a stub of the report, and returns its run folder."""
-    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(place):
-        patch.setattr(pipeline, "make_report", lambda context: (context.run_dir / "report.html").write_text("-"))
+    """Runs a command without its report, and returns its run folder."""
+    with without_reports(), contextlib.chdir(place):
         code, err = run(*arguments)
     assert (code, err[-900:] if code else "") == (0, "")
     return place / "run"

@@ -1,6 +1,7 @@
 """Materials of convex terms in a simulator."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,7 +36,9 @@ def test_two_coefficients_and_a_bulk_modulus_are_mooney_rivlin():
 def test_gradients_by_every_coefficient_and_direction(pose):
     terms = {"c20": 20e3, "c30": 10e3, "c01": C01, "c02": 5e3, "dilation": 10e3, "bulk_1": 1e6, "bulk_2": 1e9}
     material = ConvexMaterial(C10, **terms, fibres=FIBRES, mass_damping=0.5, stiffness_damping=1e-3)
-    rows = {row.parameter: row for row in check_gradients(simulator(material), pose)}
+    mesh = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
+    small = replace(simulator(material), body=Body(mesh, fixed=select_vertices(mesh, x=0.0)))
+    rows = {row.parameter: row for row in check_gradients(small, pose)}
     assert {"c02", "bulk_1", "fibre_1_azimuth", "fibre_2_tension, each element"} <= rows.keys()
     # Terms of high order have no gradient at rest, and differences are inexact where a fibre's modulus jumps.
     exact = {n: r for n, r in rows.items() if r.uncertainty < 1e-8 * abs(r.difference)}

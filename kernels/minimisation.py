@@ -54,7 +54,7 @@ class SolverProgress:
 
 @wp.struct
 class LineSearch:
-    """Iterate and line search of every environment, (B, N) each."""
+    """Iterate and line search of every environment; all fields are (B, N)."""
 
     positions: wp.array2d[wp.vec3d]  # of the next evaluation: the iterate or a trial [m]
     origin: wp.array2d[wp.vec3d]  # start of the line search [m]

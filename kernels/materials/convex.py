@@ -19,6 +19,7 @@ import warp as wp
 from ..matrices import cofactor, signed_svd
 from ..modules import named_module
 from ..spectral import spectral_blocks
+from . import mooney_rivlin
 from .density import Law
 
 POWERS_OF_A, POWERS_OF_B = 3, 2
@@ -75,6 +76,12 @@ def convex_law(fibres: int) -> Law:
         )
 
     @wp.func(module=module)
+    def derivatives(first: wp.float64, second: wp.float64, jac: wp.float64, m: moduli):
+        """Returns j, and the terms in a, in b and in j with their first two derivatives."""
+        k = invariants(first, second, jac)
+        return k[2], powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m)
+
+    @wp.func(module=module)
     def direction(m: moduli, fibre: int) -> wp.vec3d:
         first = ISOTROPIC + PER_FIBRE * fibre
         return wp.vec3d(m[first], m[first + 1], m[first + 2])
@@ -93,13 +100,10 @@ def convex_law(fibres: int) -> Law:
     def response(f: wp.mat33d, m: moduli):
         cof = cofactor(f)
         first = wp.ddot(f, f)
-        k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
-        by_a = powers(k[0], m, 0, _B)
-        by_b = powers(k[1], m, _B, _J)
-        by_j = by_volume(k[2], m)
+        j, by_a, by_b, by_j = derivatives(first, wp.ddot(cof, cof), wp.determinant(f), m)
         energy = by_a[0] + by_b[0] + by_j[0]
         stress = TWO * (by_a[1] + by_b[1] * first) * f - (TWO * by_b[1]) * (f * (wp.transpose(f) * f))
-        stress += (TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]) * cof
+        stress += (TWO * by_a[1] * (j - ONE) - FOUR * by_b[1] + by_j[1]) * cof
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e
@@ -151,63 +155,33 @@ def convex_law(fibres: int) -> Law:
 
     @wp.func(module=module)
     def write_isotropic(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
-        """Writes the blocks of dP/dF of the isotropic terms, by the equation in `mooney_rivlin`."""
+        """Writes the blocks of dP/dF of the isotropic terms."""
         cof = cofactor(f)
         first = wp.ddot(f, f)
-        k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
-        by_a = powers(k[0], m, 0, _B)
-        by_b = powers(k[1], m, _B, _J)
-        by_j = by_volume(k[2], m)
-        slope = TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]
+        j, by_a, by_b, by_j = derivatives(first, wp.ddot(cof, cof), wp.determinant(f), m)
+        slope = TWO * by_a[1] * (j - ONE) - FOUR * by_b[1] + by_j[1]
+        mooney_rivlin.write_tangent(f, by_a[1], by_b[1], slope, TWO * by_a[1] + by_j[2], out)
         columns = wp.transpose(f)
-        left = f * columns
         normals = wp.transpose(cof)
-        a = TWO * columns + (TWO * (k[2] - ONE)) * normals  # rows: columns of da/dF
-        b = TWO * (first * columns - columns * left) - FOUR * normals
+        a = TWO * columns + (TWO * (j - ONE)) * normals  # rows: columns of da/dF
+        b = TWO * (first * columns - columns * (f * columns)) - FOUR * normals
         for r in range(3):
             for n in range(r + 1):
-                block = (TWO * by_a[1] + by_j[2]) * wp.outer(normals[r], normals[n])
-                block += (FOUR * by_b[1]) * wp.outer(columns[r], columns[n])
-                block -= (TWO * by_b[1]) * wp.outer(columns[n], columns[r])
-                block += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(b[r], b[n])
-                same = -TWO * by_b[1] * wp.dot(columns[r], columns[n])
-                if r == n:
-                    block -= (TWO * by_b[1]) * left
-                    same += TWO * by_a[1] + TWO * by_b[1] * first
-                elif r - n == 1:
-                    block += slope * wp.skew(columns[3 - r - n])
-                else:
-                    block -= slope * wp.skew(columns[1])
-                block[0, 0] += same
-                block[1, 1] += same
-                block[2, 2] += same
-                out[(r * (r + 1)) / 2 + n] = block
+                out[(r * (r + 1)) / 2 + n] += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(b[r], b[n])
 
     @wp.func(module=module)
     def write_clamped(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
         """Writes these blocks without negative eigenvalues."""
         u, s, v = signed_svd(f)
         cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-        k = invariants(wp.dot(s, s), wp.dot(cof, cof), s[0] * cof[0])
-        by_a = powers(k[0], m, 0, _B)
-        by_b = powers(k[1], m, _B, _J)
-        by_j = by_volume(k[2], m)
-        slope = TWO * by_a[1] * (k[2] - ONE) - FOUR * by_b[1] + by_j[1]
+        j, by_a, by_b, by_j = derivatives(wp.dot(s, s), wp.dot(cof, cof), s[0] * cof[0], m)
+        slope = TWO * by_a[1] * (j - ONE) - FOUR * by_b[1] + by_j[1]
+        normal, flip, twist = mooney_rivlin.principal_tangent(s, by_a[1], by_b[1], slope, TWO * by_a[1] + by_j[2])
         squares = wp.cw_mul(s, s)
         around = wp.vec3d(squares[1] + squares[2], squares[0] + squares[2], squares[0] + squares[1])
-        a = TWO * s + (TWO * (k[2] - ONE)) * cof
+        a = TWO * s + (TWO * (j - ONE)) * cof
         b = TWO * wp.cw_mul(s, around) - FOUR * cof
-        normal = (TWO * by_a[1] + by_j[2]) * wp.outer(cof, cof) + by_a[2] * wp.outer(a, a) + by_b[2] * wp.outer(b, b)
-        flip = wp.vec3d()
-        twist = wp.vec3d()
-        for n in range(3):
-            i = (n + 1) % 3
-            j = (n + 2) % 3
-            normal[n, n] += TWO * by_a[1] + TWO * by_b[1] * around[n]
-            normal[i, j] += FOUR * by_b[1] * s[i] * s[j] + slope * s[n]
-            normal[j, i] += FOUR * by_b[1] * s[i] * s[j] + slope * s[n]
-            flip[n] = TWO * by_a[1] + TWO * by_b[1] * (squares[n] - s[i] * s[j]) - slope * s[n]
-            twist[n] = TWO * by_a[1] + TWO * by_b[1] * (squares[n] + s[i] * s[j]) + slope * s[n]
+        normal += by_a[2] * wp.outer(a, a) + by_b[2] * wp.outer(b, b)
         spectral_blocks(u, v, normal, flip, twist, True, out)
 
     @wp.func(module=module)

@@ -49,47 +49,56 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
 # With the principal stresses sigma_i of I2, 2 s_i (s_j^2 + s_k^2), and of a function g of J, g' s_j s_k:
 # the flip of the pair (i, j) is 2 (s_k^2 - s_i s_j) and -g' s_k, its twist 2 (s_k^2 + s_i s_j) and g' s_k.
 @wp.func
-def clamped_tangent(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
-    """Writes the blocks of the nearest tangent without negative eigenvalues."""
-    u, s, v = signed_svd(f)
+def principal_tangent(s: wp.vec3d, first: wp.float64, second: wp.float64, slope: wp.float64, curvature: wp.float64):
+    """Returns normal, flip and twist of `spectral_blocks` for an energy of I1, I2 and J.
+
+    Args:
+        s: signed singular values of F.
+        first: derivative of the energy by I1.
+        second: derivative by I2.
+        slope: derivative by J.
+        curvature: second derivative by J.
+    """
     cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
-    slope = volume_slope(m, s[0] * s[1] * s[2])
-    normal = (TWO * m[0] + m[2]) * wp.outer(cof, cof)
+    normal = curvature * wp.outer(cof, cof)
     flip = wp.vec3d(ZERO, ZERO, ZERO)
     twist = wp.vec3d(ZERO, ZERO, ZERO)
     for k in range(3):
         i = (k + 1) % 3
         j = (k + 2) % 3
-        normal[k, k] += TWO * m[0] + TWO * m[1] * (s[i] * s[i] + s[j] * s[j])
-        normal[i, j] += FOUR * m[1] * s[i] * s[j] + slope * s[k]
-        normal[j, i] += FOUR * m[1] * s[i] * s[j] + slope * s[k]
-        flip[k] = TWO * m[0] + TWO * m[1] * (s[k] * s[k] - s[i] * s[j]) - slope * s[k]
-        twist[k] = TWO * m[0] + TWO * m[1] * (s[k] * s[k] + s[i] * s[j]) + slope * s[k]
-    spectral_blocks(u, v, normal, flip, twist, True, out)
+        normal[k, k] += TWO * first + TWO * second * (s[i] * s[i] + s[j] * s[j])
+        normal[i, j] += FOUR * second * s[i] * s[j] + slope * s[k]
+        normal[j, i] += FOUR * second * s[i] * s[j] + slope * s[k]
+        flip[k] = TWO * first + TWO * second * (s[k] * s[k] - s[i] * s[j]) - slope * s[k]
+        twist[k] = TWO * first + TWO * second * (s[k] * s[k] + s[i] * s[j]) + slope * s[k]
+    return normal, flip, twist
 
 
 # A change x of column n of F changes column k of I1 F - F F^T F by
 # (2 f_k f_n^T - f_n f_k^T - C_kn I + [k = n] (I1 I - F F^T)) x, with C = F^T F.
 @wp.func
-def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-    """Writes the blocks of dP/dF, by the equation above."""
-    if clamp:
-        clamped_tangent(f, m, out)
-        return
-    first = wp.ddot(f, f)
-    slope = volume_slope(m, wp.determinant(f))
+def write_tangent(
+    f: wp.mat33d,
+    first: wp.float64,
+    second: wp.float64,
+    slope: wp.float64,
+    curvature: wp.float64,
+    out: wp.array[wp.mat33d],
+):
+    """Writes the blocks of dP/dF by the equation above; the arguments are those of `principal_tangent`."""
+    square = wp.ddot(f, f)
     columns = wp.transpose(f)
     left = f * columns
     normals = wp.transpose(cofactor(f))
     for k in range(3):
         for n in range(k + 1):
-            block = (TWO * m[0] + m[2]) * wp.outer(normals[k], normals[n])
-            block += (FOUR * m[1]) * wp.outer(columns[k], columns[n])
-            block -= (TWO * m[1]) * wp.outer(columns[n], columns[k])
-            same = -TWO * m[1] * wp.dot(columns[k], columns[n])
+            block = curvature * wp.outer(normals[k], normals[n])
+            block += (FOUR * second) * wp.outer(columns[k], columns[n])
+            block -= (TWO * second) * wp.outer(columns[n], columns[k])
+            same = -TWO * second * wp.dot(columns[k], columns[n])
             if k == n:
-                block -= (TWO * m[1]) * left
-                same += TWO * m[0] + TWO * m[1] * first
+                block -= (TWO * second) * left
+                same += TWO * first + TWO * second * square
             elif k - n == 1:
                 block += slope * wp.skew(columns[3 - k - n])
             else:
@@ -98,3 +107,16 @@ def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
             block[1, 1] += same
             block[2, 2] += same
             out[(k * (k + 1)) / 2 + n] = block
+
+
+@wp.func
+def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
+    """Writes the blocks of dP/dF, with `clamp` those of the nearest tangent without negative eigenvalues."""
+    curvature = TWO * m[0] + m[2]
+    if clamp:
+        u, s, v = signed_svd(f)
+        slope = volume_slope(m, s[0] * s[1] * s[2])
+        normal, flip, twist = principal_tangent(s, m[0], m[1], slope, curvature)
+        spectral_blocks(u, v, normal, flip, twist, True, out)
+        return
+    write_tangent(f, m[0], m[1], volume_slope(m, wp.determinant(f)), curvature, out)

@@ -40,10 +40,13 @@ def test_gradients_by_every_coefficient_and_direction(pose):
     small = replace(simulator(material), body=Body(mesh, fixed=select_vertices(mesh, x=0.0)))
     rows = {row.parameter: row for row in check_gradients(small, pose)}
     assert {"c02", "bulk_1", "fibre_1_azimuth", "fibre_2_tension, each element"} <= rows.keys()
-    # Terms of high order have no gradient at rest, and differences are inexact where a fibre's modulus jumps.
-    exact = {n: r for n, r in rows.items() if r.uncertainty < 1e-8 * abs(r.difference)}
-    assert {name: row.relative_error for name, row in exact.items() if not row.relative_error < 1e-6} == {}
-    assert len(exact) > (30 if pose == "bent" else 15)
+    # Rounding limits differences of the smaller gradients, and jumps of a fibre's modulus limit those by its constants;
+    # `tests/kernels/test_material_laws.py` compares the latter away from the jumps.
+    compared = {name: row for name, row in rows.items() if abs(row.adjoint) > 1e-6}
+    errors = {name: row.relative_error / (1e-3 if "fibre" in name else 1e-6) for name, row in compared.items()}
+    assert {name: error for name, error in errors.items() if not error < 1.0} == {}
+    assert {"c10", "c01", "dilation", "bulk_1", "fibre_1_azimuth", "fibre_2_tension"} <= compared.keys()
+    assert pose != "twisted" or {"c20", "c02", "bulk_2", "fibre_1_stiffening"} <= compared.keys()
 
 
 def test_fibres_stiffen_a_beam_along_their_direction_only():

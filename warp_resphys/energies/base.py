@@ -270,7 +270,7 @@ class BoundEnergy:
         return None
 
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns the memory variables (B, ...) after a step, by name.
+        """Returns the memory variables (B, ...) after a step, by name; called only if `memory` is not empty.
 
         Args:
             step: the step.

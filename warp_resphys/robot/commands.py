@@ -1,4 +1,4 @@
-"""What the inputs of a robot do in a step: to its simulator, to its learned force's network, and in later steps."""
+"""Effects of a robot's inputs in a step: on its simulator, on the network of its learned force, and on later steps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from .state import RobotState
 
 @dataclass(frozen=True)
 class Acting:
-    """What acts during a step of B environments.
+    """Inputs that act during a step of B environments.
 
     Attributes:
         inputs: of the simulator.

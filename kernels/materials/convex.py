@@ -1,22 +1,34 @@
-"""A sum of terms with non-negative coefficients: powers of polyconvex invariants, and families of fibres.
+"""A sum of terms with non-negative coefficients: powers of polyconvex invariants, Ogden's terms, and fibres.
 
-    W = sum_p c_p a^p + sum_p d_p b^p + e j^2 + sum_f (k_2 <q_f>^2 + k_3 <q_f>^3 + k_c <-q_f>^2)
+    W = sum_p c_p a^p + sum_p d_p b^p + e j^2 + sum_n 2 mu_n / n^2 S_n
+        + sum_f (k_f s(l_f - 1 - slack_f) + k_3 <q_f>^3 + k_c <-q_f>^2)
     U = g_2 j^2 + g_4 j^4
 
-with j = J - 1, a = I1 - 3 - 2 j + j^2, b = I2 - 3 - 4 j, and q_f = |F e_f|^2 - 1 of fibres along unit vectors e_f.
-W is integrated at the points of the shape rule, U at those of the volume rule; <x> = max(x, 0).
+with j = J - 1, a = I1 - 3 - 2 j + j^2, b = I2 - 3 - 4 j, l_f = |F e_f| the stretch of fibres along unit vectors e_f,
+q_f = l_f^2 - 1, and <x> = max(x, 0). With the singular values s_i of F and a whole number n, at least 3 or at most -3,
 
-All terms and their derivatives vanish at rest, and stay finite where elements invert. a is convex in (F, J), b in
-(cof F, J), both are non-negative, and q_f is convex in F; so their powers, and every combination with non-negative
-coefficients, are polyconvex (Ball, Archive for Rational Mechanics and Analysis 63, 1976). The exception is the
-compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1), and lambda is 2 (e + g_2) without fibres.
+    S_n = sum_i s_i^n - 3 - n j + n / 2 j^2  for n > 0,     sum_{i < k} (s_i s_k)^-n - 3 + 2 n j  for n < 0
+
+(Ogden, Proceedings of the Royal Society A 326, 1972: for J = 1 they are his). s(x) = max(x, 0)^2 / 2 is smoothed over
+a toe (`kernels.laws.muscle`); its strain is less by the slack, as fibres are wavy. W is integrated at the points of the
+shape rule, U at those of the volume rule.
+
+All terms and their derivatives vanish at rest, and stay finite where elements invert. a, S_n for n > 0, and l_f are
+convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so their powers and increasing convex
+functions are convex too, and every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational
+Mechanics and Analysis 63, 1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is
+2 (c_1 + d_1) + sum_n mu_n, and lambda, without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
+
+The moduli named unit_shear and unit_bulk, of value one, carry the volumes of viscosity alone: its coefficients are
+viscosities and moduli of branches, not ratios to the elastic ones.
 """
 
 import functools
 
 import warp as wp
 
-from ..matrices import cofactor, signed_svd
+from ..laws.muscle import pull
+from ..matrices import cofactor, polar_rotation, signed_svd
 from ..modules import named_module
 from ..spectral import spectral_blocks
 from . import mooney_rivlin
@@ -25,22 +37,77 @@ from .density import Law
 POWERS_OF_A, POWERS_OF_B = 3, 2
 _B, _J = POWERS_OF_A, POWERS_OF_A + POWERS_OF_B
 _G2, _G4 = _J + 1, _J + 2
-ISOTROPIC = _J + 3  # number of isotropic coefficients
-PER_FIBRE = 6  # e_f, k_2, k_3 and k_c
+ISOTROPIC = _J + 3  # number of coefficients of invariants
+_OGDEN = ISOTROPIC + 2  # index of the first of Ogden's moduli
+PER_FIBRE = 8  # e_f, slack, toe, k_f, k_3 and k_c
 ZERO, ONE, TWO, FOUR = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(4.0)
 THREE, SIX, TWELVE = wp.float64(3.0), wp.float64(6.0), wp.float64(12.0)
+FIVE, HALF = wp.float64(5.0), wp.float64(0.5)
 SMALLEST = wp.float64(1.0e-12)  # lower bound of a squared length in a denominator
+CLOSE = wp.float64(1.0e-3)  # relative difference of stretches below which a quotient is a series
+
+
+@wp.func
+def odd_power(x: wp.float64, exponent: wp.float64) -> wp.float64:
+    """Returns the odd function |x|^exponent sgn x."""
+    return wp.sign(x) * wp.pow(wp.abs(x), exponent)
+
+
+@wp.func
+def quotient(x: wp.float64, y: wp.float64, n: wp.float64) -> wp.float64:
+    """Returns the difference of `odd_power` between x and y over x - y, also where they are equal."""
+    larger, smaller = x, y
+    if wp.abs(y) > wp.abs(x):
+        larger, smaller = y, x
+    r = ZERO
+    if larger != ZERO:
+        r = smaller / larger - ONE
+    ratio = n * (
+        ONE
+        + (n - ONE)
+        / TWO
+        * r
+        * (ONE + (n - TWO) / THREE * r * (ONE + (n - THREE) / FOUR * r * (ONE + (n - FOUR) / FIVE * r)))
+    )
+    if wp.abs(r) > CLOSE:
+        ratio = (odd_power(ONE + r, n) - ONE) / r
+    return wp.pow(wp.abs(larger), n - ONE) * ratio
+
+
+@wp.func
+def matrix_power(a: wp.mat33d, n: int) -> wp.mat33d:
+    """Returns A^n for n >= 1."""
+    result = a
+    for _ in range(1, n):
+        result = result * a
+    return result
+
+
+@wp.func
+def unsigned_polar(f: wp.mat33d):
+    """Returns R and U of F = R U, with U positive semi-definite and an orthogonal R, also where F is inverted."""
+    if wp.determinant(f) > ZERO:
+        r = polar_rotation(f)
+        return r, wp.transpose(r) * f
+    u, s, v = signed_svd(f)
+    signs = wp.diag(wp.vec3d(ONE, ONE, -ONE))
+    right = wp.transpose(v)
+    return u * signs * right, v * wp.diag(wp.vec3d(s[0], s[1], -s[2])) * right
 
 
 @functools.cache
-def convex_law(fibres: int) -> Law:
-    """Returns the law with a number of families of fibres.
+def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
+    """Returns the law with Ogden's terms of some exponents, and a number of families of fibres.
 
-    Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, and e_f (3 components), k_2, k_3 and k_c of each family.
+    Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, unit_shear, unit_bulk, mu_n of each of Ogden's terms, and
+    e_f (3 components), slack, toe, k_f, k_3 and k_c of each family.
     """
-    count = ISOTROPIC + PER_FIBRE * fibres
+    terms = len(ogden)
+    exponents = wp.types.vector(max(terms, 1), wp.int32)(*(ogden or (0,)))
+    first_fibre = _OGDEN + terms
+    count = first_fibre + PER_FIBRE * fibres
     moduli = wp.types.vector(count, wp.float64)
-    name = f"convex.{fibres}"
+    name = ".".join(str(part).replace("-", "m") for part in ("convex", *ogden, f"f{fibres}"))
     module = named_module(f"solid.{name}")
     wp.set_module_options({"max_unroll": 1}, module)
 
@@ -69,11 +136,18 @@ def convex_law(fibres: int) -> Law:
     @wp.func(module=module)
     def by_volume(j: wp.float64, m: moduli) -> wp.vec3d:
         """Returns the terms in j, and their first two derivatives."""
-        square = (m[_J] + m[_G2]) * j
+        linear = ZERO
+        quadratic = m[_J] + m[_G2]
+        for k in range(terms):
+            share = m[_OGDEN + k] / wp.float64(exponents[k])
+            if share > ZERO:
+                linear -= TWO * share
+                quadratic += share
+            else:
+                linear += FOUR * share
         quartic = m[_G4] * j * j
-        return wp.vec3d(
-            (square + quartic * j) * j, TWO * square + FOUR * quartic * j, TWO * (m[_J] + m[_G2]) + TWELVE * quartic
-        )
+        slope = TWO * quadratic * j + FOUR * quartic * j
+        return wp.vec3d((linear + (quadratic + quartic) * j) * j, linear + slope, TWO * quadratic + TWELVE * quartic)
 
     @wp.func(module=module)
     def derivatives(first: wp.float64, second: wp.float64, jac: wp.float64, m: moduli):
@@ -82,19 +156,60 @@ def convex_law(fibres: int) -> Law:
         return k[2], powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m)
 
     @wp.func(module=module)
+    def by_stretches(u: wp.mat33d, cof: wp.mat33d, n: int):
+        """Returns 2 / n^2 S_n without its terms in j, and its derivative by the stretches U, with cof U."""
+        size = wp.float64(wp.abs(n))
+        if n > 0:
+            lower = matrix_power(u, n - 1)
+            return TWO / (size * size) * (wp.ddot(lower, u) - THREE), TWO / size * lower
+        lower = matrix_power(cof, -n - 1)
+        change = wp.trace(lower)
+        crossed = lower * u
+        slope = crossed + wp.transpose(crossed) - change * u - wp.trace(u) * lower
+        slope += wp.diag(wp.vec3d(ONE, ONE, ONE)) * (change * wp.trace(u) - wp.trace(crossed))
+        return TWO / (size * size) * (wp.ddot(lower, cof) - THREE), TWO / size * slope
+
+    @wp.func(module=module)
+    def add_by_stretches(s: wp.vec3d, m: moduli, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d):
+        """Returns normal, flip and twist of `spectral_blocks` with those of Ogden's terms."""
+        for k in range(terms):
+            n = wp.float64(wp.abs(exponents[k])) - ONE
+            scale = TWO * m[_OGDEN + k] / (n + ONE)
+            for i in range(3):
+                j, l = (i + 1) % 3, (i + 2) % 3
+                if exponents[k] > 0:
+                    normal[i, i] += scale * n * wp.pow(wp.abs(s[i]), n - ONE)
+                    flip[i] += scale * quotient(s[j], s[l], n)
+                    twist[i] += scale * quotient(s[j], -s[l], n)
+                else:
+                    x, slope = s[j] * s[l], scale * odd_power(s[j] * s[l], n)
+                    curvature = scale * n * wp.pow(wp.abs(x), n - ONE)
+                    normal[j, j] += curvature * s[l] * s[l]
+                    normal[l, l] += curvature * s[j] * s[j]
+                    normal[j, l] += curvature * x + slope
+                    normal[l, j] += curvature * x + slope
+                    square = scale * s[i] * s[i]
+                    flip[i] += square * quotient(s[i] * s[j], s[i] * s[l], n) - slope
+                    twist[i] += square * quotient(s[i] * s[j], -s[i] * s[l], n) + slope
+        return normal, flip, twist
+
+    @wp.func(module=module)
     def direction(m: moduli, fibre: int) -> wp.vec3d:
-        first = ISOTROPIC + PER_FIBRE * fibre
+        first = first_fibre + PER_FIBRE * fibre
         return wp.vec3d(m[first], m[first + 1], m[first + 2])
 
     @wp.func(module=module)
     def along_fibre(q: wp.float64, m: moduli, fibre: int) -> wp.vec3d:
         """Returns the energy of a family and its first two derivatives by q."""
-        first = ISOTROPIC + PER_FIBRE * fibre + 3
+        first = first_fibre + PER_FIBRE * fibre + 3
         if q <= ZERO:
-            return m[first + 2] * wp.vec3d(q * q, TWO * q, TWO)
-        square = m[first]
-        cubic = m[first + 1] * q
-        return wp.vec3d((square + cubic) * q * q, (TWO * square + THREE * cubic) * q, TWO * square + SIX * cubic)
+            return m[first + 4] * wp.vec3d(q * q, TWO * q, TWO)
+        stretch = wp.sqrt(ONE + q)
+        energy, force, slope = pull(stretch - ONE - m[first], m[first + 1])
+        by_q = HALF / stretch * force
+        cubic = m[first + 3] * q
+        w = wp.vec3d(cubic * q * q, THREE * cubic * q, SIX * cubic)
+        return w + m[first + 2] * wp.vec3d(energy, by_q, (HALF * slope - by_q) * HALF / (ONE + q))
 
     @wp.func(module=module)
     def response(f: wp.mat33d, m: moduli):
@@ -104,6 +219,15 @@ def convex_law(fibres: int) -> Law:
         energy = by_a[0] + by_b[0] + by_j[0]
         stress = TWO * (by_a[1] + by_b[1] * first) * f - (TWO * by_b[1]) * (f * (wp.transpose(f) * f))
         stress += (TWO * by_a[1] * (j - ONE) - FOUR * by_b[1] + by_j[1]) * cof
+        if terms > 0:
+            turn, u = unsigned_polar(f)
+            cof_u = cofactor(u)
+            slope = wp.mat33d()
+            for k in range(terms):
+                stretched, by_u = by_stretches(u, cof_u, exponents[k])
+                energy += m[_OGDEN + k] * stretched
+                slope += m[_OGDEN + k] * by_u
+            stress += turn * slope
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e
@@ -117,21 +241,32 @@ def convex_law(fibres: int) -> Law:
         result = moduli()
         cof = cofactor(f)
         first = wp.ddot(f, f)
-        k = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
+        invariant = invariants(first, wp.ddot(cof, cof), wp.determinant(f))
         change_j = wp.ddot(cof, df)
-        change_a = TWO * wp.ddot(f, df) + TWO * (k[2] - ONE) * change_j
+        change_a = TWO * wp.ddot(f, df) + TWO * (invariant[2] - ONE) * change_j
         change_b = TWO * (first * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)) - FOUR * change_j
         power = ONE
         for n in range(0, _B):
             result[n] = wp.float64(n + 1) * power * change_a
-            power = power * k[0]
+            power = power * invariant[0]
         power = ONE
         for n in range(_B, _J):
             result[n] = wp.float64(n - _B + 1) * power * change_b
-            power = power * k[1]
-        result[_J] = TWO * k[2] * change_j
+            power = power * invariant[1]
+        result[_J] = TWO * invariant[2] * change_j
         result[_G2] = result[_J]
-        result[_G4] = FOUR * k[2] * k[2] * k[2] * change_j
+        result[_G4] = FOUR * invariant[2] * invariant[2] * invariant[2] * change_j
+        if terms > 0:
+            turn, u = unsigned_polar(f)
+            cof_u = cofactor(u)
+            turned = wp.transpose(turn) * df
+            for k in range(terms):
+                _energy, by_u = by_stretches(u, cof_u, exponents[k])
+                share = TWO / wp.float64(exponents[k])
+                by_j = TWO * share
+                if exponents[k] > 0:
+                    by_j = share * (invariant[2] - ONE)
+                result[_OGDEN + k] = wp.ddot(by_u, turned) + by_j * change_j
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e
@@ -143,14 +278,21 @@ def convex_law(fibres: int) -> Law:
             by_direction = (TWO * w[2] * change) * back + (TWO * w[1]) * (
                 wp.transpose(f) * moved + wp.transpose(df) * c
             )
-            at = ISOTROPIC + PER_FIBRE * fibre
+            at = first_fibre + PER_FIBRE * fibre
             result[at] = by_direction[0]
             result[at + 1] = by_direction[1]
             result[at + 2] = by_direction[2]
-            pull = wp.max(q, ZERO)
-            result[at + 3] = TWO * pull * change
-            result[at + 4] = THREE * pull * pull * change
-            result[at + 5] = TWO * wp.min(q, ZERO) * change
+            taut = wp.max(q, ZERO)
+            stretch = wp.sqrt(ONE + taut)
+            toe = m[at + 4]
+            energy, force, slope = pull(stretch - ONE - m[at + 3], toe)
+            lengthened = HALF / stretch * change
+            t = wp.clamp((stretch - ONE - m[at + 3]) / toe, ZERO, ONE)
+            result[at + 3] = -m[at + 5] * slope * lengthened
+            result[at + 4] = -m[at + 5] * t * t * t * (TWO - THREE * HALF * t) * lengthened
+            result[at + 5] = force * lengthened
+            result[at + 6] = THREE * taut * taut * change
+            result[at + 7] = TWO * wp.min(q, ZERO) * change
         return result
 
     @wp.func(module=module)
@@ -170,8 +312,8 @@ def convex_law(fibres: int) -> Law:
                 out[(r * (r + 1)) / 2 + n] += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(b[r], b[n])
 
     @wp.func(module=module)
-    def write_clamped(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
-        """Writes these blocks without negative eigenvalues."""
+    def write_principal(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
+        """Writes these blocks, and those of Ogden's terms, in the principal frame."""
         u, s, v = signed_svd(f)
         cof = wp.vec3d(s[1] * s[2], s[0] * s[2], s[0] * s[1])
         j, by_a, by_b, by_j = derivatives(wp.dot(s, s), wp.dot(cof, cof), s[0] * cof[0], m)
@@ -182,12 +324,13 @@ def convex_law(fibres: int) -> Law:
         a = TWO * s + (TWO * (j - ONE)) * cof
         b = TWO * wp.cw_mul(s, around) - FOUR * cof
         normal += by_a[2] * wp.outer(a, a) + by_b[2] * wp.outer(b, b)
-        spectral_blocks(u, v, normal, flip, twist, True, out)
+        normal, flip, twist = add_by_stretches(s, m, normal, flip, twist)
+        spectral_blocks(u, v, normal, flip, twist, clamp, out)
 
     @wp.func(module=module)
     def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-        if clamp:
-            write_clamped(f, m, out)
+        if clamp or terms > 0:
+            write_principal(f, m, clamp, out)
         else:
             write_isotropic(f, m, out)
         for fibre in range(fibres):
@@ -209,6 +352,6 @@ def convex_law(fibres: int) -> Law:
                     block[2, 2] += same
                     out[(r * (r + 1)) / 2 + n] += block
 
-    both = [(2.0, 0.0), *((0.0, 0.0),) * (POWERS_OF_A - 1), (2.0, 0.0), *((0.0, 0.0),) * (POWERS_OF_B - 1)]
-    lame = (*both, (0.0, 2.0), (0.0, 2.0), (0.0, 0.0), *((0.0, 0.0),) * (PER_FIBRE * fibres))
+    # Viscosity has moduli of its own, so that the elastic ones contribute nothing to it.
+    lame = ((0.0, 0.0),) * ISOTROPIC + ((1.0, 0.0), (0.0, 1.0)) + ((0.0, 0.0),) * (count - _OGDEN)
     return Law(name, lame, moduli, response, slopes, tangent)

@@ -190,7 +190,7 @@ def test_branches_without_modulus_have_a_gradient():
         (lambda: replace(ELASTIC, prony=[0.3]), "give a (ratio, time) for each branch"),
         (lambda: replace(ELASTIC, prony=[(0.3, 0.0)]), "prony_time_1 is"),
         (lambda: replace(ELASTIC, prony=[(-0.1, 1.0)]), "prony_ratio_1 is"),
-        (lambda: make_material(prony_ratio_1=0.1), "the Prony branches are prony_ratio_1"),
+        (lambda: make_material(prony_ratio_1=0.1), "prony has prony_ratio_1: give each branch"),
         (lambda: make_material(prony_ratio_2=0.1, prony_time_2=1.0), "numbered from 1"),
         (lambda: make_material(prony=3), "has no constant 'prony'"),
     ],

@@ -18,7 +18,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from typing_extensions import override
@@ -37,8 +37,7 @@ def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: A
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
 
 
-PRONY_RATIO = Quantity("prony_ratio", "", 0.0, closed=True)
-PRONY_TIME = Quantity("prony_time", "s", 0.0)
+_PRONY_TIME = Quantity("prony_time", "s", 0.0)
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,10 @@ class Material(ABC):
     rules: ClassVar[tuple[str, ...]]
     # upper bound of each modulus' contribution to the tangent's eigenvalues at small strains
     curvature: ClassVar[tuple[float, ...]]
+    # constants of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
+    groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
+        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), _PRONY_TIME)
+    }
 
     density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
     # alpha [1/s] of the force -alpha M v
@@ -67,34 +70,85 @@ class Material(ABC):
 
     def __post_init__(self) -> None:
         """Raises InputError for a constant outside its physical range."""
-        if not all(isinstance(branch, Sequence) and len(branch) == 2 for branch in self.prony):
-            raise InputError(f"prony is {self.prony!r}: give a (ratio, time) for each branch, - and s.")
+        for group, own in self.groups.items():
+            items = getattr(self, group)
+            if not all(isinstance(item, Sequence) and len(item) == len(own) for item in items):
+                names = ", ".join(q.name.partition("_")[2] for q in own)
+                units = " and ".join(q.unit or "-" for q in own)
+                raise InputError(f"{group} is {items!r}: give a ({names}) for each {self._item(group)}, {units}.")
         constants = self.constants
         for name, quantity in self.quantities.items():
             quantity.check(constants[name])
 
     @classmethod
     def own_quantities(cls) -> dict[str, Quantity]:
-        """Returns the constants by name without Prony branches, those of the law first."""
+        """Returns the constants by name without those of groups, those of the law first."""
         own = sorted((f for f in fields(cls) if f.metadata), key=lambda f: bool(f.kw_only))
         return {f.name: f.metadata["quantity"] for f in own}
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Constants by name: those of the law first, ``prony_ratio_1``, ``prony_time_1``, ... last."""
-        return {**self.own_quantities(), **{name: replace(q, name=name) for name, q in self._branches}}
+    def numbered(self) -> dict[str, tuple[Quantity, Parameter]]:
+        """Constants of groups with their values: ``prony_ratio_1``, ``prony_time_1``, ..."""
+        return {
+            f"{q.name}_{k}": (replace(q, name=f"{q.name}_{k}"), value)
+            for group, own in self.groups.items()
+            for k, item in enumerate(getattr(self, group), 1)
+            for q, value in zip(own, item, strict=True)
+        }
 
     @property
-    def _branches(self) -> list[tuple[str, Quantity]]:
-        both = (PRONY_RATIO, PRONY_TIME)
-        return [(f"{q.name}_{k}", q) for k in range(1, 1 + len(self.prony)) for q in both]
+    def quantities(self) -> dict[str, Quantity]:
+        """Constants by name, those of the law first."""
+        return {**self.own_quantities(), **{name: quantity for name, (quantity, _) in self.numbered.items()}}
 
     @property
     def constants(self) -> dict[str, Parameter]:
         """Values of the constants by name."""
-        branches = zip(self._branches, chain.from_iterable(self.prony), strict=True)
         own = {name: getattr(self, name) for name in self.own_quantities()}
-        return {**own, **{name: value for (name, _), value in branches}}
+        return {**own, **{name: value for name, (_, value) in self.numbered.items()}}
+
+    @classmethod
+    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
+        """Returns the material with some constants by name, those of groups numbered from 1.
+
+        Raises:
+            InputError: an unknown constant, a branch that is not whole, or a value out of range.
+        """
+        return cls(**cls._arguments(constants))
+
+    @classmethod
+    def _arguments(cls, constants: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the arguments of the class: constants, and the items of groups."""
+        own, values, groups = cls.own_quantities(), dict(constants), {}
+        for group, quantities in cls.groups.items():
+            names = {q.name for q in quantities}
+            given = {name for name in constants if re.sub(r"_[1-9]\d*$", "", name) in names}
+            count = len({re.findall(r"\d+$", name)[-1] for name in given if name not in names})
+            items = [[f"{q.name}_{k}" for q in quantities] for k in range(1, 1 + count)]
+            if given != {*chain.from_iterable(items)}:
+                raise InputError(
+                    f"{group} has {', '.join(sorted(given))}: give each {cls._item(group)}, numbered from 1, its "
+                    f"{' and its '.join(f'{q.name}_' for q in quantities)}."
+                )
+            groups[group] = [tuple(values.pop(name) for name in item) for item in items]
+        for name in values:
+            if name not in own:
+                numbered = [f"{q.name}_1" for q in chain.from_iterable(cls.groups.values())]
+                raise InputError(f"the material has no constant {name!r}: it has {', '.join((*own, *numbered, '...'))}")
+        return {**values, **groups}
+
+    @staticmethod
+    def _item(group: str) -> str:
+        return "branch" if group == "prony" else "family"
+
+    def group(self, name: str, constants: Mapping[str, torch.Tensor]) -> list[tuple[torch.Tensor, ...]]:
+        """Returns the constants of each item of a group."""
+        items = range(1, 1 + len(getattr(self, name)))
+        return [tuple(constants[f"{q.name}_{k}"] for q in self.groups[name]) for k in items]
+
+    def viscosity(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the Kelvin-Voigt retardation times of shear and bulk [s], (1 or B, 1) each."""
+        return (constants["stiffness_damping"],) * 2
 
     @abstractmethod
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -212,35 +266,44 @@ class Gent(DensityMaterial):
         return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
 
 
-_FIBRE = (
-    Quantity("azimuth", "rad", per="element"),
-    Quantity("elevation", "rad", per="element"),
-    Quantity("tension", "Pa", 0.0, closed=True, per="element"),
-    Quantity("stiffening", "Pa", 0.0, closed=True, per="element"),
-    Quantity("compression", "Pa", 0.0, closed=True, per="element"),
-)
+def _modulus(name: str) -> Quantity:
+    return Quantity(name, "Pa", 0.0, closed=True, per="element")
 
 
-@dataclass(frozen=True)
-class FibreFamily:
-    """Fibres along e = (cos beta cos alpha, cos beta sin alpha, sin beta) at rest, with q = |F e|^2 - 1.
+class FibreFamily(NamedTuple):
+    """Fibres along e = (cos beta cos alpha, cos beta sin alpha, sin beta) at rest, of stretch l = |F e|, q = l^2 - 1.
 
-    Numbers, or a value for each element of a curved body.
+    Numbers, or a value for each element of a curved body. A fibre of a slack pulls beyond the stretch 1 + slack.
     """
 
     azimuth: Parameter = 0.0  # alpha [rad]
     elevation: Parameter = 0.0  # beta [rad]
-    tension: Parameter = 0.0  # of q^2 where q > 0 [Pa]
+    slack: Parameter = 0.0  # of the stretch
+    toe: Parameter = 0.02  # strain beyond the slack, over which the fibre tightens
+    tension: Parameter = 0.0  # of (l - 1 - slack)^2 / 2 [Pa]
     stiffening: Parameter = 0.0  # of q^3 where q > 0 [Pa]
     compression: Parameter = 0.0  # of q^2 where q < 0 [Pa]
 
 
 @dataclass(frozen=True)
 class ConvexMaterial(Material):
-    """Rubber of terms with non-negative coefficients: powers of invariants, and families of fibres.
+    """Rubber of terms with non-negative coefficients: powers of invariants, Ogden's terms, and families of fibres.
 
-    With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993).
+    With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
+    that of Ogden (1972). Viscosities and branches have moduli of their own, independent of the elastic coefficients, so
+    that forces are linear in all coefficients.
     """
+
+    groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
+        "prony": (Quantity("prony_modulus", "Pa", 0.0, closed=True), _PRONY_TIME),
+        "fibres": (
+            Quantity("fibre_azimuth", "rad", per="element"),
+            Quantity("fibre_elevation", "rad", per="element"),
+            Quantity("fibre_slack", "", 0.0, closed=True, per="element"),
+            Quantity("fibre_toe", "", 0.0, per="element"),
+            *map(_modulus, ("fibre_tension", "fibre_stiffening", "fibre_compression")),
+        ),
+    }
 
     c10: Parameter = constant(44e3, "c10", "Pa", closed=True)  # of a [Pa]
     c20: Parameter = constant(0.0, "c20", "Pa", closed=True)  # of a^2 [Pa]
@@ -250,22 +313,29 @@ class ConvexMaterial(Material):
     dilation: Parameter = constant(0.0, "dilation", "Pa", closed=True)  # of j^2 at shape points [Pa]
     bulk_1: Parameter = constant(22e6, "bulk_1", "Pa", closed=True)  # of j^2 at volume points [Pa]
     bulk_2: Parameter = constant(0.0, "bulk_2", "Pa", closed=True)  # of j^4 there [Pa]
+    shear_viscosity: Parameter = constant(0.0, "shear_viscosity", "Pa s", closed=True, per="", common=True)  # [Pa s]
+    bulk_viscosity: Parameter = constant(0.0, "bulk_viscosity", "Pa s", closed=True, per="", common=True)  # [Pa s]
+    # modulus mu that a term of Ogden has at small strains [Pa], by its exponent, a whole number
+    ogden: Mapping[int, Parameter] = field(default_factory=dict, kw_only=True)
     fibres: Sequence[FibreFamily] = field(default=(), kw_only=True)
+    stiffness_damping: Parameter = field(default=0.0, init=False, repr=False)  # replaced by the viscosities
 
     def __post_init__(self) -> None:
         """Builds the law.
 
         Raises:
-            InputError: a coefficient is negative or not finite, or a family of fibres is not a `FibreFamily`.
+            InputError: a coefficient is negative or not finite, or an exponent lies between -2 and 2.
         """
-        for number, family in enumerate(self.fibres):
-            if not isinstance(family, FibreFamily):
-                raise InputError(f"fibres[{number}] is {family!r}: give a FibreFamily(azimuth, elevation, tension).")
-        count = len(self.fibres)
+        wrong = [n for n in self.ogden if not isinstance(n, int) or -3 < n < 3]
+        if wrong:
+            raise InputError(f"ogden has the exponent {wrong[0]!r}: give whole numbers from 3 up or from -3 down.")
+        terms, families = len(self.ogden), len(self.fibres)
         law = {
-            "law": convex_law(count),
-            "rules": ("shape",) * 6 + ("volume",) * 2 + (("mean",) * 3 + ("shape",) * 3) * count,
-            "curvature": (4.0, 0.0, 0.0, 4.0, 0.0, 2.0, 2.0, 0.0) + (0.0, 0.0, 0.0, 8.0, 0.0, 8.0) * count,
+            "law": convex_law(tuple(self.ogden), families),
+            "rules": (*("shape",) * 6, "volume", "volume", "shape", "volume", *("shape",) * terms)
+            + (*("mean",) * 5, *("shape",) * 3) * families,
+            "curvature": (4.0, 0.0, 0.0, 4.0, 0.0, 2.0, 2.0, 0.0, 0.0, 0.0, *(2.0,) * terms)
+            + (*(0.0,) * 5, 1.0, 0.0, 8.0) * families,
         }
         for name, value in law.items():
             object.__setattr__(self, name, value)
@@ -273,27 +343,33 @@ class ConvexMaterial(Material):
 
     @property
     @override
-    def quantities(self) -> dict[str, Quantity]:
-        """Constants by name; those of fibres are ``fibre_1_azimuth``, ``fibre_1_tension``, ..."""
-        names = [(f"fibre_{k + 1}_{q.name}", q) for k in range(len(self.fibres)) for q in _FIBRE]
-        return {**super().quantities, **{name: replace(q, name=name) for name, q in names}}
+    def numbered(self) -> dict[str, tuple[Quantity, Parameter]]:
+        """As of every material, and ``ogden_3``, ``ogden_m3`` for the exponent -3, ..."""
+        ogden = {name: (_modulus(name), self.ogden[n]) for n, name in self._ogden.items()}
+        return {**super().numbered, **ogden}
 
     @property
+    def _ogden(self) -> dict[int, str]:
+        return {n: f"ogden_{n}".replace("-", "m") for n in self.ogden}
+
     @override
-    def constants(self) -> dict[str, Parameter]:
-        values = {
-            f"fibre_{k + 1}_{own.name}": getattr(family, own.name)
-            for k, family in enumerate(self.fibres)
-            for own in fields(family)
-        }
-        return {**super().constants, **values}
+    @classmethod
+    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
+        found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in constants}
+        ogden = {int(m[2]) * (-1 if m[1] else 1): constants[name] for name, m in found.items() if m}
+        return cls(**cls._arguments({name: value for name, value in constants.items() if not found[name]}), ogden=ogden)
+
+    @override
+    def viscosity(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        return constants["shear_viscosity"], constants["bulk_viscosity"]
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the coefficients, and the direction and coefficients of each family."""
+        """Returns the coefficients, units of viscosity, Ogden's terms, and direction and constants of each family."""
         moduli = [constants[name] for name in list(self.own_quantities())[:ISOTROPIC]]
-        for k in range(len(self.fibres)):
-            azimuth, elevation, *own = (constants[f"fibre_{k + 1}_{q.name}"] for q in _FIBRE)
+        moduli += [torch.ones_like(moduli[0])] * 2
+        moduli += [constants[name] for name in self._ogden.values()]
+        for azimuth, elevation, *own in self.group("fibres", constants):
             level = elevation.cos()
             moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *own]
         return tuple(moduli)
@@ -315,18 +391,4 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
     """
     if model not in MATERIALS:
         raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    own = MATERIALS[model].own_quantities()
-    branches = {name: value for name, value in constants.items() if re.fullmatch(r"prony_(ratio|time)_[1-9]\d*", name)}
-    count = len(branches) // 2
-    names = [(f"{PRONY_RATIO.name}_{k}", f"{PRONY_TIME.name}_{k}") for k in range(1, 1 + count)]
-    if {*branches} != {*chain.from_iterable(names)}:
-        raise InputError(
-            f"the Prony branches are {', '.join(sorted(branches))}: give each, numbered from 1, its prony_ratio_ and "
-            "its prony_time_."
-        )
-    for name in constants:
-        if name not in own and name not in branches:
-            names_text = ", ".join((*own, "prony_ratio_1, prony_time_1, ..."))
-            raise InputError(f"{model} has no constant {name!r}: it has {names_text}")
-    values = {name: value for name, value in constants.items() if name in own}
-    return MATERIALS[model](**values, prony=[(branches[ratio], branches[time]) for ratio, time in names])
+    return MATERIALS[model].from_constants(constants)

@@ -21,7 +21,7 @@ from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
-from .materials import PRONY_RATIO, PRONY_TIME, Material
+from .materials import Material
 from .viscosity import Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
@@ -162,16 +162,17 @@ class BoundSolid(BoundEnergy):
         material = self._solid.material
         moduli = torch.broadcast_tensors(*material.moduli(parameters))
         spreads = [spread(self._shares[rule], m) for rule, m in zip(material.rules, moduli, strict=True)]
-        damping, ratio, time = parameters["stiffness_damping"][:, 0], None, None
+        damping = torch.cat(torch.broadcast_tensors(*material.viscosity(parameters)), 1)
+        ratio = time = None
         if material.prony:
-            names = [[f"{q.name}_{k + 1}" for k in range(len(material.prony))] for q in (PRONY_RATIO, PRONY_TIME)]
-            ratio, time = (torch.cat(torch.broadcast_tensors(*(parameters[n] for n in own)), 1) for own in names)
+            branches = zip(*material.group("prony", parameters), strict=True)
+            ratio, time = (torch.cat(torch.broadcast_tensors(*own), 1) for own in branches)
             if not (ratio.requires_grad or bool((ratio > 0).any())):
                 ratio = time = None
         damped = damping.requires_grad or bool((damping > 0).any())
         return {
             "stiffness": torch.stack(spreads, dim=-1),
-            "stiffness_damping": damping if damped else None,
+            "damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,
         }
@@ -182,8 +183,8 @@ class BoundSolid(BoundEnergy):
         return Mass(inertia, weight, parameters["mass_damping"])
 
     def _viscosity(self, constants: Constants) -> Viscosity:
-        damping, ratio, time = (constants.values[name] for name in ("stiffness_damping", "prony_ratio", "prony_time"))
-        zero = self.site.rest_positions.new_zeros(1)
+        damping, ratio, time = (constants.values[name] for name in ("damping", "prony_ratio", "prony_time"))
+        zero = self.site.rest_positions.new_zeros(1, 2)
         return Viscosity(zero if damping is None else damping, damping is not None, ratio, time)
 
     def _values(self, *values: torch.Tensor | None) -> dict[str, torch.Tensor | None]:

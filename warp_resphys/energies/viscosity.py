@@ -5,8 +5,8 @@ the additional density
 
     mu (c E - 2 W) : E + lambda / 2 (d tr E - 2 w) tr E .
 
-Kelvin-Voigt viscosity of retardation time beta has c = d = beta / h_e, W = c R with the reference strain R of the
-integrator's stage, and w = d tr R.
+Kelvin-Voigt viscosity of retardation times beta and beta_b of shear and bulk, mostly equal, has c = beta / h_e,
+d = beta_b / h_e, W = c R with the reference strain R of the integrator's stage, and w = d tr R.
 
 Prony branches relax shear only: G(t) = mu (1 + sum_k g_k exp(-t / tau_k)), with the long-term modulus mu; lambda stays
 elastic, as is usual for rubber. Branch k has the strain H_k that has not relaxed yet:
@@ -37,8 +37,8 @@ StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
 class Viscosity:
     """Viscous constants of a solid."""
 
-    damping: torch.Tensor  # (1 or B,) retardation time beta [s]
-    damped: bool  # whether beta may be non-zero
+    damping: torch.Tensor  # (1 or B, 2) retardation times beta of shear and bulk [s]
+    damped: bool  # whether these may be non-zero
     ratio: torch.Tensor | None  # (1 or B, K) moduli of the Prony branches over mu; None without branches
     time: torch.Tensor | None  # (1 or B, K) their relaxation times [s]
 
@@ -55,13 +55,14 @@ class Viscosity:
             time_step: h [s].
         """
         batch = len(q)
-        c = d = (self.damping / stage.step).expand(batch)
+        both = (self.damping / stage.step).expand(batch, 2)
+        c, d = both.unbind(1)
         offset = dilation = None
         if self.damped:
-            offset = _scale(d, reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights]))
-            dilation = offset.diagonal(dim1=-2, dim2=-1).sum(-1)
+            reference = reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights])
+            offset, dilation = _scale(c, reference), d[:, None] * reference.diagonal(dim1=-2, dim2=-1).sum(-1)
         if self.ratio is None or self.time is None:
-            return d[:, None].expand(batch, 2), offset, dilation
+            return both, offset, dilation
         decay, gamma = relaxation(self.time, stage.end * time_step)
         added = (self.ratio * gamma).expand(batch, -1).sum(1)
         branches = _scale(added, strain(q))

@@ -1,0 +1,162 @@
+"""Coefficients in which the forces of a simulator are linear, from the balance of forces of observed motions.
+
+With the positions of all vertices at every step, the residual of a step (`Simulator.linearise`) at the observed
+solution is g_0 + sum_k theta_k a_k, where a_k is the force of coefficient k alone. The coefficients are the
+non-negative least-squares solution of
+
+    min sum || H^-1 (g_0 + sum_k theta_k a_k) ||^2
+
+over steps and motions: the weak form of an unknown law (Flaschel, Kumar and De Lorenzis, Computer Methods in Applied
+Mechanics and Engineering 381, 2021). H is the Hessian of a longer step, whose inverse turns forces into the
+displacements that they would cause. Without this weight, forces of nearly incompressible modes rule the sum.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import torch
+from numpy.typing import NDArray
+
+from ..dynamics.simulator import Simulator
+from ..energies.solid import VISCOUS_STRAIN
+from ..io.errors import InputError
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+
+FloatArray = NDArray[np.float64]
+Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
+
+_AT_ONCE = 256  # environments of a batch
+_RIDGE = 1e-14  # of the trace, where columns are dependent
+
+
+@dataclass(frozen=True)
+class Motion:
+    """B observed motions with the same number of steps T."""
+
+    q: torch.Tensor  # (T + 1, B, N, 3) positions of all vertices at the steps [m]
+    v: torch.Tensor  # (B, N, 3) velocities at the start [m/s]
+    inputs: Inputs = field(default_factory=Inputs)  # during the steps
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients of a fit."""
+
+    coefficients: FloatArray  # (K,)
+    residual: float  # root mean square over that without these forces
+
+
+class WeakForm:
+    """Balance of forces of motions.
+
+    Args:
+        simulator: simulator with all energies, of which some have unknown coefficients.
+        motions: motions that begin without memory, as after a long rest.
+        zero: values of the parameters without the forces of these coefficients.
+        stiffness: values of the parameters for the Hessian of the weight.
+        stride: steps from one row to the next.
+        weight_step: time step of that Hessian [s].
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        motions: Sequence[Motion],
+        zero: Candidate,
+        stiffness: Candidate,
+        stride: int = 5,
+        weight_step: float = 0.05,
+    ) -> None:
+        if not motions or stride < 1:
+            raise InputError("there is no step to balance: give at least one motion, and a stride of one or more.")
+        self._simulator, self._zero, self._stride = simulator, dict(zero), stride
+        self._slow = replace(simulator, time_step=weight_step)
+        self._stiff = self._slow.prepare(stiffness)
+        self._motions = motions
+        with torch.no_grad():
+            self._states = [list(self._along(motion)) for motion in motions]
+        self.target = -self._rows([self._zero])[:, 0]  # (R,) rows of -H^-1 g_0
+
+    def columns(self, candidates: Sequence[Candidate]) -> FloatArray:
+        """Returns H^-1 a_k (R, K) of K candidates [m]; rows run over steps, motions and free coordinates."""
+        return self._rows([self._zero, *candidates])[:, 1:] + self.target[:, None]
+
+    def _along(self, motion: Motion) -> "list[State]":
+        """Returns the states at the start of every step, without memory."""
+        method, step = self._simulator.method, self._simulator.time_step
+        states = [State(motion.q[0], motion.v)]
+        for q in motion.q[1:-1]:
+            x = method.solution_for(states[-1], q)
+            states.append(replace(method.finish(states[-1], x, step), q=q))
+        return states
+
+    @torch.no_grad()
+    def _rows(self, candidates: Sequence[Candidate]) -> FloatArray:
+        """Returns the weighted residuals (R, K) with the parameters of each candidate, the others being zero."""
+        parts = []
+        for motion, states in zip(self._motions, self._states, strict=True):
+            most = max(1, _AT_ONCE // motion.q.shape[1])
+            chunks = [candidates[i : i + most] for i in range(0, len(candidates), most)]
+            parts.append(np.concatenate([self._of_motion(motion, states, chunk) for chunk in chunks], axis=1))
+        return np.concatenate(parts)
+
+    def _of_motion(self, motion: Motion, states: Sequence[State], candidates: Sequence[Candidate]) -> FloatArray:
+        simulator, count = self._simulator, len(candidates)
+        batch = motion.q.shape[1]
+        names = set().union(*candidates)
+        values = {name: [c.get(name, self._zero.get(name, 0.0)) for c in candidates] for name in names}
+        spread = {
+            name: motion.q.new_tensor(own).repeat_interleave(batch)[:, None]
+            for name, own in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
+        }
+        constants = simulator.prepare(spread)
+        carries = any(name.startswith("prony") and any(own) for name, own in values.items())
+        memory: Mapping[str, torch.Tensor] = {}
+        rows = []
+        for number, start in enumerate(states):
+            if number % self._stride and not carries:
+                continue
+            state = replace(start.map(lambda t: t.repeat(count, 1, 1)), memory=memory)
+            end = motion.q[number + 1]
+            inputs = motion.inputs.at(number).repeat(count)
+            if number % self._stride == 0:
+                x = simulator.method.solution_for(state, end.repeat(count, 1, 1))
+                rows.append(self._weighted(simulator.linearise(state, inputs, constants).residual(x), end))
+            if carries:
+                memory = simulator.remember(state, end.repeat(count, 1, 1), constants).memory
+                memory = {name: value for name, value in memory.items() if name.endswith(VISCOUS_STRAIN)}
+        return np.concatenate(rows)
+
+    def _weighted(self, residuals: torch.Tensor, at: torch.Tensor) -> FloatArray:
+        """Returns H^-1 g on the free vertices, (B 3F, K), of residuals (K B, N, 3) at positions (B, N, 3)."""
+        lin = self._slow.linearise(State(at, torch.zeros_like(at)), None, self._stiff)
+        lin.factorise(at)
+        forces = residuals.unflatten(0, (-1, len(at))).permute(1, 2, 3, 0).flatten(1, 2)
+        moved = lin.solve(forces).unflatten(1, (-1, 3))[:, lin.free]
+        rows: FloatArray = moved.flatten(0, 2).cpu().numpy().astype(np.float64)
+        return rows
+
+
+def fit(columns: FloatArray, target: FloatArray) -> Fit:
+    """Returns the non-negative least-squares solution of columns (R, K) theta = target (R,).
+
+    The columns are scaled to unit length, and the normal equations are solved, as R is much larger than K.
+    """
+    scale = np.linalg.norm(columns, axis=0)
+    used = scale > 0.0
+    unit = columns[:, used] / scale[used]
+    normal = unit.T @ unit
+    root = scipy.linalg.cholesky(normal + _RIDGE * np.trace(normal) / max(len(normal), 1) * np.eye(len(normal)))
+    right = scipy.linalg.solve_triangular(root, unit.T @ target, trans=1)
+    theta = np.zeros(len(scale))
+    theta[used] = scipy.optimize.nnls(root, right)[0] / scale[used]
+    return Fit(theta, residual_of(columns @ theta, target))
+
+
+def residual_of(forces: FloatArray, target: FloatArray) -> float:
+    """Returns the root mean square of forces less target, over that of the target."""
+    return float(np.linalg.norm(forces - target) / np.linalg.norm(target))

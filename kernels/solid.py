@@ -47,6 +47,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
+    shares = bool(getattr(law, "SHARED", 0))
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.func(module=module)
@@ -61,6 +62,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
+        shared: wp.array2d[wp.float64],  # (B, S) values of the law that all points share; (B, 0) for most laws
         viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
         strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
@@ -74,7 +76,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
-        energy, stress = response(f, m)
+        if wp.static(shares):
+            energy, stress = response(f, m, shared[b])
+        else:
+            energy, stress = response(f, m)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
@@ -111,6 +116,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -124,7 +130,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]
-        elastic_tangent(f, m, clamp[b] != 0, out)
+        if wp.static(shares):
+            elastic_tangent(f, m, shared[b], clamp[b] != 0, out)
+        else:
+            elastic_tangent(f, m, clamp[b] != 0, out)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
@@ -141,6 +150,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -178,4 +188,31 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         strain_out[b, p] = (TWO * shape) * rise
         dilation_out[b, p] = bulk * swelling
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+    made = SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+    if not shares:
+        return made
+    add_slopes = law.shared_slopes
+
+    @wp.kernel(module=module)
+    def shared_adjoint(
+        nodes: wp.array2d[int],
+        gradients: wp.array2d[wp.vec3d],
+        stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
+        viscosity: wp.array[wp.vec2d],
+        strain_offset: wp.array2d[wp.mat33d],
+        dilation_offset: wp.array2d[wp.float64],
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        direction: wp.array2d[wp.vec3d],  # (B, N) z [m]
+        shared_out: wp.array3d[wp.float64],  # (B, G, S) parts of dL/d shared, zero before: point p adds to part p mod G
+    ):
+        b, first = wp.tid()
+        for p in range(first, stiffness.shape[1], shared_out.shape[1]):
+            cell = p / points_per_cell
+            f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+            dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
+            add_slopes(f, dz, stiffness[b, p], shared[b], shared_out[b, first])
+
+    made.shared_adjoint = shared_adjoint
+    return made

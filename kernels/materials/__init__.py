@@ -11,6 +11,6 @@ and volume terms may be integrated at different points, so that a modulus may be
 - ``tangent(f, m, clamp, out)``: the blocks of dP/dF; with ``clamp``, without negative eigenvalues.
 
 A law with values that all points of an environment share, such as the weights of a network, has their number
-``SHARED``. ``response`` and ``tangent`` take these values after the moduli, and ``shared_slopes(f, df, m, shared, out)``
-subtracts the derivatives of P : df by them from an array.
+``SHARED``. Then ``response`` and ``tangent`` take these values after the moduli, and
+``shared_slopes(f, df, m, shared, out)`` subtracts the derivatives of P : df by them from an array.
 """

@@ -10,8 +10,9 @@ of two layers of `UNITS` units with the activation s(z) = (z + sqrt(z^2 + 1)) / 
     h_k = s(R_k . x + r_k),    y_i = s(sum_k C_ki h_k + Q_i . x + q_i),    N = sum_i u_i y_i + k_a x_1 + k_b x_2
 
 C, u, k_a, k_b and the first two components of R_k and Q_i must not be negative: then N is convex in x and does not
-decrease with a and b. As a is convex in (F, J), b convex in (cof F, J) and j linear in J, W is polyconvex (Ball, Archive
-for Rational Mechanics and Analysis 63, 1976; Klein et al., Journal of the Mechanics and Physics of Solids 159, 2022).
+decrease with a and b. As a is convex in (F, J), b convex in (cof F, J) and j linear in J, W is polyconvex (Ball,
+Archive for Rational Mechanics and Analysis 63, 1976; with such networks Klein et al., Journal of the Mechanics and
+Physics of Solids 159, 2022).
 Since a and b are not negative, W has its minimum at rest. At small strains mu is 2 S (N_1 + N_2) / L, and lambda is
 S N_33 / L_j^2 + 2 g_2, with derivatives N_1, N_2 and N_33 at rest.
 
@@ -205,9 +206,7 @@ def shared_slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, w: wp.array[wp.float64
 
 
 @wp.func
-def add_row(
-    x: wp.vec3d, v: wp.vec3d, by_argument: wp.float64, by_rate: wp.float64, out: wp.array[wp.float64], at: int
-):
+def add_row(x: wp.vec3d, v: wp.vec3d, by_argument: wp.float64, by_rate: wp.float64, out: wp.array[wp.float64], at: int):
     """Subtracts the derivatives by R_k and r_k, or by Q_i and q_i."""
     for c in range(3):
         out[at + c] -= by_argument * x[c] + by_rate * v[c]

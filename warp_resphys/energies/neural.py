@@ -71,9 +71,10 @@ def lame(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> torch.Tensor:
-    """Returns random weights (W,) with a shear modulus at small strains, and at most half of lambda.
+    """Returns random weights (W,) with a shear modulus mu at small strains, and at most mu and half of lambda.
 
-    Half of mu is that of the units, the rest that of the terms that are linear in the invariants.
+    Half of mu is that of the units, the rest that of the terms that are linear in the invariants. Most of lambda is
+    left to the terms at volume points, against locking.
 
     Args:
         shear_modulus: mu [Pa].
@@ -96,7 +97,7 @@ def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> 
     rest = (1.0 - _NETWORK_SHARE) * shear_modulus * LENGTH / (2.0 * ENERGY)
     direct += rest * torch.tensor([1.0 - _SECOND_SHARE, _SECOND_SHARE], dtype=torch.float64)
     _, volume = lame(_joined((first, coupling, second, output, direct)))
-    smaller = (0.5 * lame_lambda / volume).sqrt().clamp_max(1.0)
+    smaller = (min(0.5 * lame_lambda, shear_modulus) / volume).sqrt().clamp_max(1.0)
     first[:, 2] *= smaller
     second[:, 2] *= smaller
     values = _joined((first, coupling, second, output, direct))
@@ -107,8 +108,8 @@ def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> 
 class NeuralMaterial(Material):
     """Rubber whose polyconvex energy is a network of a few hundred weights, beside two terms of the volume.
 
-    The network is that of ``kernels.materials.neural``: convex and never stressed at rest for all real weights, as
-    `bounded` makes those positive that must be. Weights are shared by all elements.
+    The network is that of ``kernels.materials.neural``, convex and without stress at rest for any real weights:
+    `bounded` makes those positive that must be. All elements share the weights.
     """
 
     law = neural

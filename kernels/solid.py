@@ -10,7 +10,7 @@ from .points import deformation_gradient, green_strain
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, HALF, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0)
+ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.float64(4.0)
 
 
 @wp.kernel
@@ -47,7 +47,8 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
-    shares = bool(getattr(law, "SHARED", 0))
+    shares = bool(getattr(law, "SHARED", 0))  # then the law has its own dissipation too
+    dissipation = getattr(law, "dissipation", None)
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.func(module=module)
@@ -86,7 +87,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             strain = green_strain(f)
             dilation = wp.trace(strain)
             left, rest = c[0] * strain - strain_offset[b, p], c[1] * dilation - dilation_offset[b, p]
-            energy += shape * wp.ddot(left - strain_offset[b, p], strain)
+            if wp.static(shares):
+                phi = dissipation(wp.ddot(left, left), shared[b])
+                energy += shape * phi[0] / c[0]
+                left = phi[1] * left
+            else:
+                energy += shape * wp.ddot(left - strain_offset[b, p], strain)
             energy += HALF * bulk * (rest - dilation_offset[b, p]) * dilation
             stress += f * isotropic(left, rest, shape, bulk)
         stress_out[b, p] = stress
@@ -108,6 +114,14 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
                 block[1, 1] += stress[k, n]
                 block[2, 2] += stress[k, n]
                 out[(k * (k + 1)) / 2 + n] += block
+
+    @wp.func(module=module)
+    def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
+        """Adds the blocks of a factor times the product of a matrix with itself."""
+        columns = wp.transpose(a)
+        for k in range(3):
+            for n in range(k + 1):
+                out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
 
     @wp.kernel(module=module)
     def tangent(
@@ -138,8 +152,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
             strain = green_strain(f)
-            rest = c[1] * wp.trace(strain) - dilation_offset[b, p]
-            stress = isotropic(c[0] * strain - strain_offset[b, p], rest, shape, bulk)
+            left, rest = c[0] * strain - strain_offset[b, p], c[1] * wp.trace(strain) - dilation_offset[b, p]
+            if wp.static(shares):
+                phi = dissipation(wp.ddot(left, left), shared[b])
+                add_square(f * left, FOUR * c[0] * shape * phi[2], out)
+                shape = phi[1] * shape
+            stress = isotropic(left, rest, shape, bulk)
             if clamp[b] != 0:
                 # The stress part of the viscous Hessian may be indefinite and is dropped in a clamped Hessian.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
@@ -179,10 +197,15 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         swelling = wp.trace(rise)
         strain = green_strain(f)
         dilation = wp.trace(strain)
-        by_shape, by_volume = ZERO, ZERO
+        left, by_volume = wp.mat33d(), ZERO
         if c[0] + c[1] > ZERO:  # Without viscosity the offsets are not set.
-            by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
+            left = c[0] * strain - strain_offset[b, p]
             by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
+        by_shape = TWO * wp.ddot(left, rise)
+        if wp.static(shares):  # S = 2 mu phi'(A : A) A with A = c E - W; `rise` becomes dS/dA : rise / (2 mu)
+            phi = dissipation(wp.ddot(left, left), shared[b])
+            rise = phi[1] * rise + (phi[2] * by_shape) * left
+            by_shape = phi[1] * by_shape
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
         stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
         strain_out[b, p] = (TWO * shape) * rise
@@ -191,7 +214,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     made = SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
     if not shares:
         return made
-    add_slopes = law.shared_slopes
+    add_slopes, add_dissipation_slopes = law.shared_slopes, law.dissipation_slopes
 
     @wp.kernel(module=module)
     def shared_adjoint(
@@ -212,7 +235,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             cell = p / points_per_cell
             f = deformation_gradient(positions, nodes, gradients, b, p, cell)
             dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
-            add_slopes(f, dz, stiffness[b, p], shared[b], shared_out[b, first])
+            m, c = stiffness[b, p], viscosity[b]
+            add_slopes(f, dz, m, shared[b], shared_out[b, first])
+            if c[0] > ZERO:
+                left = c[0] * green_strain(f) - strain_offset[b, p]
+                along = TWO * wp.dot(mu_of, m) * wp.ddot(f * left, dz)
+                add_dissipation_slopes(wp.ddot(left, left), along, shared[b], shared_out[b, first])
 
     made.shared_adjoint = shared_adjoint
     return made

@@ -16,7 +16,15 @@ Physics of Solids 159, 2022).
 Since a and b are not negative, W has its minimum at rest. At small strains mu is 2 S (N_1 + N_2) / L, and lambda is
 S N_33 / L_j^2 + 2 g_2, with derivatives N_1, N_2 and N_33 at rest.
 
-The shared values are r, R, C, Q, q, u and k, as `parts` orders them, then N(0) and n.
+The viscous potential of a step is mu / c phi(|A|^2) with A = c E - W (`energies.viscosity`), where
+
+    phi(p) = kappa p + Y^2 (M(y) - M(0)),    y = sqrt(1 + p / Y^2) - 1,    M(y) = sum_k v_k s(g_k y + e_k)
+
+and kappa, v and g must not be negative. As y and M are convex and do not decrease, phi is convex in A; it may grow like
+|A|, which is a viscosity that falls with the rate, or faster than |A|^2. Kelvin-Voigt viscosity has A = beta dE/dt and
+kappa = 1, v = 0.
+
+The shared values are R and r, C, Q and q, u, k, then kappa, v, g, e, and N(0), n and M(0).
 """
 
 import warp as wp
@@ -29,15 +37,19 @@ from . import mooney_rivlin
 NAME, LAME = "neural", ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, 2.0), (0.0, 0.0))
 UNITS = 8
 LENGTH, LENGTH_J = 0.25, 0.1  # L and L_j: stretches of 1.5 have invariants a of 0.6
-# First index of each part of the shared values: rows (R_k, r_k), columns C_k, rows (Q_i, q_i), u, k, and N(0), n.
+# First index of each part of the shared values: (R_k, r_k), C_k, (Q_i, q_i), u, k, kappa, and v, g, e.
 _COUPLING = 4 * UNITS
 _SECOND = _COUPLING + UNITS * UNITS
 _OUTPUT = _SECOND + 4 * UNITS
 _DIRECT = _OUTPUT + UNITS
-WEIGHTS = _DIRECT + 2
-SHARED = WEIGHTS + 2
+_KAPPA = _DIRECT + 2
+_RATE = _KAPPA + 1
+WEIGHTS = _RATE + 3 * UNITS
+SHARED = WEIGHTS + 3
+RATE = 0.01  # Y
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(12.0)
+SQUARE = wp.float64(RATE * RATE)
 SCALES = wp.constant(wp.vec3d(1.0 / LENGTH, 1.0 / LENGTH, 1.0 / LENGTH_J))
 
 moduli = wp.types.vector(5, wp.float64)  # (S, mu, lambda of W, g_2, g_4); the second and third serve viscosity
@@ -264,3 +276,30 @@ def tangent(f: wp.mat33d, m: moduli, w: wp.array[wp.float64], clamp: bool, out: 
         write_clamped(f, m, w, out)
     else:
         write_tangent(f, m, w, out)
+
+
+@wp.func
+def dissipation(p: wp.float64, w: wp.array[wp.float64]) -> wp.vec3d:
+    """Returns phi and its first two derivatives."""
+    root = wp.sqrt(ONE + p / SQUARE)  # 1 + y
+    m = wp.vec3d(-w[WEIGHTS + 2], ZERO, ZERO)  # M(y) - M(0), M' and M''
+    for k in range(UNITS):
+        g = w[_RATE + UNITS + k]
+        s = activation(g * (root - ONE) + w[_RATE + 2 * UNITS + k])
+        m += w[_RATE + k] * wp.vec3d(s[0], g * s[1], g * g * s[2])
+    second = (m[2] * root - m[1]) / (FOUR * SQUARE * root * root * root)
+    return wp.vec3d(w[_KAPPA] * p + SQUARE * m[0], w[_KAPPA] + m[1] / (TWO * root), second)
+
+
+@wp.func
+def dissipation_slopes(p: wp.float64, factor: wp.float64, w: wp.array[wp.float64], out: wp.array[wp.float64]):
+    """Subtracts the derivatives of factor phi' by the shared values from `out`."""
+    root = wp.sqrt(ONE + p / SQUARE)
+    share = factor / (TWO * root)
+    out[_KAPPA] -= factor
+    for k in range(UNITS):
+        v, g = w[_RATE + k], w[_RATE + UNITS + k]
+        s = activation(g * (root - ONE) + w[_RATE + 2 * UNITS + k])
+        out[_RATE + k] -= share * g * s[1]
+        out[_RATE + UNITS + k] -= share * v * (s[1] + g * (root - ONE) * s[2])
+        out[_RATE + 2 * UNITS + k] -= share * v * g * s[2]

@@ -8,34 +8,59 @@ import pytest
 import torch
 import warp as wp
 
-from warp_resphys import Body, Simulator, SolverSettings, StableNeoHookean, box_hexahedra, select_vertices
+from warp_resphys import Body, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.dynamics.tape import record_rollout
-from warp_resphys.energies.neural import NeuralMaterial, initial_weights
+from warp_resphys.energies.neural import ENERGY, NeuralMaterial, initial_weights, parts
 from warp_resphys.io.errors import InputError
+from warp_resphys.kernels.materials.neural import LENGTH
 from warp_resphys.learning.parameters import identifiable_parameters
-from warp_resphys.studies.gradient_check import POSES, check_gradients
+from warp_resphys.studies.gradient_check import POSES, central_difference, check_gradients
 
 BEAM = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 BODY = Body(BEAM, fixed=select_vertices(BEAM, x=0.0))
 TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
 MU, LAMBDA = 40e3, 1e6
+VISCOUS = {"stiffness_damping": 5e-3, "prony": [(0.3, 0.02)]}
 OTHER = initial_weights(60e3, LAMBDA, seed=1)
 
 
 def simulator(material=None, **more):
-    own = material or NeuralMaterial.from_lame(MU, LAMBDA, stiffness_damping=1e-3, prony=[(0.3, 0.02)])
+    own = material or NeuralMaterial.from_lame(MU, LAMBDA, **VISCOUS)
     return Simulator(BODY, own, solver=TIGHT, integrator="bdf2", **more)
 
 
-def test_small_motions_are_those_of_its_lame_constants():
-    e, nu = MU * (3.0 * LAMBDA + 2.0 * MU) / (LAMBDA + MU), 0.5 * LAMBDA / (LAMBDA + MU)
-    pair = NeuralMaterial.from_lame(MU, LAMBDA), StableNeoHookean(e, nu)
-    ends = []
-    body = replace(BODY, volume_integration="full")  # Else the volume of the network is integrated at other points.
-    for material in pair:
-        sim = replace(simulator(material, gravity=(0.0, 0.0, 1e-4)), body=body)
-        ends.append(sim.rollout(sim.rest_state(), 5).q[-1] - sim.rest_positions)
-    torch.testing.assert_close(*ends, rtol=0.0, atol=1e-4 * float(ends[1].abs().max()))
+def test_without_units_it_is_mooney_rivlin_rubber_with_kelvin_voigt_viscosity():
+    c10, c01, bulk = 18e3, 4e3, 2e6
+    weights = OTHER.clone()
+    *_, output, direct, linear, rate = parts(weights)
+    for own, value in ((output, 0.0), (rate[0], 0.0), (direct[0], c10 * LENGTH / ENERGY), (linear, 1.0)):
+        own.fill_(math.log(math.expm1(value)) if value else -100.0)
+    direct[1] = math.log(math.expm1(c01 * LENGTH / ENERGY))
+    g2 = 0.5 * (bulk - 4.0 / 3.0 * (c10 + c01))
+    pair = NeuralMaterial(weights, g2, **VISCOUS), MooneyRivlin(c10, c01, bulk, **VISCOUS)
+    runs = [sim.rollout(sim.rest_state(), 10).q for sim in map(simulator, pair)]
+    torch.testing.assert_close(runs[0], runs[1], rtol=0.0, atol=1e-10)
+    assert (runs[0][-1] - runs[0][0]).abs().max() > 1e-3
+
+
+def test_a_step_minimises_its_energy():
+    """The residual is the derivative of the energy, with rates at which viscosity is not linear."""
+    sim = simulator()
+    start = sim.rest_state()
+    start.v[:, :, 2] = 10.0 * sim.rest_positions[:, 0]
+    sim.step(start)
+    potential = sim.workspace(1).potential
+    solution = potential.positions.clone()
+    move = potential.restrict(torch.randn(solution.shape, generator=torch.Generator().manual_seed(0)).double())
+
+    def energy(x):
+        potential.positions.copy_(solution + 1e-3 * move + 1e-4 * x * move)
+        return float(potential.evaluate()[0])
+
+    slope, uncertainty = central_difference(energy)
+    energy(0.0)
+    assert slope == pytest.approx(float(1e-4 * (potential.residual * move).sum()), rel=1e-6)
+    assert uncertainty < 1e-7 * slope
 
 
 @pytest.mark.parametrize("pose", POSES)

@@ -26,14 +26,15 @@ def weights_of(seed):
     return torch.randn(neural.WEIGHTS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+def activated(z):
+    return 0.5 * (z + (z**2 + 1.0).sqrt())
+
+
 def energy(f, weights, g2=G2, g4=G4):
     """Energies (B) of deformation gradients (B, 3, 3) by the formula."""
 
-    def activated(z):
-        return 0.5 * (z + (z**2 + 1.0).sqrt())
-
     def network(x):
-        first, coupling, second, output, direct = parts(bounded(weights))
+        first, coupling, second, output, direct, *_ = parts(bounded(weights))
         h = activated(x @ first[:, :3].T + first[:, 3])
         y = activated(h @ coupling + x @ second[:, :3].T + second[:, 3])
         return y @ output + x[:, :2] @ direct
@@ -65,6 +66,15 @@ def evaluate(
     slopes_out[i] = neural.slopes(f[i], df[i], m, m)
     neural.shared_slopes(f[i], df[i], m, w, shared_out[i])
     neural.tangent(f[i], m, w, clamp, tangent_out[i])
+
+
+@wp.kernel(module=MODULE)
+def evaluate_dissipation(
+    p: wp.array[wp.float64], w: wp.array[wp.float64], phi_out: wp.array[wp.vec3d], slopes_out: wp.array2d[wp.float64]
+):
+    i = wp.tid()
+    phi_out[i] = neural.dissipation(p[i], w)
+    neural.dissipation_slopes(p[i], wp.float64(1.0), w, slopes_out[i])
 
 
 def response(weights, f=GRADIENTS, clamp=False):
@@ -158,3 +168,32 @@ def test_it_is_convex_along_rank_one_directions_and_least_at_rest(seed):
     curvature = np.einsum("nki,nij,nkj->nk", along, tangent, along)
     assert (curvature.min(1) > -1e-9 * np.abs(tangent).max((1, 2))).all()
     assert np.linalg.eigvalsh(tangent).min() < 0.0  # not convex in F
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_dissipation_is_that_of_its_formula_and_convex(seed):
+    weights = weights_of(seed).requires_grad_(True)
+    size = torch.tensor([0.0, 1e-3, 0.01, 0.1, 1.0], dtype=torch.float64, requires_grad=True)  # |A|
+    p = size.detach().square().requires_grad_(True)
+    *_, kappa, (v, g, e) = parts(bounded(weights))
+
+    def phi(p):
+        y = (1.0 + p / 0.01**2).sqrt()[:, None] - 1.0
+        return kappa * p + 0.01**2 * ((activated(g * y + e) - activated(e)) * v).sum(1)
+
+    values, slopes = wp.zeros(5, dtype=wp.vec3d), wp.zeros((5, neural.SHARED), dtype=wp.float64)
+    shared = NeuralMaterial().shared({"weights": weights})
+    own = [wp.array(array.detach().numpy(), dtype=wp.float64) for array in (p, shared)]
+    wp.launch(evaluate_dissipation, 5, [*own, values, slopes], device="cpu")
+    (first,) = torch.autograd.grad(phi(p).sum(), p, create_graph=True)
+    (second,) = torch.autograd.grad(first.sum(), p, retain_graph=True)
+    expected = torch.stack([phi(p), first, second], 1).detach()
+    np.testing.assert_allclose(values.numpy(), expected, rtol=1e-9, atol=1e-15)
+    for n in range(5):
+        (by_weights,) = torch.autograd.grad(first[n], weights, retain_graph=True)
+        (product,) = torch.autograd.grad(shared, weights, -torch.as_tensor(slopes.numpy()[n]), retain_graph=True)
+        np.testing.assert_allclose(product, by_weights, rtol=1e-9, atol=1e-13)
+    (rise,) = torch.autograd.grad(phi(size.square()).sum(), size, create_graph=True)
+    assert (torch.autograd.grad(rise.sum(), size)[0] > 0.0).all()
+    assert (rise[1:] > 0.0).all()
+    assert seed or float(first[0].detach()) == pytest.approx(1.0, rel=1e-12)

@@ -1,5 +1,6 @@
 """An elastic material whose energy is an input-convex neural network of invariants (`kernels.materials.neural`)."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
@@ -14,32 +15,34 @@ from ..stepping.quantity import Parameter, Quantity
 from .materials import Material, constant
 
 ENERGY = 100e3 * LENGTH  # S [J/m^3]: with weights of one, moduli of the order of 100 kPa
-_NETWORK_SHARE = 0.5  # of initial weights: contribution of the network's units to mu
+_NETWORK_SHARE = 0.5  # of initial weights: contribution of the network's units to mu and to viscosity
+_SHAPES = ((UNITS, 4), (UNITS, UNITS), (UNITS, 4), (UNITS,), (2,), (1,), (3, UNITS))
 _SECOND_SHARE = 0.2  # of initial weights: contribution of the second invariant to the remaining mu
 
-Parts = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+Parts = tuple[torch.Tensor, ...]
 
 
 def parts(values: torch.Tensor) -> Parts:
-    """Splits values (..., W), in the order of the kernels: (R, r), C, (Q, q), u and k (`kernels.materials.neural`).
+    """Splits values (..., W) into (R, r), C, (Q, q), u, k, kappa and (v, g, e) of `kernels.materials.neural`.
 
-    The shapes are (..., U, 4), (..., U, U), (..., U, 4), (..., U) and (..., 2), for U units in each layer.
+    The shapes are (..., U, 4), (..., U, U), (..., U, 4), (..., U), (..., 2), (..., 1) and (..., 3, U), for U units in
+    each layer.
     """
-    first, coupling, second, output, direct = values.split([4 * UNITS, UNITS * UNITS, 4 * UNITS, UNITS, 2], -1)
-    rows = (first.unflatten(-1, (UNITS, 4)), second.unflatten(-1, (UNITS, 4)))
-    return rows[0], coupling.unflatten(-1, (UNITS, UNITS)), rows[1], output, direct
+    pieces = values.split([math.prod(shape) for shape in _SHAPES], -1)
+    return tuple(piece.unflatten(-1, shape) for piece, shape in zip(pieces, _SHAPES, strict=True))
 
 
 def _joined(own: Parts) -> torch.Tensor:
-    return torch.cat([own[0].flatten(-2), own[1].flatten(-2), own[2].flatten(-2), own[3], own[4]], -1)
+    return torch.cat([piece.flatten() for piece in own])
 
 
 def _non_negative(like: torch.Tensor) -> torch.Tensor:
     """Marks the values (W,) that must not be negative."""
-    rows = torch.ones(UNITS, 4, dtype=torch.bool, device=like.device)
-    rows[:, 2:] = False
-    ones = torch.ones(UNITS, UNITS, dtype=torch.bool, device=like.device)
-    return _joined((rows, ones, rows, ones[0], ones[0, :2]))
+    first, coupling, second, output, direct, linear, rate = (
+        torch.ones(shape, dtype=torch.bool, device=like.device) for shape in _SHAPES
+    )
+    first[:, 2:] = second[:, 2:] = rate[2] = False
+    return _joined((first, coupling, second, output, direct, linear, rate))
 
 
 def bounded(weights: torch.Tensor) -> torch.Tensor:
@@ -49,7 +52,7 @@ def bounded(weights: torch.Tensor) -> torch.Tensor:
 
 def at_rest(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Returns the network (...), its gradient (..., 3) and its second derivative by the third input (...), at rest."""
-    first, coupling, second, output, direct = parts(values)
+    first, coupling, second, output, direct, *_ = parts(values)
     h, y = first[..., 3], second[..., 3]
     root = (h.square() + 1.0).sqrt()
     slopes = (0.5 + 0.5 * h / root)[..., None] * first[..., :3]
@@ -70,11 +73,17 @@ def lame(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return 2.0 * ENERGY / LENGTH * (gradient[..., 0] + gradient[..., 1]), ENERGY / LENGTH_J**2 * curvature
 
 
+def viscous_slope(linear: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
+    """Returns phi'(0) (...) from kappa (..., 1) and v, g, e (..., 3, U): viscosity over that of Kelvin and Voigt."""
+    v, g, e = rate.unbind(-2)
+    return linear[..., 0] + 0.5 * (v * g * (0.5 + 0.5 * e / (e.square() + 1.0).sqrt())).sum(-1)
+
+
 def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> torch.Tensor:
     """Returns random weights (W,) with a shear modulus mu at small strains, and at most mu and half of lambda.
 
     Half of mu is that of the units, the rest that of the terms that are linear in the invariants. Most of lambda is
-    left to the terms at volume points, against locking.
+    left to the terms at volume points, against locking. At small rates viscosity is that of Kelvin and Voigt.
 
     Args:
         shear_modulus: mu [Pa].
@@ -91,16 +100,20 @@ def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> 
         return torch.cat([uniform(0.1, 1.0, UNITS, 2), uniform(-1.0, 1.0, UNITS, 1), uniform(-2.0, 0.5, UNITS, 1)], 1)
 
     first, coupling, second, output = rows(), uniform(0.0, 2.0 / UNITS, UNITS, UNITS), rows(), uniform(0.1, 1.0, UNITS)
-    direct = torch.zeros(2, dtype=torch.float64)
-    own, _ = lame(_joined((first, coupling, second, output, direct)))
+    direct, linear = (torch.zeros(n, dtype=torch.float64) for n in (2, 1))
+    rate = torch.cat([uniform(0.1, 1.0, 2, UNITS), uniform(-2.0, 0.5, 1, UNITS)])
+    rate[0] *= _NETWORK_SHARE / viscous_slope(linear, rate)
+    linear += 1.0 - _NETWORK_SHARE
+    viscous = linear, rate
+    own, _ = lame(_joined((first, coupling, second, output, direct, *viscous)))
     output = output * (_NETWORK_SHARE * shear_modulus / own)
     rest = (1.0 - _NETWORK_SHARE) * shear_modulus * LENGTH / (2.0 * ENERGY)
     direct += rest * torch.tensor([1.0 - _SECOND_SHARE, _SECOND_SHARE], dtype=torch.float64)
-    _, volume = lame(_joined((first, coupling, second, output, direct)))
+    _, volume = lame(_joined((first, coupling, second, output, direct, *viscous)))
     smaller = (min(0.5 * lame_lambda, shear_modulus) / volume).sqrt().clamp_max(1.0)
     first[:, 2] *= smaller
     second[:, 2] *= smaller
-    values = _joined((first, coupling, second, output, direct))
+    values = _joined((first, coupling, second, output, direct, *viscous))
     return torch.where(_non_negative(values), values + torch.log(-torch.expm1(-values)), values)
 
 
@@ -146,7 +159,9 @@ class NeuralMaterial(Material):
 
     @override
     def shared(self, constants: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the values of the network, and its value and slope at rest."""
+        """Returns the values of the network, and the constants that are subtracted: N(0), n and M(0)."""
         values = bounded(constants["weights"])
         value, gradient, _ = at_rest(values)
-        return torch.cat([values, value[..., None], gradient[..., 2:]], -1)
+        v, _, e = parts(values)[-1].unbind(-2)
+        dissipated = (0.5 * v * (e + (e.square() + 1.0).sqrt())).sum(-1)
+        return torch.cat([values, value[..., None], gradient[..., 2:], dissipated[..., None]], -1)

@@ -62,7 +62,8 @@ wp.set_module_options({"max_unroll": 1}, named_module(f"solid.{NAME}"))
 def activation(z: wp.float64) -> wp.vec3d:
     """Returns s(z) and its first two derivatives."""
     root = wp.sqrt(z * z + ONE)
-    return wp.vec3d(HALF * (z + root), HALF + HALF * z / root, HALF / (root * root * root))
+    inverse = ONE / root
+    return wp.vec3d(HALF * (z + root), HALF + HALF * z * inverse, HALF * inverse * inverse * inverse)
 
 
 @wp.func

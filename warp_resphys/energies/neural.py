@@ -15,7 +15,7 @@ from ..stepping.quantity import Parameter, Quantity
 from .materials import Material, constant
 
 ENERGY = 100e3 * LENGTH  # S [J/m^3]: with weights of one, moduli of the order of 100 kPa
-_NETWORK_SHARE = 0.5  # of initial weights: contribution of the network's units to mu and to viscosity
+_UNITS_SHARE = 0.1  # of initial weights: contribution of the units to mu and to viscosity at rest
 _SHAPES = ((UNITS, 4), (UNITS, UNITS), (UNITS, 4), (UNITS,), (2,), (1,), (3, UNITS))
 _SECOND_SHARE = 0.2  # of initial weights: contribution of the second invariant to the remaining mu
 
@@ -82,8 +82,9 @@ def viscous_slope(linear: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
 def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> torch.Tensor:
     """Returns random weights (W,) with a shear modulus mu at small strains, and at most mu and half of lambda.
 
-    Half of mu is that of the units, the rest that of the terms that are linear in the invariants. Most of lambda is
-    left to the terms at volume points, against locking. At small rates viscosity is that of Kelvin and Voigt.
+    Most of mu is that of the terms that are linear in the invariants, so that the material is near `MooneyRivlin`; most
+    of lambda is left to the terms at volume points, against locking. At small rates viscosity is that of Kelvin and
+    Voigt.
 
     Args:
         shear_modulus: mu [Pa].
@@ -102,12 +103,12 @@ def initial_weights(shear_modulus: float, lame_lambda: float, seed: int = 0) -> 
     first, coupling, second, output = rows(), uniform(0.0, 2.0 / UNITS, UNITS, UNITS), rows(), uniform(0.1, 1.0, UNITS)
     direct, linear = (torch.zeros(n, dtype=torch.float64) for n in (2, 1))
     rate = torch.cat([uniform(0.1, 1.0, 2, UNITS), uniform(-2.0, 0.5, 1, UNITS)])
-    rate[0] *= _NETWORK_SHARE / viscous_slope(linear, rate)
-    linear += 1.0 - _NETWORK_SHARE
+    rate[0] *= _UNITS_SHARE / viscous_slope(linear, rate)
+    linear += 1.0 - _UNITS_SHARE
     viscous = linear, rate
     own, _ = lame(_joined((first, coupling, second, output, direct, *viscous)))
-    output = output * (_NETWORK_SHARE * shear_modulus / own)
-    rest = (1.0 - _NETWORK_SHARE) * shear_modulus * LENGTH / (2.0 * ENERGY)
+    output = output * (_UNITS_SHARE * shear_modulus / own)
+    rest = (1.0 - _UNITS_SHARE) * shear_modulus * LENGTH / (2.0 * ENERGY)
     direct += rest * torch.tensor([1.0 - _SECOND_SHARE, _SECOND_SHARE], dtype=torch.float64)
     _, volume = lame(_joined((first, coupling, second, output, direct, *viscous)))
     smaller = (min(0.5 * lame_lambda, shear_modulus) / volume).sqrt().clamp_max(1.0)
@@ -122,7 +123,10 @@ class NeuralMaterial(Material):
     """Rubber whose polyconvex energy is a network of a few hundred weights, beside two terms of the volume.
 
     The network is that of ``kernels.materials.neural``, convex and without stress at rest for any real weights:
-    `bounded` makes those positive that must be. All elements share the weights.
+    `bounded` makes those positive that must be. All elements share the weights. Its viscosity depends on the rate: the
+    network gives phi of |A|, where A is the retardation time `stiffness_damping` times the rate of strain, plus the
+    strains in the Prony branches, if there are any; without either there is no viscosity. The viscosity of volume
+    changes is that of Kelvin and Voigt.
     """
 
     law = neural

@@ -10,7 +10,7 @@ from .points import deformation_gradient, green_strain
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, HALF, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0)
+ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.float64(4.0)
 
 
 @wp.kernel
@@ -47,6 +47,8 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
+    shares = bool(getattr(law, "SHARED", 0))  # then the law has its own dissipation too
+    dissipation = getattr(law, "dissipation", None)
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.func(module=module)
@@ -61,6 +63,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
+        shared: wp.array2d[wp.float64],  # (B, S) values of the law that all points share; (B, 0) for most laws
         viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
         strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
@@ -74,14 +77,22 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
-        energy, stress = response(f, m)
+        if wp.static(shares):
+            energy, stress = response(f, m, shared[b])
+        else:
+            energy, stress = response(f, m)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
             strain = green_strain(f)
             dilation = wp.trace(strain)
             left, rest = c[0] * strain - strain_offset[b, p], c[1] * dilation - dilation_offset[b, p]
-            energy += shape * wp.ddot(left - strain_offset[b, p], strain)
+            if wp.static(shares):
+                phi = dissipation(wp.ddot(left, left), shared[b])
+                energy += shape * phi[0] / c[0]
+                left = phi[1] * left
+            else:
+                energy += shape * wp.ddot(left - strain_offset[b, p], strain)
             energy += HALF * bulk * (rest - dilation_offset[b, p]) * dilation
             stress += f * isotropic(left, rest, shape, bulk)
         stress_out[b, p] = stress
@@ -104,6 +115,14 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
                 block[2, 2] += stress[k, n]
                 out[(k * (k + 1)) / 2 + n] += block
 
+    @wp.func(module=module)
+    def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
+        """Adds the blocks of a factor times the product of a matrix with itself."""
+        columns = wp.transpose(a)
+        for k in range(3):
+            for n in range(k + 1):
+                out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
+
     @wp.kernel(module=module)
     def tangent(
         active: wp.array[int],
@@ -111,6 +130,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -124,13 +144,20 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]
-        elastic_tangent(f, m, clamp[b] != 0, out)
+        if wp.static(shares):
+            elastic_tangent(f, m, shared[b], clamp[b] != 0, out)
+        else:
+            elastic_tangent(f, m, clamp[b] != 0, out)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
             strain = green_strain(f)
-            rest = c[1] * wp.trace(strain) - dilation_offset[b, p]
-            stress = isotropic(c[0] * strain - strain_offset[b, p], rest, shape, bulk)
+            left, rest = c[0] * strain - strain_offset[b, p], c[1] * wp.trace(strain) - dilation_offset[b, p]
+            if wp.static(shares):
+                phi = dissipation(wp.ddot(left, left), shared[b])
+                add_square(f * left, FOUR * c[0] * shape * phi[2], out)
+                shape = phi[1] * shape
+            stress = isotropic(left, rest, shape, bulk)
             if clamp[b] != 0:
                 # The stress part of the viscous Hessian may be indefinite and is dropped in a clamped Hessian.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
@@ -141,6 +168,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -169,13 +197,50 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         swelling = wp.trace(rise)
         strain = green_strain(f)
         dilation = wp.trace(strain)
-        by_shape, by_volume = ZERO, ZERO
+        left, by_volume = wp.mat33d(), ZERO
         if c[0] + c[1] > ZERO:  # Without viscosity the offsets are not set.
-            by_shape = TWO * wp.ddot(c[0] * strain - strain_offset[b, p], rise)
+            left = c[0] * strain - strain_offset[b, p]
             by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
+        by_shape = TWO * wp.ddot(left, rise)
+        if wp.static(shares):  # S = 2 mu phi'(A : A) A with A = c E - W; `rise` becomes dS/dA : rise / (2 mu)
+            phi = dissipation(wp.ddot(left, left), shared[b])
+            rise = phi[1] * rise + (phi[2] * by_shape) * left
+            by_shape = phi[1] * by_shape
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
         stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
         strain_out[b, p] = (TWO * shape) * rise
         dilation_out[b, p] = bulk * swelling
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+    made = SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+    if not shares:
+        return made
+    add_slopes, add_dissipation_slopes = law.shared_slopes, law.dissipation_slopes
+
+    @wp.kernel(module=module)
+    def shared_adjoint(
+        nodes: wp.array2d[int],
+        gradients: wp.array2d[wp.vec3d],
+        stiffness: wp.array2d[moduli],
+        shared: wp.array2d[wp.float64],
+        viscosity: wp.array[wp.vec2d],
+        strain_offset: wp.array2d[wp.mat33d],
+        dilation_offset: wp.array2d[wp.float64],
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        direction: wp.array2d[wp.vec3d],  # (B, N) z [m]
+        shared_out: wp.array3d[wp.float64],  # (B, G, S) parts of dL/d shared, zero before: point p adds to part p mod G
+    ):
+        b, first = wp.tid()
+        for p in range(first, stiffness.shape[1], shared_out.shape[1]):
+            cell = p / points_per_cell
+            f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+            dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
+            m, c = stiffness[b, p], viscosity[b]
+            add_slopes(f, dz, m, shared[b], shared_out[b, first])
+            if c[0] > ZERO:
+                left = c[0] * green_strain(f) - strain_offset[b, p]
+                along = TWO * wp.dot(mu_of, m) * wp.ddot(f * left, dz)
+                add_dissipation_slopes(wp.ddot(left, left), along, shared[b], shared_out[b, first])
+
+    made.shared_adjoint = shared_adjoint
+    return made

@@ -25,6 +25,8 @@ from .materials import Material
 from .viscosity import Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
+SHARED: Final = "shared"
+PARTS: Final = 256  # of the sum over points for the derivatives by shared values, at most
 VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step (`energies.viscosity`)
 
 
@@ -57,7 +59,8 @@ class Solid(Energy):
 
     Values of a step are ``stiffness`` (B, P, T), the moduli times the points' volumes [J], and those of
     `energies.viscosity`: ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; ``dilation_offset`` (B, P),
-    w. Memory is ``viscous_strain`` (B, K, P, 3, 3), the strain in each Prony branch.
+    w. A law with values that all points share has ``shared`` (B, S). Memory is ``viscous_strain`` (B, K, P, 3, 3), the
+    strain in each Prony branch.
 
     Args:
         discretisation: discretisation of the body, or of some of its cells.
@@ -175,6 +178,7 @@ class BoundSolid(BoundEnergy):
             "damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,
+            **({} if (shared := material.shared(parameters)) is None else {SHARED: shared}),
         }
 
     @override
@@ -218,7 +222,7 @@ class SolidTerm(Term):
         super().__init__(launcher, sets)
         law = material.law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
-        self._moduli = len(material.rules)
+        self._moduli, self._shared = len(material.rules), int(getattr(law, "SHARED", 0))
         self._carried = carried
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
         stiff = self._curvature > 0.0
@@ -229,13 +233,19 @@ class SolidTerm(Term):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         points = self.n_points
         shapes = ((points, self._moduli), (2,), (points, 3, 3), (points,))
-        return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
+        own = dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
+        return {**own, SHARED: (self._shared,)} if self._shared else own
+
+    def _shared_view(self, values: Values) -> Any:
+        """Returns the values that all points share (B, S), (B, 0) without any."""
+        return warp_view(value_of(values, SHARED) if self._shared else self.launcher.zeros(0), wp.float64)
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        stiffness, viscosity, strain, dilation = (value_of(values, name) for name in self.shapes)
+        stiffness, viscosity, strain, dilation = (value_of(values, name) for name in ("stiffness", *VISCOUS))
         views = [
             warp_view(stiffness[:, s.own], self._vector),
+            self._shared_view(values),
             warp_view(viscosity, wp.vec2d),
             warp_view(strain[:, s.own], wp.mat33d),
             warp_view(dilation[:, s.own], wp.float64),
@@ -253,19 +263,27 @@ class SolidTerm(Term):
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, shapes = self.launcher, self.shapes
-        out = {name: own.zeros(*shape) for name, shape in {**shapes, "viscosity": (self.n_points, 2)}.items()}
-        types = dict(zip(shapes, (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))
+        parts = min(self.n_points, PARTS)
+        sums = {"viscosity": (self.n_points, 2), **({SHARED: (parts, self._shared)} if self._shared else {})}
+        out = {name: own.zeros(*shape) for name, shape in {**shapes, **sums}.items()}
+        types = dict(zip(("stiffness", *VISCOUS), (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))
         commands = []
         for s in self.sets:
             carried = own.upload(self._carried[s.own], self._vector)
-            inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), carried]
-            inputs.append(warp_view(direction, wp.vec3d))
+            inputs, along = self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)
             outputs = [warp_view(out[name][:, s.own], kind) for name, kind in types.items()]
-            commands.append(own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, outputs))
+            commands.append(
+                own.record(self._kernels.adjoint, (own.batch, s.n_points), [*inputs, carried, along], outputs)
+            )
+            if self._shared:
+                view = [warp_view(out[SHARED], wp.float64)]
+                commands.append(own.record(self._kernels.shared_adjoint, (own.batch, parts), [*inputs, along], view))
 
         def differentiate() -> dict[str, torch.Tensor]:
+            if self._shared:
+                out[SHARED].zero_()
             own.launch(*commands)
-            return {name: slope.sum(1) if name == "viscosity" else slope.clone() for name, slope in out.items()}
+            return {name: slope.sum(1) if name in sums else slope.clone() for name, slope in out.items()}
 
         return differentiate
 

@@ -20,8 +20,9 @@ _RESPONSES: Final = ("factor", "delay", "rise")  # of an input to its commands, 
 
 
 def identifiable_parameters(simulator: Simulator) -> tuple[str, ...]:
-    """Names of the parameters of a simulator that can be identified; see `replay.Replay`."""
-    constants = (*(name for name in simulator.parameters if name != "gravity"), *parameters_of_parts(simulator))
+    """Names of the parameters of a simulator that can be identified, which are numbers; see `replay.Replay`."""
+    numbers = (name for name, quantity in simulator.parameters.items() if name != "gravity" and not quantity.shape)
+    constants = (*numbers, *parameters_of_parts(simulator))
     responses = [f"{name}_{word}" for name in simulator.inputs if name not in HUNG for word in _RESPONSES]
     return (*constants, MASS_FACTOR, *TILTS, *responses)
 

@@ -27,6 +27,7 @@ from .experiment.files import (
     DRIVEN,
     ERRORS,
     IDENTIFICATION,
+    LAW_FILE,
     MESH_CHECK,
     METRICS,
     QUALITY,
@@ -43,6 +44,7 @@ from .experiment.files import (
 )
 from .experiment.folds import Fold, run_folds
 from .experiment.identify import identify
+from .experiment.identify_law import identify_law
 from .experiment.importing import import_recordings, import_scaled
 from .experiment.laboratory import run_laboratory
 from .experiment.learn import refine, train
@@ -69,6 +71,7 @@ from .settings.stages import (
     DriveStage,
     EvaluateStage,
     FoldsReportStage,
+    IdentifyLawStage,
     IdentifyStage,
     ImportStage,
     LaboratoryStage,
@@ -187,6 +190,9 @@ def learning_stages(
 
     if run.identify is not None:
         stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
+    if run.law is not None:
+        add("identify_law", identify_law, (LAW_FILE,), IdentifyLawStage.of(run, **common))
+        needs = (*needs, "identify_law")
     reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
     learned = []
     for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:

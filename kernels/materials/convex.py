@@ -14,10 +14,10 @@ a toe (`kernels.laws.muscle`); its strain is less by the slack, as fibres are wa
 shape rule, U at those of the volume rule.
 
 All terms and their derivatives vanish at rest, and stay finite where elements invert. a, S_n for n > 0, and l_f are
-convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so their powers and increasing convex
-functions are convex too, and every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational
-Mechanics and Analysis 63, 1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is
-2 (c_1 + d_1) + sum_n mu_n, and lambda, without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
+convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so that their powers are convex too, and
+every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational Mechanics and Analysis 63,
+1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1) + sum_n mu_n, and
+lambda, without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
 
 The moduli named unit_shear and unit_bulk, of value one, carry the volumes of viscosity alone: its coefficients are
 viscosities and moduli of branches, not ratios to the elastic ones.
@@ -172,25 +172,25 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
     @wp.func(module=module)
     def add_by_stretches(s: wp.vec3d, m: moduli, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d):
         """Returns normal, flip and twist of `spectral_blocks` with those of Ogden's terms."""
-        for k in range(terms):
-            n = wp.float64(wp.abs(exponents[k])) - ONE
-            scale = TWO * m[_OGDEN + k] / (n + ONE)
+        for term in range(terms):
+            n = wp.float64(wp.abs(exponents[term])) - ONE
+            scale = TWO * m[_OGDEN + term] / (n + ONE)
             for i in range(3):
-                j, l = (i + 1) % 3, (i + 2) % 3
-                if exponents[k] > 0:
+                j, k = (i + 1) % 3, (i + 2) % 3
+                if exponents[term] > 0:
                     normal[i, i] += scale * n * wp.pow(wp.abs(s[i]), n - ONE)
-                    flip[i] += scale * quotient(s[j], s[l], n)
-                    twist[i] += scale * quotient(s[j], -s[l], n)
+                    flip[i] += scale * quotient(s[j], s[k], n)
+                    twist[i] += scale * quotient(s[j], -s[k], n)
                 else:
-                    x, slope = s[j] * s[l], scale * odd_power(s[j] * s[l], n)
+                    x, slope = s[j] * s[k], scale * odd_power(s[j] * s[k], n)
                     curvature = scale * n * wp.pow(wp.abs(x), n - ONE)
-                    normal[j, j] += curvature * s[l] * s[l]
-                    normal[l, l] += curvature * s[j] * s[j]
-                    normal[j, l] += curvature * x + slope
-                    normal[l, j] += curvature * x + slope
+                    normal[j, j] += curvature * s[k] * s[k]
+                    normal[k, k] += curvature * s[j] * s[j]
+                    normal[j, k] += curvature * x + slope
+                    normal[k, j] += curvature * x + slope
                     square = scale * s[i] * s[i]
-                    flip[i] += square * quotient(s[i] * s[j], s[i] * s[l], n) - slope
-                    twist[i] += square * quotient(s[i] * s[j], -s[i] * s[l], n) + slope
+                    flip[i] += square * quotient(s[i] * s[j], s[i] * s[k], n) - slope
+                    twist[i] += square * quotient(s[i] * s[j], -s[i] * s[k], n) + slope
         return normal, flip, twist
 
     @wp.func(module=module)
@@ -285,7 +285,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
             taut = wp.max(q, ZERO)
             stretch = wp.sqrt(ONE + taut)
             toe = m[at + 4]
-            energy, force, slope = pull(stretch - ONE - m[at + 3], toe)
+            _energy, force, slope = pull(stretch - ONE - m[at + 3], toe)
             lengthened = HALF / stretch * change
             t = wp.clamp((stretch - ONE - m[at + 3]) / toe, ZERO, ONE)
             result[at + 3] = -m[at + 5] * slope * lengthened

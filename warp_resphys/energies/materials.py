@@ -385,6 +385,7 @@ MATERIALS: dict[str, type[Material]] = {
     "stable_neo_hookean": StableNeoHookean,
     "mooney_rivlin": MooneyRivlin,
     "gent": Gent,
+    "law": ConvexMaterial,
 }
 
 

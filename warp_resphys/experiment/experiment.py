@@ -31,9 +31,10 @@ from ..settings.run import PublishedSettings
 from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, marker_view_of
-from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
+from .files import DATASET, GIVEN, IDENTIFICATION, LAW_FILE, SCALED_DATASET, STATIC, Dataset, read_dataset
 
 COROTATED: Final = "corotated"
+LAW: Final = "law"
 LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
 # By model: the simulator that it uses or corrects, and the identification that provides its parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
@@ -41,6 +42,7 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "simulation": ("simulation", None),
     "sysid_elastic": ("simulation", "sysid_elastic"),
     "sysid": ("identified", "sysid"),
+    "law": ("law", "law"),
     "simfree": ("identified", "sysid"),
     "resphys_uncorrected": ("simulation", None),
     "resphys": ("identified", "sysid"),
@@ -84,8 +86,9 @@ class Experiment:
         """Returns a simulator with the gravity of the trials.
 
         Args:
-            kind: ``simulation`` (uncorrected), ``target`` (which generated the trials), ``published``, or
-                ``identified``, which may use another integrator and a shorter time step.
+            kind: ``simulation`` (uncorrected), ``target`` (which generated the trials), ``published``,
+                ``identified``, which may use another integrator and a shorter time step, or ``law``, which has an
+                identified material as well.
         """
         if kind not in self._simulators:
             body = None if kind == "published" else self.body
@@ -100,7 +103,7 @@ class Experiment:
         if kind == "published":
             published = self._published
             own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
-        elif kind == "identified" and identified is not None and identified.integrator is not None:
+        elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
             own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
         return SimulatorSettings.of(settings).model_copy(update=own)
 
@@ -108,6 +111,8 @@ class Experiment:
         """Material of a simulator of some kind, see `simulator`."""
         if kind == "published":
             return self._published.simulation
+        if kind == LAW:
+            return MaterialSettings(model=LAW, **read_json(self.folder / LAW_FILE)["constants"])
         if kind != "target":
             return self.settings.simulation
         assert isinstance(self.settings, TimeStage)
@@ -137,7 +142,8 @@ class Experiment:
 
     def observe_by(self, model: str) -> Observation:
         """Observation with the marker placement that was identified for a model, if any."""
-        key = MODELS[model][1]
+        key = self._sources(model)[1]
+        key = "sysid" if key == LAW else key
         if key is None or self.settings.identified is None:
             return self.observe
         placement = read_json(self.folder / IDENTIFICATION)[key].get("placement")
@@ -218,15 +224,22 @@ class Experiment:
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
-        key = MODELS[model][1]
-        if key is None or self.settings.identified is None:
+        key = self._sources(model)[1]
+        if key is None or (key != LAW and self.settings.identified is None):
             return {}
-        values = read_json(self.folder / IDENTIFICATION)[key]["parameters"]
+        file = read_json(self.folder / (LAW_FILE if key == LAW else IDENTIFICATION))
+        values = (file if key == LAW else file[key])["parameters"]
         return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
+
+    def _sources(self, model: str) -> tuple[str, str | None]:
+        """Returns the entry of `MODELS`; a force corrects the law where there is one that helps, otherwise SysID."""
+        if self.settings.law is None or model not in (LAW, "resphys"):
+            return MODELS[model]
+        return MODELS[LAW if read_json(self.folder / LAW_FILE)["accepted"] else "sysid"]
 
     def model_simulator(self, model: str) -> Simulator:
         """The simulator that a model uses or corrects."""
-        kind = MODELS[model][0]
+        kind = self._sources(model)[0]
         return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
 
     def conditions(

@@ -16,11 +16,12 @@ from .page import MINUS
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "sysid_elastic": ("identification of E and nu", ("simulation",)),
     "sysid": ("identification (SysID)", ("simulation",)),
-    "simfree": ("the network in place of the simulator (SimFree)", ("sysid", "simulation")),
+    "law": ("the identified law of the material", ("sysid", "simulation")),
+    "simfree": ("the network in place of the simulator (SimFree)", ("law", "sysid", "simulation")),
     "resphys_uncorrected": ("the learned force on the data sheet's simulator", ("simulation",)),
-    "resphys": ("the learned force (ResPhys)", ("sysid", "simulation")),
+    "resphys": ("the learned force (ResPhys)", ("law", "sysid", "simulation")),
 }
-_BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID"}
+_BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID", "law": "the law"}
 _GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # Keys of the ranges in the group `identify`.
 _LEARNED: Final = ("simfree", "resphys")  # With published gains; the published identification has other parameters.
 _CLOSE: Final = 1e-4  # Distance from a bound or the first guess that counts as none, over a parameter's range.

@@ -24,11 +24,12 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "reconstruction": ("Reconstruction", "the simulator with forces fitted to the test trial itself"),
     "sysid_elastic": ("SysID of E and ν", "the elastic parameters that fit best"),  # noqa: RUF001
     "sysid": ("SysID", "the simulator with the parameters that fit best"),
+    "law": ("Law", "the simulator with the identified law of its material"),
     "simfree": ("SimFree", "a network in place of the simulator"),
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
-MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
+MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "law", "simfree", "resphys")}
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
 _OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 

@@ -40,6 +40,7 @@ TONES: Final[Mapping[str, Tone]] = {
     "simulation": Tone("#c4481b", "#ff9a6c"),
     "reconstruction": Tone("#1d7a55", "#62d2a2"),
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
+    "law": Tone("#0f766e", "#5eead4"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
     "published_network": Tone("#b0307a", "#f08bc4"),

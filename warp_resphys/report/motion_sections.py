@@ -174,7 +174,7 @@ def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> li
     from . import motion_figures
 
     row, blocks = trials.worst, list[Block]()
-    drawn = [m for m in ("simulation", "sysid", "resphys") if m in trials.positions]
+    drawn = [m for m in ("simulation", "sysid", "law", "resphys") if m in trials.positions]
     if trials.moves and len(data.tip):
         rest = data.mesh.vertices[data.tip].mean(axis=0)
         paths = {"target": trials.target[row], **{m: trials.positions[m][row] for m in drawn}}

@@ -113,7 +113,7 @@ def marker_verdict(
     held = "each held out once" if folds and len(trials) > 1 else "held out from training and identification"
     held = "in the part held out from training and identification" if parted else held
     span = "" if seconds is None else f" over the first {seconds:g} s"
-    ranked = ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic", "simulation")
+    ranked = ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic", "simulation")
     main = next((m for m in ranked if m in errors), "")
     if not main:
         return f"There are no errors to report on {who}."

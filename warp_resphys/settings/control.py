@@ -8,7 +8,7 @@ from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Share
 from .mesh import Direction
 from .trials import different
 
-Model = Literal["published", "simulation", "sysid_elastic", "sysid", "simfree", "resphys_uncorrected", "resphys"]
+Model = Literal["published", "simulation", "sysid_elastic", "sysid", "law", "simfree", "resphys_uncorrected", "resphys"]
 Models = Annotated[Some[Model], AfterValidator(different)]
 Shape = Annotated[
     str,

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, setting
+from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Word, setting
 from .body import Integrator
 from .trials import different
 
@@ -118,6 +118,23 @@ class IdentifySettings(IdentifiedSettings):
                     "its range."
                 )
         return self
+
+
+class LawSettings(Settings):
+    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`."""
+
+    terms: Many[Word] = setting(
+        ("c20", "c01", "c02", "dilation", "ogden_3", "ogden_4", "ogden_6"), "elastic terms besides c10 and bulk_1"
+    )
+    viscous: bool = setting(True, "whether it may have a viscosity")
+    branches: Count = setting(13, "relaxation times that are tried; 0: none")
+    relaxation_times: tuple[Positive, Positive] = setting((0.01, 1.0), "shortest and longest", "s")
+    families: Count = setting(1, "largest number of families of fibres")
+    stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
+    trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
+    seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")
+    max_evaluations: Natural = setting(10, "of the loss and its gradient")
+    tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which the search ends")
 
 
 class ReconstructionSettings(Settings):

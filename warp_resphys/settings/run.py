@@ -18,6 +18,7 @@ from .learning import (
     IdentifiedSettings,
     IdentifySettings,
     InTheLoopSettings,
+    LawSettings,
     NetworkSettings,
     ReconstructionSettings,
     RefinementSettings,
@@ -80,6 +81,7 @@ class RunSettings(SimulatorSettings):
     laboratory: LaboratorySettings | None = setting(None, "plays the real body where there are no recordings")
     published: PublishedSettings | None = setting(None, "simulation to compare with")
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
+    law: LawSettings | None = setting(None, "law of the material to identify; null: none")
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()
@@ -171,7 +173,7 @@ class RunSettings(SimulatorSettings):
     @property
     def models(self) -> list[str]:
         """Names of the models that the run compares."""
-        return models_of(self.published, self.identify, self.correct_uncorrected)
+        return models_of(self.published, self.identify, self.correct_uncorrected, self.law is not None)
 
     def training(self, model: str) -> TrainingSettings:
         """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.
@@ -350,18 +352,22 @@ class RunSettings(SimulatorSettings):
         return self
 
 
-def models_of(published: Any, identified: IdentifiedSettings | None, correct_uncorrected: bool) -> list[str]:
+def models_of(
+    published: Any, identified: IdentifiedSettings | None, correct_uncorrected: bool, law: bool = False
+) -> list[str]:
     """Returns the names of the models that an experiment compares.
 
     Args:
         published: settings of the published simulation, or None.
         identified: settings of the identified simulator, or None.
         correct_uncorrected: whether a force is learned for the uncorrected simulator as well.
+        law: whether the law of the material is identified.
     """
     absent = {
         "published": published is None,
         "sysid": identified is None,
         "sysid_elastic": identified is None or not identified.elastic,
+        "law": not law,
         "resphys_uncorrected": identified is None or not correct_uncorrected,
     }
     return [model for model in get_args(Model) if not absent.get(model)]

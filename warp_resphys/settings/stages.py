@@ -27,6 +27,7 @@ from .learning import (
     ActuationSettings,
     IdentifiedSettings,
     IdentifySettings,
+    LawSettings,
     ReconstructionSettings,
     RefinementSettings,
     ReleaseSettings,
@@ -115,6 +116,7 @@ class LearningStage(SimulationStage):
     train_fraction: float
     trial_seconds: float | None
     identified: IdentifiedSettings | None
+    law: LawSettings | None
     batch: int | None
     shared: str  # folder of the dataset, from that of the split
     acquired: str  # fingerprint of the stage that wrote the dataset
@@ -126,6 +128,14 @@ class IdentifyStage(LearningStage):
 
     identify: IdentifySettings
     seed: int
+
+
+class IdentifyLawStage(LearningStage):
+    """Identification of the material's law."""
+
+    law: LawSettings
+    identify: IdentifySettings | None
+    name: str
 
 
 class ReconstructStage(LearningStage):

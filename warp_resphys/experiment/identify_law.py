@@ -1,0 +1,281 @@
+"""Stage: identifies the law of the material from the training trials, and accepts it if it helps on validation trials.
+
+Where the trials give the states of all vertices, the weak form fits every class of laws (`learning.law`). With markers
+alone, classes are tried in order of size, through the simulator. In both cases the smallest class that is close to the
+best on the validation trials is refined through the simulator, with the other parameters of the identification.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
+from ..io.files import write_json
+from ..io.progress import Progress
+from ..io.stages import StageContext, package_versions
+from ..learning.bounds import Bounds, Prior
+from ..learning.identification import Identification, Identifier
+from ..learning.law import LawClass, Library, fit_classes
+from ..learning.replay import Replay, Start
+from ..learning.weak_form import ObservedMotion, WeakForm
+from ..settings.body import MaterialSettings
+from ..settings.stages import IdentifyLawStage
+from .build import build_simulator
+from .experiment import LAW, Experiment
+from .files import LAW_FILE
+from .identify import bounds_of
+from .trials import evenly
+
+_UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
+_CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
+_LEAST: Final = 1e-3  # fraction of the shear modulus below which a refined coefficient is zero
+
+Replays = Sequence[tuple[Replay, Start]]
+
+
+def identify_law(context: StageContext) -> None:
+    """Writes law.json: the law, its posterior, the classes that were tried, and whether it is used.
+
+    Raises:
+        InputError: the simulator has materials by region.
+    """
+    settings: IdentifyLawStage = context.settings
+    experiment = Experiment(settings, context.run_dir)
+    if experiment.material_of("simulation").regions:
+        raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
+    _LawSearch(context, experiment).run()
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A law that is refined through the simulator."""
+
+    law: LawClass
+    others: dict[str, float]  # identified parameters that are not those of the material
+    found: Identification
+    score: float  # error on the validation trials
+
+
+class _LawSearch:
+    """Search for a law in an experiment."""
+
+    def __init__(self, context: StageContext, experiment: Experiment) -> None:
+        self.context, self.experiment = context, experiment
+        self.settings: IdentifyLawStage = context.settings
+        split = self.settings.split
+        self.checked = split.validation or split.train
+        self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
+        self.shear = self._guess()["c10"] * 2.0
+
+    def run(self) -> None:
+        """Writes law.json."""
+        wanted, split = self.settings.law, self.settings.split
+        names = split.train if wanted.trials is None else tuple(evenly(split.train, wanted.trials))
+        states = self.experiment.dataset.bound is None and self.experiment.dataset.velocity is not None
+        library = Library(
+            terms=tuple(wanted.terms),
+            viscous=wanted.viscous,
+            times=tuple(np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()),
+            families=wanted.families,
+        )
+        if states:
+            classes = self._from_states(library)
+            scores = self._scores([law.constants for law in classes], self.checked)
+            chosen = self._smallest(scores)
+            best = self._refine(classes[chosen], names)
+        else:
+            refined = self._from_markers(library, names)
+            classes, scores = [own.law for own in refined], [own.score for own in refined]
+            chosen = self._smallest(scores)
+            best = refined[chosen]
+        below = self._score_below()
+        tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
+        uncertainty = best.found.uncertainty
+        content = {
+            "format": 1,
+            "accepted": best.score < below,
+            "groups": list(best.law.groups),
+            "constants": best.law.constants,
+            "units": {name: _unit(name) for name in best.law.constants},
+            "parameters": best.others,
+            "deviation": {} if uncertainty is None else uncertainty.deviation,
+            "at_bounds": list(best.found.at_bounds),
+            "loss": best.found.loss,
+            "validation": {"trials": list(self.checked), "law": best.score, "below": below},
+            "classes": tried,
+            "data": {"name": self.settings.name, "trials": list(names)},
+            "versions": package_versions(),
+        }
+        write_json(self.context.run_dir / LAW_FILE, content)
+
+    @staticmethod
+    def _smallest(scores: Sequence[float]) -> int:
+        """Returns the first of the classes that are close to the best one."""
+        return next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
+
+    def _guess(self) -> dict[str, float]:
+        """Returns a neo-Hookean law with the moduli and the viscosity of the identified material."""
+        material = self.experiment.simulator("simulation").materials[""]
+        known = {name: float(torch.as_tensor(value)) for name, value in material.constants.items()}
+        known |= {name: value for name, value in self.sysid.items() if name in known}
+        tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
+        lame = np.asarray(material.law.LAME).T @ [float(m) for m in material.moduli(tensors)]
+        mu, volume = float(lame[0]), float(lame[1])
+        guess = {"c10": 0.5 * mu, "bulk_1": 0.5 * volume, "shear_viscosity": known.get("stiffness_damping", 0.0) * mu}
+        return {**guess, "density": known["density"], "mass_damping": known["mass_damping"]}
+
+    def _simulator(self, constants: Mapping[str, float], settled: bool = False) -> Simulator:
+        """Returns the simulator of the identified model with a law."""
+        settings = self.experiment.settings_of("identified")
+        common = {name: self._guess()[name] for name in ("density", "mass_damping")}
+        material = MaterialSettings.model_validate({"model": LAW, **common, **constants})
+        return build_simulator(settings, material, self.experiment.body, on_failure="count" if settled else None)
+
+    def _from_states(self, library: Library) -> list[LawClass]:
+        """Returns the classes of the weak form."""
+        wanted = self.settings.law
+        zero = {name: 0.0 for name in (*library.terms, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1")}
+        unset = {"prony_time_1": 0.1, "fibre_azimuth_1": 0.0, "fibre_elevation_1": 0.0, "fibre_tension_1": 0.0}
+        unset |= {"fibre_slack_1": 0.0, "fibre_toe_1": 0.02, "fibre_stiffening_1": 0.0, "fibre_compression_1": 0.0}
+        simulator = self._simulator({**zero, **unset}, settled=True)
+        guess = self._guess()
+        stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
+        forms = []
+        for names in (self.settings.split.train, self.settings.split.validation):
+            motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
+            known = {"prony_time_1": 0.1, "fibre_toe_1": 0.02}
+            forms.append(WeakForm(simulator, motions, known, stiff, wanted.stride) if motions else None)
+        assert forms[0] is not None
+        return fit_classes(forms[0], forms[1], library)
+
+    def _motion(self, simulator: Simulator, names: Sequence[str]) -> ObservedMotion:
+        trials = self.experiment.trials(names, simulator)
+        start = self.experiment.start(Replay(simulator, self.experiment.observe, trials))
+        _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self._others(simulator))
+        return ObservedMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
+
+    def _others(self, simulator: Simulator) -> dict[str, torch.Tensor]:
+        """Returns (1,) identified parameters that are not those of the material."""
+        own = self.experiment.simulator("simulation").materials[""].quantities
+        return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
+
+    def _from_markers(self, library: Library, names: Sequence[str]) -> list["_Refined"]:
+        """Returns classes refined through the simulator, each from the smaller one, with more terms at first guesses."""
+        groups = {
+            "elastic": dict.fromkeys(library.terms, 0.02 * self.shear),
+            "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),
+            "fibres": _family(0.1 * self.shear) if library.families else {},
+        }
+        guess = {name: value for name, value in self._guess().items() if name in ("c10", "bulk_1")}
+        refined = [self._refine(LawClass((), guess, math.nan), names)]
+        for name, added in groups.items():
+            if added:
+                last = refined[-1].law
+                larger = LawClass((*last.groups, name), {**last.constants, **added}, math.nan)
+                refined.append(self._refine(larger, names))
+        return refined
+
+    def _replays(self, simulator: Simulator, names: Sequence[str]) -> Replays:
+        return self.experiment.replays(simulator, names, "sysid" if self.sysid else "simulation")
+
+    def _scores(
+        self, laws: Sequence[Mapping[str, float]], names: Sequence[str], others: Mapping[str, float] | None = None
+    ) -> list[float]:
+        """Returns the root mean square error of laws on trials, over the motion's amplitude; infinite if one fails."""
+        union: dict[str, float] = {}
+        for law in laws:
+            union |= {name: value if _is_shape(name) else 0.0 for name, value in law.items()}
+        simulator = self._simulator(union, settled=True)
+        values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
+        own = self._others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
+        values |= {name: value.expand(len(laws)) for name, value in own.items()}
+        return self._errors(simulator, values, names, len(laws))
+
+    def _errors(
+        self, simulator: Simulator, values: Mapping[str, torch.Tensor], names: Sequence[str], sets: int
+    ) -> list[float]:
+        total = simulator.tensor(np.zeros(sets))
+        with torch.no_grad():
+            for replay, start in self._replays(simulator, names):
+                errors = replay.errors(replay(start, values)).square().sum((2, 3, 4))
+                total += (errors * replay.trials.loss_weight).sum(1) / len(names)
+        return [math.sqrt(value) if math.isfinite(value) else math.inf for value in total.tolist()]
+
+    def _score_below(self) -> float:
+        """Returns the error of the identified simulator, or of the uncorrected one."""
+        simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
+        return self._errors(simulator, self.experiment.parameters("sysid"), self.checked, 1)[0]
+
+    def _refine(self, law: LawClass, names: Sequence[str]) -> "_Refined":
+        """Returns a law that is refined through the simulator, with the other identified parameters."""
+        wanted = self.settings.law
+        guess = dict(law.constants)
+        if wanted.viscous:
+            guess["shear_viscosity"] = max(guess.get("shear_viscosity", 0.0), 1e-4 * self.shear)
+        simulator = self._simulator(guess)
+        bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)}
+        others = {name: float(value) for name, value in self._others(simulator).items()}
+        if self.settings.identify is not None:
+            bounds |= {name: bounds_of(self.settings.identify.parameters[name]) for name in others}
+        identifier = Identifier(self._replays(simulator, names), bounds, wanted.seconds)
+        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
+
+            def report(_: int, loss: float, values: Mapping[str, float]) -> None:
+                progress.advance(1, loss=f"{loss:.3g}", c10=f"{values['c10']:.4g}")
+
+            start = {name: (guess | others)[name] for name in bounds}
+            found = identifier.run([start], wanted.max_evaluations, report, tolerance=wanted.tolerance)
+        refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
+        weak = {n for n, value in refined.items() if _unit(n) == "Pa" and value < _LEAST * self.shear and n != "c10"}
+        weak |= {n for n, value in refined.items() if n == "shear_viscosity" and value < 1e-6 * self.shear}
+        kept = {name: value for name, value in refined.items() if name not in weak or _is_of_group(name)}
+        after = {name: found.parameters[name] for name in others}
+        return _Refined(replace(law, constants=kept), after, found, self._scores([kept], self.checked, after)[0])
+
+    def _bounds(self, name: str, value: float) -> Bounds:
+        if name == "bulk_1":
+            return Bounds(0.1 * value, 10.0 * value, True, Prior(value, value))
+        if name.startswith("prony_time"):
+            return Bounds(value / 4.0, 4.0 * value, True)
+        if name.startswith(("fibre_azimuth", "fibre_elevation")):
+            return Bounds(value - 0.5, value + 0.5)
+        if name.startswith("fibre_slack"):
+            return Bounds(0.0, 0.1)
+        if name.startswith("fibre_toe"):
+            return Bounds(0.002, 0.1, True)
+        if name == "shear_viscosity":
+            return Bounds(0.0, max(4.0 * value, 0.01 * self.shear))
+        return Bounds(0.0, max(4.0 * value, self.shear))
+
+
+def _is_shape(name: str) -> bool:
+    """Whether a constant has no coefficient's meaning: a time, a direction, a slack or a toe."""
+    return _unit(name) != "Pa" and name != "shear_viscosity"
+
+
+def _is_refined(name: str) -> bool:
+    return not name.startswith(("fibre_stiffening", "fibre_compression"))
+
+
+def _is_of_group(name: str) -> bool:
+    return name.startswith(("prony", "fibre"))
+
+
+def _unit(name: str) -> str:
+    words = {*name.split("_")}
+    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+
+
+def _branches(moduli: Sequence[float], times: Sequence[float]) -> dict[str, float]:
+    pairs = enumerate(zip(moduli, times, strict=False), 1)
+    return {key: x for k, (m, t) in pairs for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))}
+
+
+def _family(tension: float) -> dict[str, float]:
+    zero = ("azimuth", "elevation", "slack", "stiffening", "compression")
+    return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **{f"fibre_{name}_1": 0.0 for name in zero}}

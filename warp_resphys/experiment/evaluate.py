@@ -315,8 +315,8 @@ def time_models(context: StageContext) -> None:
     """Writes times.json: computing time per test trial [s], mean and standard deviation over the trials.
 
     The rows are those of the published table: the uncorrected simulator, the simulator with the true parameters if
-    known, the simulator with the learned force, and the network alone. Trials run one at a time, once, after a warm-up
-    run of the first trial.
+    the target has its mesh and time step, the simulator with the learned force, and the network alone. Trials run one
+    at a time, once, after a warm-up run of the first trial.
     """
     settings: TimeStage = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
@@ -325,7 +325,8 @@ def time_models(context: StageContext) -> None:
     learned = learned_of(experiment, "resphys")
     starts = {name: experiment.start(experiment.replay(simulator, [name], "resphys")) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, experiment.simulator("simulation"))}
-    if settings.target is not None:
+    target, shared = settings.target, ("mesh", "parts", "time_step")
+    if target is not None and all(getattr(target, key) == getattr(settings, key) for key in shared):
         rows["target"] = ("simulation", None, experiment.simulator("target"))
     rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
     times: dict[str, dict[str, float]] = {}

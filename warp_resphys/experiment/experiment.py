@@ -26,12 +26,13 @@ from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import estimate_release
 from ..learning.replay import Replay, Start
-from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
 from ..settings.run import PublishedSettings
 from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, marker_view_of
 from .files import DATASET, GIVEN, IDENTIFICATION, SCALED_DATASET, STATIC, Dataset, read_dataset
+from .target import target_settings
 
 COROTATED: Final = "corotated"
 LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
@@ -88,7 +89,7 @@ class Experiment:
                 ``identified``, which may use another integrator and a shorter time step.
         """
         if kind not in self._simulators:
-            body = None if kind == "published" else self.body
+            body = None if kind in ("published", "target") else self.body
             made_of, material = self.settings_of(kind), self.material_of(kind)
             self._simulators[kind] = build_simulator(made_of, material, body, on_failure=self.on_failure)
         return self._simulators[kind]
@@ -102,14 +103,17 @@ class Experiment:
             own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
         elif kind == "identified" and identified is not None and identified.integrator is not None:
             own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
-        return SimulatorSettings.of(settings).model_copy(update=own)
+        chosen = target_settings(settings, self._target) if kind == "target" else SimulatorSettings.of(settings)
+        return chosen.model_copy(update=own)
 
     def material_of(self, kind: str) -> MaterialSettings:
         """Material of a simulator of some kind, see `simulator`."""
         if kind == "published":
             return self._published.simulation
-        if kind != "target":
-            return self.settings.simulation
+        return self._target.material if kind == "target" else self.settings.simulation
+
+    @property
+    def _target(self) -> TargetSettings:
         assert isinstance(self.settings, TimeStage)
         assert self.settings.target is not None
         return self.settings.target

@@ -21,9 +21,10 @@ from ..settings.stages import SimulateStage
 from ..settings.trials import BaseMotion, MotionSettings, MovingBase, ReleaseFromTwist, SimulatedData, Trial
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .build import build_simulator, whole_mesh
+from .build import whole_mesh
 from .files import DATASET, GIVEN, Dataset
 from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from .target import build_target
 
 log = logging.getLogger(__name__)
 
@@ -90,15 +91,16 @@ class _FreeMotion(ResumableRollout):
 
     def __init__(self, part: TrialPart) -> None:
         settings: SimulateStage = part.context.settings
-        self._data, self._simulator = settings.data, build_simulator(settings, settings.target)
+        self._data, self._target = settings.data, build_target(settings, settings.target)
+        self._simulator = self._target.simulator
         self._trials = [trial for trial in settings.trials if trial.name in part.names]
         self._constants, self.like = self._simulator.prepare(), self._simulator.rest_positions
-        shape = (len(self._trials), self._simulator.body.n_vertices, 3)
+        shape = (len(self._trials), len(whole_mesh(settings).vertices), 3)
         self.fields = {"observed": Field(shape, "m", batch_axes=1), "velocity": Field(shape, "m/s", batch_axes=1)}
         self.frames = part.frames
         self._fixed: list[torch.Tensor] | None = None
         if (motion := settings.data.base_motion) is not None:
-            times = settings.time_step * np.arange(1, part.frames)
+            times = self._simulator.time_step * np.arange(1, (part.frames - 1) * self._target.substeps + 1)
             poses = [base_of(motion, trial, times, _motion_scale(settings, trial)) for trial in self._trials]
             self._fixed = fixed_positions(self._simulator, np.stack(poses, axis=1))
 
@@ -108,12 +110,16 @@ class _FreeMotion(ResumableRollout):
 
     @override
     def step(self, number: int) -> State:
-        inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[number - 1])
-        return self._simulator.step(self.state, inputs, self._constants)[0]
+        state, substeps = self.state, self._target.substeps
+        for at in range((number - 1) * substeps, number * substeps):
+            inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[at])
+            state = self._simulator.step(state, inputs, self._constants)[0]
+        return state
 
     @override
     def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
-        return {"observed": self.state.q.cpu().numpy(), "velocity": self.state.v.cpu().numpy()}
+        seen = {"observed": self.state.q, "velocity": self.state.v}
+        return {name: self._target.seen(values).cpu().numpy() for name, values in seen.items()}
 
 
 def initial_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:

@@ -1,10 +1,10 @@
 """Notes on the page of a run: its simulator, its network, and contributions to its errors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from ..energies.materials import make_material
-from ..settings.body import MaterialSettings
+from ..settings.body import MaterialSettings, TargetSettings
 from ..settings.run import RunSettings
 from .page import number_text
 
@@ -37,6 +37,22 @@ _OF_A_BEAM: Final = (
 _OF_AN_ARM: Final = {
     True: "The published errors are for another body: recordings of a real arm, which this run does not use.",
     False: "The published errors are for the published simulator, of 494 vertices, on the authors' recordings.",
+}
+_OF_A_TARGET: Final = {
+    "mesh": "mesh",
+    "physics": "integration of masses and volumes",
+    "parts": "further parts",
+    "glued": "glue",
+    "regions": "regions",
+    "rigid": "rigid parts",
+    "fixed": "fixed vertices",
+    "symmetry": "symmetry planes",
+    "chambers": "chambers",
+    "fibres": "fibres around the chambers",
+    "tendons": "tendons",
+    "muscles": "muscle fibres",
+    "medium": "fluid",
+    "payload_string": "string for payloads",
 }
 
 
@@ -132,3 +148,43 @@ def material_note(material: MaterialSettings) -> str:
     else:
         words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
     return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"
+
+
+def target_note(settings: RunSettings) -> str:
+    """Return the target of simulated data in words: its material, and how else it differs from the simulator."""
+    if settings.recorded is not None or settings.target is None:
+        return ""
+    more = differences(settings, settings.target)
+    return material_note(settings.target.material) + (f"; with {in_a_row(more)}" if more else "")
+
+
+def differences(settings: RunSettings, target: TargetSettings) -> list[str]:
+    """Return how the simulation that plays the real body differs from the simulator, without their materials' models.
+
+    Args:
+        settings: Of the run.
+        target: One of its `targets`.
+    """
+    words = []
+    for key, name in _OF_A_TARGET.items():
+        own, simulated = getattr(target, key), getattr(settings, key)
+        if own != simulated:
+            words.append(f"{'other ' if own and simulated else '' if own else 'no '}{name}")
+    if target.time_step != settings.time_step:
+        words.append(f"time steps of {target.time_step:g} s")
+    if target.integrator != settings.integrator:
+        words.append(f"the integrator {target.integrator.replace('_', ' ')}")
+    if _damping(target.material) != _damping(settings.simulation):
+        words.append("other damping")
+    return words
+
+
+def _damping(material: MaterialSettings) -> dict[str, float]:
+    """Constants of the viscosity of a material that are not zero."""
+    viscous = {name: value for name, value in material.parameters.items() if "damping" in name or "prony" in name}
+    return {name: value for name, value in viscous.items() if value}
+
+
+def in_a_row(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence: "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

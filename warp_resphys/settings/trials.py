@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
-from .body import FibreSettings, Integrator, MaterialSettings, TimeStep
-from .mesh import Direction, LengthUnit, MeshSettings, PlaceSettings
+from .body import TargetSettings
+from .mesh import Direction, LengthUnit, PlaceSettings
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; a static pose.
 Begins = Literal["held", "released", "rest", "static"]
@@ -337,14 +337,9 @@ class SequenceSettings(Settings):
     rest: NotNegative = setting(0.1, "duration without inputs at the start and at the end", "s")
 
 
-class PlaySettings(Settings):
-    """A simulation that plays the real body, with physics that differ from those of the simulator."""
+class PlaySettings(TargetSettings):
+    """A simulation that plays the real body, and its cameras."""
 
-    mesh: MeshSettings
-    time_step: TimeStep = setting(description="of its simulation", unit="s")
-    integrator: Integrator = setting(description="of its simulation")
-    material: MaterialSettings = setting(description="of its body")
-    fibres: FibreSettings | None = setting(None, "around its chambers")
     sequences: SequenceSettings = setting(SequenceSettings(), "random inputs")
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
     noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")

@@ -95,7 +95,7 @@ def vertices_in(mesh: Mesh, other: Mesh) -> Observation:
     if place.outside[far] > _LARGEST_DISTANCE * size[far]:
         x, y, z = other.vertices[far]
         raise MeshError(
-            f"the simulator's vertex ({x:g}, {y:g}, {z:g}) m lies {1e3 * place.outside[far]:.3g} mm outside of this "
-            "mesh: both must be the same body in the same place."
+            f"the simulator's vertex at ({x:g}, {y:g}, {z:g}) m lies outside of this mesh: both must be the same body "
+            "in the same place."
         )
     return MarkerMap(torch.as_tensor(mesh.cells[place.cells])[None], torch.as_tensor(place.weights)[None])

@@ -29,6 +29,7 @@ _MASS: Final = {
         "does not, so its uncorrected error differs."
     ),
 }
+_TARGET: Final = "The published target differs from its simulator in E and ν alone; this run's also has {}."  # noqa: RUF001
 _OF_A_BEAM: Final = (
     "The published errors are for other data: recordings with ten markers on the beam's sides, whose weight is cut off "
     "at the release, compared with trajectories reconstructed from them; the published uncorrected simulation has the "
@@ -40,7 +41,7 @@ _OF_AN_ARM: Final = {
 }
 _OF_A_TARGET: Final = {
     "mesh": "mesh",
-    "physics": "integration of masses and volumes",
+    "physics": "integration of mass and volume",
     "parts": "further parts",
     "glued": "glue",
     "regions": "regions",
@@ -52,14 +53,19 @@ _OF_A_TARGET: Final = {
     "tendons": "tendons",
     "muscles": "muscle fibres",
     "medium": "fluid",
-    "payload_string": "string for payloads",
+    "payload_string": "payload string",
 }
 
 
 def published_note(settings: RunSettings) -> str:
     """Returns how the published errors of an experiment differ from ours."""
     if settings.markers is None:
-        return _AGAINST + _MASS[settings.physics.mass]
+        more = list[str]()
+        for target in settings.targets.values():
+            more += ["another model of the material"] if target.material.model != settings.simulation.model else []
+            more += differences(settings, target)
+        also = f" {_TARGET.format(in_a_row(more))}" if more else ""
+        return _AGAINST + _MASS[settings.physics.mass] + also
     return _OF_AN_ARM[settings.is_laboratory] if settings.chambers is not None else _OF_A_BEAM
 
 
@@ -159,7 +165,7 @@ def target_note(settings: RunSettings) -> str:
 
 
 def differences(settings: RunSettings, target: TargetSettings) -> list[str]:
-    """Return how the simulation that plays the real body differs from the simulator, without their materials' models.
+    """Return how the simulation that plays the real body differs from the simulator, its elastic law left out.
 
     Args:
         settings: Of the run.
@@ -169,7 +175,8 @@ def differences(settings: RunSettings, target: TargetSettings) -> list[str]:
     for key, name in _OF_A_TARGET.items():
         own, simulated = getattr(target, key), getattr(settings, key)
         if own != simulated:
-            words.append(f"{'other ' if own and simulated else '' if own else 'no '}{name}")
+            other = "other " if name.endswith("s") else "another "
+            words.append(f"{other if own and simulated else '' if own else 'no '}{name}")
     if target.time_step != settings.time_step:
         words.append(f"time steps of {target.time_step:g} s")
     if target.integrator != settings.integrator:

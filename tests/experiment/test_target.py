@@ -149,6 +149,10 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
         (["target.time_step=0.004"], "time_step is 0.01 s and target.time_step 0.004 s: the first must be a multiple"),
         (["target.time_step=0.02"], "target.time_step 0.02 s: the first must be a multiple of the second"),
         (["target.tme_step=0.005"], r"target\.material: .*'tme_step'"),
+        (
+            ["target.fibres={angles:[8.0],stiffness:1e4}"],
+            r"target\.fibres are wound around chambers",
+        ),
         (["target.muscle={bundles:{}}"], "unknown key 'target.muscle', did you mean 'muscles'"),
         (
             ["target.mesh={kind:box_hexahedra,size:[0.08,0.03,0.03],divisions:[8,3,3]}", "data.load={x:0.08}"],
@@ -170,7 +174,7 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
         ),
         (
             ["experiment=beam_real", PASSIVE.replace("stiffness", "commanded:stress,stiffness")],
-            "laboratory: its body takes the stress of 1 muscles, but that of the simulator takes no input",
+            "laboratory: its body takes muscle_stress of 1 muscle, but that of the simulator takes no input",
         ),
     ],
 )

@@ -107,7 +107,7 @@ def _check_target(run: RunSettings, body: Body) -> None:
 def _check_drive(drive: Drive | None, real: Drive | None) -> None:
     """Refuses a laboratory whose input is not that of the simulator."""
     simulated, played = (
-        "no input" if own is None else f"the {own.quantity.words} of {len(own.parts)} {own.per}s"
+        "no input" if own is None else f"{own.quantity.name} of {len(own.parts)} {own.per}{'s'[: len(own.parts) - 1]}"
         for own in (drive, real)
     )
     if simulated != played:
@@ -137,9 +137,8 @@ def _check_control(run: RunSettings, body: Body) -> None:
 def _check_memory(run: RunSettings) -> None:
     """Refuses meshes and networks that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
-    bodies = {"": run, **{f"{key}.": target for key, target in run.targets.items()}}
-    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in bodies.items()}
-    for key, body in bodies.items():
+    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in run.bodies.items()}
+    for key, body in run.bodies.items():
         meshes |= {f"{key}parts.{name}.mesh": part.mesh for name, part in body.parts.items()}
     for key, mesh in meshes.items():
         cells = math.prod(mesh.divisions) if isinstance(mesh, HexahedralBox | TetrahedralBox) else 0

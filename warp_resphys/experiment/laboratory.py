@@ -8,7 +8,6 @@ slightly from their nominal places, and cameras see the markers in their own fra
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -249,8 +248,8 @@ class _Played(ResumableRollout):
         self._constants, self.like = simulator.prepare(), simulator.rest_positions
         by_name = {trial.name: trial for trial in settings.trials}
         self._trials = [by_name[name] for name in part.names]
-        substeps = partial(substeps_of, settings.time_step, settings.laboratory, "laboratory")
-        self._tip, self._substeps = settings.tip, 1 if self._trials[0].is_released else substeps()
+        self._tip, released = settings.tip, self._trials[0].is_released
+        self._substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
         markers = bound_markers(binding, simulator.body.mesh, setup.tracked, tuple(binding.tracked))
         self._markers = markers.to(self.like)
         payload = np.array([trial.payload for trial in self._trials])

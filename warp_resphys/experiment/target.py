@@ -5,7 +5,7 @@ velocities are interpolated to other vertices x by the shape functions of the ce
 
     q(x) = sum_a N_a(x) q_a,
 
-which reproduces the rest shape, rigid motions and, with quadratic cells, bending (tests/experiment/test_target.py).
+which is exact for fields of the degree of the cells (tests/experiment/test_target.py).
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from ..io.settings import Natural, Settings, Word, parse, setting
-from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, TargetSettings
+from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
 from .learning import (
     AblationSettings,
@@ -130,6 +130,11 @@ class RunSettings(SimulatorSettings):
         return {key: settings for key, settings in own.items() if settings is not None}
 
     @property
+    def bodies(self) -> dict[str, SteppedSettings]:
+        """The simulator and its target, by the prefix of their keys, such as ``target.``."""
+        return {"": self, **{f"{key}.": target for key, target in self.targets.items()}}
+
+    @property
     def payload_at(self) -> PlaceSettings | None:
         """Vertices that carry payloads."""
         return None if self.recorded is None else self.recorded.payload_at
@@ -222,18 +227,21 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _drives(self) -> Self:
-        commanded = {
-            "chambers": self.chambers is not None,
-            "tendons": self.tendons is not None,
-            "muscles": self.muscles is not None and self.muscles.commanded is not None,
-        }
-        driven = [group for group, is_driven in commanded.items() if is_driven]
-        if len(driven) > 1:
-            raise ValueError(
-                f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
-            )
-        if self.fibres is not None and self.chambers is None:
-            raise ValueError("fibres are wound around chambers, but chambers is null: leave the fibres out.")
+        for key, body in self.bodies.items():
+            commanded = {
+                "chambers": body.chambers is not None,
+                "tendons": body.tendons is not None,
+                "muscles": body.muscles is not None and body.muscles.commanded is not None,
+            }
+            driven = [f"{key}{group}" for group, is_driven in commanded.items() if is_driven]
+            if len(driven) > 1:
+                raise ValueError(
+                    f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
+                )
+            if body.fibres is not None and body.chambers is None:
+                raise ValueError(
+                    f"{key}fibres are wound around chambers, but {key}chambers is null: leave the fibres out."
+                )
         if self.payload_string is not None and self.payload_at is None:
             raise ValueError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
         if self.identify is not None and "fibre_stiffness" in self.identify.parameters and self.fibres is None:
@@ -242,9 +250,10 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _holds_rigid_parts(self) -> Self:
-        used: dict[str, tuple[Any, str]] = {"integrator": (self.rigid, self.integrator)}
+        used: dict[str, tuple[Any, str]] = {}
+        for prefix, body in self.bodies.items():
+            used[f"{prefix}integrator"] = (body.rigid, body.integrator)
         used |= {} if self.identify is None else {"identify.integrator": (self.rigid, self.identify.integrator or "")}
-        used |= {f"{key}.integrator": (own.rigid, own.integrator) for key, own in self.targets.items()}
         for key, (rigid, integrator) in used.items():
             if rigid and integrator == "midpoint":
                 raise ValueError(f"{key} is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2.")

@@ -148,6 +148,7 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
     [
         (["target.time_step=0.004"], "time_step is 0.01 s and target.time_step 0.004 s: the first must be a multiple"),
         (["target.time_step=0.02"], "target.time_step 0.02 s: the first must be a multiple of the second"),
+        (["laboratory.tme_step=0.005", "experiment=beam_real"], "unknown key 'laboratory.tme_step', did you mean"),
         (["target.tme_step=0.005"], r"target\.material: .*'tme_step'"),
         (
             ["target.fibres={angles:[8.0],stiffness:1e4}"],
@@ -191,3 +192,11 @@ def test_a_wrong_value_of_the_simulator_is_not_blamed_on_its_target(key, value):
     plain["target"] = plain["target"]["material"]
     with pytest.raises(InputError, match=f"^(unknown key ')?{key}"):
         parse(RunSettings, {**plain, key: value})
+
+
+def test_constants_directly_in_the_target_are_named_in_messages():
+    plain = composed()
+    with pytest.raises(InputError, match=r"^target\.youngs_modulus is 'soft': it must be a number"):
+        parse(
+            RunSettings, {**plain, "target": {**plain["target"]["material"], "youngs_modulus": "soft", "regions": {}}}
+        )

@@ -237,6 +237,11 @@ class SteppedSettings(BodySettings):
 class TargetSettings(SteppedSettings):
     """The simulation that plays the real body."""
 
+    # `run.filled` moves constants that stand directly in ``target`` into its material.
+    model_config = ConfigDict(
+        json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "string"}]}}
+    )
+
     material: MaterialSettings = setting(description="of its body")
 
 

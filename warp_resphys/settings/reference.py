@@ -107,7 +107,6 @@ def editor_schema() -> dict[str, Any]:
     """Returns the JSON Schema of a file of settings, in which keys may be missing, as it extends other options."""
     schema: dict[str, Any] = _partial(RunSettings.model_json_schema())
     schema["properties"] |= {"defaults": {"type": "array"}, "hydra": {"type": "object"}}
-    schema["$defs"]["TargetSettings"]["additionalProperties"] = {"type": ["number", "string"]}  # of its material
     return schema
 
 

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
 from .body import TargetSettings
@@ -339,6 +339,8 @@ class SequenceSettings(Settings):
 
 class PlaySettings(TargetSettings):
     """A simulation that plays the real body, and its cameras."""
+
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": False})
 
     sequences: SequenceSettings = setting(SequenceSettings(), "random inputs")
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")

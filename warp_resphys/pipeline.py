@@ -63,8 +63,8 @@ from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions
 from .report.control_section import controller_name
 from .report.page import number_text
+from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
-from .settings.mesh import MeshSettings
 from .settings.run import RunSettings
 from .settings.stages import (
     BaselinesStage,
@@ -94,12 +94,12 @@ _MOST_COLUMNS = 5  # largest number of folds that are shown as columns in a term
 Work = Callable[[StageContext], None]
 
 
-def files_read(run: RunSettings, mesh: MeshSettings) -> dict[str, str]:
+def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]:
     """Returns the SHA-256 of the files of bodies and base motions, by path.
 
     Args:
         run: settings of the run.
-        mesh: of the simulator, or of the laboratory.
+        bodies: of the simulator and of the simulation that plays the real body; None is left out.
 
     Raises:
         DataFileError: a file cannot be read.
@@ -107,7 +107,8 @@ def files_read(run: RunSettings, mesh: MeshSettings) -> dict[str, str]:
     folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
     moved = {motion.file for motion in run.motions().values() if motion.file is not None}
     motions = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
-    paths = [getattr(source, "path", None) for source in (mesh, *(part.mesh for part in run.parts.values()))]
+    meshes = [mesh for body in bodies if body for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))]
+    paths = [getattr(mesh, "path", None) for mesh in meshes]
     return motions | {path: digest(path) for path in paths if path is not None}
 
 
@@ -127,9 +128,10 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
     Raises:
         DataFileError: a recording cannot be read.
     """
-    files, trials, data = files_read(run, run.mesh), trials_of(run), run.recorded
+    files, trials, data = files_read(run, run), trials_of(run), run.recorded
     if data is None:
-        return [Stage("simulate", simulate, (DATASET,), SimulateStage.of(run, files=files, trials=trials))]
+        simulated = SimulateStage.of(run, files=files_read(run, run, run.target), trials=trials)
+        return [Stage("simulate", simulate, (DATASET,), simulated)]
     stages, upstream = list[Stage](), tuple[str, ...]()
     learned = None if folds_of(run) is not None else split_of(run).train + split_of(run).validation
     imported = ImportStage.of(run, files=files, trials=trials, learned=learned)
@@ -153,7 +155,7 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
 def _played(run: RunSettings) -> PlayedSettings:
     """Settings that the recordings of a simulated laboratory depend on, without the trials."""
     assert run.laboratory is not None
-    return PlayedSettings.of(run, files=files_read(run, run.laboratory.mesh))
+    return PlayedSettings.of(run, files=files_read(run, run.laboratory))
 
 
 def _laboratory_stage(name: str, run: RunSettings, trials: Sequence[Trial], *upstream: str) -> Stage:
@@ -182,7 +184,7 @@ def learning_stages(
     """
     workers = workers_of(run) if workers is None else workers
     needs = () if run.identify is None else ("identify",)
-    common = {"files": files_read(run, run.mesh), "shared": shared, "acquired": acquired, "split": split}
+    common = {"files": files_read(run, run), "shared": shared, "acquired": acquired, "split": split}
     stages: list[Stage] = []
 
     def add(name: str, work: Work, outputs: tuple[str, ...], settings: LearningStage, *upstream: str) -> None:
@@ -208,7 +210,7 @@ def learning_stages(
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
         # With observed states, a network that replaces the simulator does not depend on it.
-        trained = trained.model_copy(update={"simulation": run.target})
+        trained = trained.model_copy(update={"simulation": run.target.material})
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
     learned.append("train_simfree")
@@ -293,7 +295,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     """
     prepare(run)
     if run.ablation is not None:
-        run_stages(ablation_stages(run, files_read(run, run.mesh)), folder)
+        run_stages(ablation_stages(run, files_read(run, run, run.target)), folder)
         print_ablation(run, folder)
         return
     first, acquired = acquire(run, folder)

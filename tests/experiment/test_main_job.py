@@ -328,7 +328,7 @@ class TestConfiguration:
                 check_run(wanted)
             return
         check_run(wanted)
-        real, wrong = (build_simulator(wanted, material) for material in (wanted.target, wanted.simulation))
+        real, wrong = (build_simulator(wanted, material) for material in (wanted.target.material, wanted.simulation))
         assert real.material != wrong.material
         stages = REFINED if option == "solver_in_the_loop" else STAGES
         stages = ["generate", "ablation", "report"] if name == "marker_ablation" else stages

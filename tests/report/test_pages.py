@@ -248,7 +248,9 @@ class TestBeams:
             (tmp_path / name).unlink()
         page = report(
             tmp_path,
-            BEAM.changed(name="my_robot", data=BEAM.data.changed(folder=None), laboratory=LABORATORY),
+            BEAM.changed(
+                name="my_robot", data=BEAM.data.changed(folder=None), laboratory={**LABORATORY, "fibres": None}
+            ),
         )
         assert "ResPhys diverged in 1 of 2 roll-outs" in page.text
         assert page.text.count("1 of 2 diverged") == 1

@@ -10,14 +10,14 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.setting_errors import completed
 from warp_resphys.io.settings import parse
 from warp_resphys.launch import freed
-from warp_resphys.settings.run import RunSettings, with_baseline
+from warp_resphys.settings.run import RunSettings, filled
 
 
 @functools.cache
 def _composed(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         plain = OmegaConf.to_container(compose("config", freed(overrides)), resolve=True)
-    return completed(RunSettings.model_json_schema(), with_baseline(plain))
+    return completed(RunSettings.model_json_schema(), filled(plain))
 
 
 def composed(*overrides):

@@ -11,7 +11,8 @@ from typing_extensions import override
 from ..data.rigid import RigidTransform, kabsch
 from ..experiment.build import bound_markers
 from ..experiment.files import REGISTRATION
-from ..experiment.laboratory import laboratory_simulator, make_setup, substeps_of
+from ..experiment.laboratory import laboratory_simulator, make_setup
+from ..experiment.target import substeps_of
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
 from ..robot.state import RobotState
@@ -57,7 +58,8 @@ class Laboratory(World):
         binding = settings.binding
         markers = bound_markers(binding, self._simulator.body.mesh, setup.tracked, tuple(binding.tracked))
         self._read = markers.to(self._simulator.rest_positions)
-        self._substeps, self.noise = substeps_of(settings), settings.laboratory.noise
+        self._substeps = substeps_of(settings.time_step, settings.laboratory, "laboratory")
+        self.noise = settings.laboratory.noise
         self._seeds = (settings.seed, _STREAM, seed)
         self._frame = _registered(run_dir, setup.reference, tuple(binding.reference))
         with torch.no_grad():

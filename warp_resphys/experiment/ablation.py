@@ -33,6 +33,7 @@ from .files import METRICS, REPORT
 from .parts import TrialPart, remove_parts, split_into_parts, work_on, workers_for
 from .reconstruct import Reconstructing
 from .simulate import held_state
+from .target import build_target
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -77,11 +78,12 @@ def generate_motion(context: StageContext) -> None:
     """Writes motion.h5: q (T + 1, N, 3) from the held state on, by the target and the uncorrected simulator."""
     settings: MotionStage = context.settings
     data = settings.data
-    target, simulation = (build_simulator(settings, material) for material in (settings.target, settings.simulation))
+    target, simulation = build_target(settings, settings.target), build_simulator(settings, settings.simulation)
     with torch.no_grad():
-        start = held_state(target, data.load, 1e-3 * np.array(data.weights_g.observed))
-        motion = {"q": target.rollout(start, data.steps).q[:, 0]}
-        motion["uncorrected_q"] = simulation.rollout(start, data.steps).q[:, 0]
+        held = held_state(target.simulator, data.load, 1e-3 * np.array(data.weights_g.observed))
+        moved = target.simulator.rollout(held, data.steps * target.substeps).q[:: target.substeps, 0]
+        start = State(target.seen(held.q), target.seen(held.v))
+        motion = {"q": target.seen(moved), "uncorrected_q": simulation.rollout(start, data.steps).q[:, 0]}
     attributes = {"fingerprint": context.fingerprint, "time_step": settings.time_step}
     with atomic_hdf5(context.run_dir / MOTION, "motion", attributes) as file:
         for name, q in motion.items():

@@ -22,10 +22,7 @@ from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import PlayedSettings
 from ..stepping.quantity import Quantity
-
-Actuated = BodySettings | PlayedSettings  # settings with the groups of the actuators
 
 # Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
@@ -97,7 +94,7 @@ class Drive:
         return self.quantity.per
 
 
-def driving_quantity(settings: Actuated) -> Quantity | None:
+def driving_quantity(settings: BodySettings) -> Quantity | None:
     """Quantity that drives the body; None without actuators."""
     if settings.chambers is not None:
         return PRESSURE
@@ -108,7 +105,7 @@ def driving_quantity(settings: Actuated) -> Quantity | None:
     return None
 
 
-def driven_parts(settings: Actuated) -> int:
+def driven_parts(settings: BodySettings) -> int:
     """Number of values of the driving input."""
     if settings.chambers is not None:
         return settings.chambers.count
@@ -118,7 +115,7 @@ def driven_parts(settings: Actuated) -> int:
     return len(settings.muscles.bundles)
 
 
-def drive_of(settings: Actuated, body: Body) -> Drive | None:
+def drive_of(settings: BodySettings, body: Body) -> Drive | None:
     """Input that drives a body; None without actuators."""
     quantity = driving_quantity(settings)
     if quantity is None:

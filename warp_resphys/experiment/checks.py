@@ -29,13 +29,14 @@ from ..settings.learning import IdentifySettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
-from ..settings.trials import MarkerSettings, RecordedData, Trial
+from ..settings.trials import MarkerSettings, RecordedData, ReleaseFromLoad, Trial
 from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, marker_view_of
 from .files import STATIC, payload_inputs
 from .identify import ELASTIC
-from .laboratory import input_sequences, laboratory_settings, substeps_of
+from .laboratory import input_sequences
 from .reading import standing_enough
+from .target import substeps_of, target_settings, vertices_in
 from .trials import all_trials, folds_of, split_of, trials_of
 
 _LARGEST_STRAIN = 0.3  # rho g L / E above which a wrong unit is assumed
@@ -79,13 +80,41 @@ def check_run(run: RunSettings) -> None:
 
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
     """Checks an experiment with simulated trials, in which all vertices are observed."""
-    assert run.target is not None
-    build_material(run.target, "target")
     split_of(run)
-    if run.data.kind == "release_from_load":
-        with _naming("data.load: "):
-            select_vertices(simulator.body.mesh, **run.data.load.arguments())
+    _check_target(run, simulator.body)
     make_reconstructor(simulator, **dict(run.reconstruction))
+
+
+def _check_target(run: RunSettings, body: Body) -> None:
+    """Checks the simulation that plays the real body, which is observed at the vertices of the simulator's body."""
+    for key, target in run.targets.items():
+        build_material(target.material, f"{key}.material")
+        with _naming(f"{key}: "):
+            simulator = build_simulator(target_settings(run, target), target.material, payload_at=run.payload_at)
+        for material in simulator.materials.values():
+            _check_size(simulator.body, material, run.gravity)
+        if run.recorded is not None:
+            _check_drive(drive_of(run, body), drive_of(target, simulator.body))
+            continue
+        substeps_of(run.time_step, target, key)
+        with _naming(f"{key}.mesh: "):
+            vertices_in(simulator.body.mesh, body.mesh)
+        if isinstance(run.data, ReleaseFromLoad):
+            with _naming("data.load: "):
+                select_vertices(simulator.body.mesh, **run.data.load.arguments())
+
+
+def _check_drive(drive: Drive | None, real: Drive | None) -> None:
+    """Refuses a laboratory whose input is not that of the simulator."""
+    simulated, played = (
+        "no input" if own is None else f"{own.quantity.name} of {len(own.parts)} {own.per}{'s'[: len(own.parts) - 1]}"
+        for own in (drive, real)
+    )
+    if simulated != played:
+        raise InputError(
+            f"laboratory: its body takes {played}, but that of the simulator takes {simulated}: give both the same "
+            "inputs, by chambers, tendons or muscles.commanded."
+        )
 
 
 def _check_reconstruction(run: RunSettings, simulator: Simulator, modes: int | None = None) -> None:
@@ -108,9 +137,9 @@ def _check_control(run: RunSettings, body: Body) -> None:
 def _check_memory(run: RunSettings) -> None:
     """Refuses meshes and networks that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
-    meshes: dict[str, MeshSettings] = {"mesh": run.mesh}
-    meshes |= {f"parts.{name}.mesh": part.mesh for name, part in run.parts.items()}
-    meshes |= {} if run.laboratory is None else {"laboratory.mesh": run.laboratory.mesh}
+    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in run.bodies.items()}
+    for key, body in run.bodies.items():
+        meshes |= {f"{key}parts.{name}.mesh": part.mesh for name, part in body.parts.items()}
     for key, mesh in meshes.items():
         cells = math.prod(mesh.divisions) if isinstance(mesh, HexahedralBox | TetrahedralBox) else 0
         needed = cells * _BYTES_PER_CELL / 2**30
@@ -165,7 +194,7 @@ def _check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSetting
     if run.published is not None:
         build_material(run.published.simulation, "published.simulation")
     if run.is_laboratory:
-        _check_laboratory(run, data, trials, drive)
+        _check_laboratory(run, data, trials, body, drive)
     for trial in trials:
         if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
             raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
@@ -255,10 +284,11 @@ def _check_inputs(data: RecordedData, drive: Drive) -> None:
         raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {count}.")
 
 
-def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Trial], drive: Drive | None) -> None:
+def _check_laboratory(
+    run: RunSettings, data: RecordedData, trials: Sequence[Trial], body: Body, drive: Drive | None
+) -> None:
     laboratory, begins = run.laboratory, {trial.begins for trial in trials}
     assert laboratory is not None
-    material = build_material(laboratory.material, "laboratory.material")
     for trial in trials:
         if trial.pull is not None and data.rest != "file":
             raise InputError(
@@ -278,14 +308,11 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
             )
     played = PlayedSettings.of(run, files={})
     if "rest" in begins and data.steps is not None:
-        substeps_of(played)
+        substeps_of(run.time_step, laboratory, "laboratory")
         if drive is not None:
             random = np.random.default_rng(0)
             input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
-    with _naming("laboratory: "):
-        body = build_body(laboratory_settings(played), played.payload_at)
-    for own in (material,) if isinstance(material, Material) else material.values():
-        _check_size(body, own, run.gravity)
+    _check_target(run, body)
 
 
 def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
@@ -352,9 +379,8 @@ def _check_parts(identify: IdentifySettings, simulator: Simulator) -> None:
 
 def _check_ablation(run: RunSettings, simulator: Simulator) -> None:
     """Checks the marker ablation."""
-    assert run.target is not None
     assert run.ablation is not None
-    build_material(run.target, "target")
+    _check_target(run, simulator.body)
     counts, surface = run.ablation.counts, len(surface_vertices(simulator.body.mesh))
     if max(counts) > surface:
         raise InputError(

@@ -21,7 +21,6 @@ from ..io.stages import StageContext
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
 from ..learning.replay import Start
-from ..settings.run import models_of
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
 from ..stepping.state import State
 from .build import finer
@@ -33,7 +32,7 @@ from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-INTERVAL_MODELS = ("sysid", "simfree", "resphys")  # models with prediction intervals
+INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals
 _FILM_FRAMES = 256  # maximum
 _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
@@ -42,7 +41,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
     settings: EvaluateStage = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    compared = models_of(settings.published, settings.identified, settings.correct_uncorrected)
+    compared = experiment.models
     names = [name for group in settings.groups.values() for name in group]
     filmed = _film_trial(experiment, settings.groups["1"])
     parts = _parts(context, experiment, names, compared, filmed)
@@ -315,8 +314,8 @@ def time_models(context: StageContext) -> None:
     """Writes times.json: computing time per test trial [s], mean and standard deviation over the trials.
 
     The rows are those of the published table: the uncorrected simulator, the simulator with the true parameters if
-    known, the simulator with the learned force, and the network alone. Trials run one at a time, once, after a warm-up
-    run of the first trial.
+    the target has its mesh and time step, the simulator with the learned force, and the network alone. Trials run one
+    at a time, once, after a warm-up run of the first trial.
     """
     settings: TimeStage = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
@@ -325,7 +324,8 @@ def time_models(context: StageContext) -> None:
     learned = learned_of(experiment, "resphys")
     starts = {name: experiment.start(experiment.replay(simulator, [name], "resphys")) for name in names}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, experiment.simulator("simulation"))}
-    if settings.target is not None:
+    target, shared = settings.target, ("mesh", "parts", "time_step")
+    if target is not None and all(getattr(target, key) == getattr(settings, key) for key in shared):
         rows["target"] = ("simulation", None, experiment.simulator("target"))
     rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
     times: dict[str, dict[str, float]] = {}

@@ -26,12 +26,23 @@ from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
 from ..learning.release import estimate_release
 from ..learning.replay import Replay, Start
-from ..settings.body import MaterialSettings, SimulatorSettings
-from ..settings.run import PublishedSettings
+from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
+from ..settings.run import PublishedSettings, models_of
 from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, marker_view_of
-from .files import DATASET, GIVEN, IDENTIFICATION, LAW_FILE, SCALED_DATASET, STATIC, Dataset, read_dataset
+from .files import (
+    DATASET,
+    GIVEN,
+    IDENTIFICATION,
+    LAW_FILE,
+    SCALED_DATASET,
+    STATIC,
+    Dataset,
+    read_dataset,
+    read_if_there,
+)
+from .target import target_settings
 
 COROTATED: Final = "corotated"
 LAW: Final = "law"
@@ -91,7 +102,7 @@ class Experiment:
                 identified material as well.
         """
         if kind not in self._simulators:
-            body = None if kind == "published" else self.body
+            body = None if kind in ("published", "target") else self.body
             made_of, material = self.settings_of(kind), self.material_of(kind)
             self._simulators[kind] = build_simulator(made_of, material, body, on_failure=self.on_failure)
         return self._simulators[kind]
@@ -105,7 +116,8 @@ class Experiment:
             own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
         elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
             own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
-        return SimulatorSettings.of(settings).model_copy(update=own)
+        chosen = target_settings(settings, self._target) if kind == "target" else SimulatorSettings.of(settings)
+        return chosen.model_copy(update=own)
 
     def material_of(self, kind: str) -> MaterialSettings:
         """Material of a simulator of some kind, see `simulator`."""
@@ -113,8 +125,10 @@ class Experiment:
             return self._published.simulation
         if kind == LAW:
             return MaterialSettings(model=LAW, **read_json(self.folder / LAW_FILE)["constants"])
-        if kind != "target":
-            return self.settings.simulation
+        return self._target.material if kind == "target" else self.settings.simulation
+
+    @property
+    def _target(self) -> TargetSettings:
         assert isinstance(self.settings, TimeStage)
         assert self.settings.target is not None
         return self.settings.target
@@ -142,11 +156,7 @@ class Experiment:
 
     def observe_by(self, model: str) -> Observation:
         """Observation with the marker placement that was identified for a model, if any."""
-        key = self._sources(model)[1]
-        key = "sysid" if key == LAW else key
-        if key is None or self.settings.identified is None:
-            return self.observe
-        placement = read_json(self.folder / IDENTIFICATION)[key].get("placement")
+        placement = self.identification(model).get("placement")
         if placement is None:
             return self.observe
         assert isinstance(self.observe, Markers)
@@ -222,24 +232,41 @@ class Experiment:
         replays = [self.replay(simulator, batch, model) for batch in self.batches(names)]
         return [(replay, self.start(replay, model)) for replay in replays]
 
-    def parameters(self, model: str) -> dict[str, torch.Tensor]:
-        """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
-        key = self._sources(model)[1]
+    def identification(self, model: str) -> dict[str, Any]:
+        """Returns the identification of a model: parameters, their uncertainty and the placement of markers, if any."""
+        key = self.sources(model)[1]
         if key is None or (key != LAW and self.settings.identified is None):
             return {}
-        file = read_json(self.folder / (LAW_FILE if key == LAW else IDENTIFICATION))
-        values = (file if key == LAW else file[key])["parameters"]
+        identified = read_if_there(self.folder / IDENTIFICATION)
+        if key != LAW:
+            return dict(identified[key])
+        placement = identified.get("sysid", {}).get("placement")
+        return {"parameters": read_json(self.folder / LAW_FILE)["parameters"], "placement": placement}
+
+    def parameters(self, model: str) -> dict[str, torch.Tensor]:
+        """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
+        values = self.identification(model).get("parameters", {})
         return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
 
-    def _sources(self, model: str) -> tuple[str, str | None]:
-        """Returns the entry of `MODELS`; a force corrects the law where there is one that helps, otherwise SysID."""
-        if self.settings.law is None or model not in (LAW, "resphys"):
-            return MODELS[model]
-        return MODELS[LAW if read_json(self.folder / LAW_FILE)["accepted"] else "sysid"]
+    @property
+    def models(self) -> list[str]:
+        """Names of the models that are compared; the law is one of them if it helps on the validation trials."""
+        settings = self.settings
+        assert isinstance(settings, EvaluateStage)
+        return models_of(settings.published, settings.identified, settings.correct_uncorrected, self.has_law)
+
+    @property
+    def has_law(self) -> bool:
+        """Whether a law was identified, and helps on the validation trials."""
+        return self.settings.law is not None and bool(read_json(self.folder / LAW_FILE)["accepted"])
+
+    def sources(self, model: str) -> tuple[str, str | None]:
+        """Returns the entry of `MODELS`; a force corrects the law, if there is one."""
+        return MODELS[LAW if model == "resphys" and self.has_law else model]
 
     def model_simulator(self, model: str) -> Simulator:
         """The simulator that a model uses or corrects."""
-        kind = self._sources(model)[0]
+        kind = self.sources(model)[0]
         return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
 
     def conditions(

@@ -1,8 +1,8 @@
 """Stage: simulated laboratory, which records trials of a simulation that takes the place of the real body.
 
-The laboratory is for users without one. Compared with the simulator to be corrected, its mesh is finer, its time step
-smaller and its material different, and fibres may be wound around its chambers. Its body is slightly tilted, its
-markers deviate slightly from their nominal places, and cameras see the markers in their own frame, with noise.
+The laboratory is for users without one. Its simulation is a target (`experiment.target`): mesh, time step, material and
+actuators may differ from those of the simulator to be corrected. Its body is slightly tilted, its markers deviate
+slightly from their nominal places, and cameras see the markers in their own frame, with noise.
 """
 
 import zlib
@@ -22,14 +22,12 @@ from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import Recording
 from ..data.rigid import RigidTransform
 from ..dynamics.simulator import Simulator
-from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
-from ..settings.body import SimulatorSettings
 from ..settings.stages import LaboratoryStage, PlayedSettings
 from ..settings.trials import Trial
 from ..stepping.inputs import Inputs
@@ -40,6 +38,7 @@ from .files import STATIC, TRUTH, payload_inputs
 from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
 from .simulate import base_of, distributed, fixed_positions
+from .target import substeps_of, target_settings
 
 FloatArray = NDArray[np.float64]
 
@@ -155,8 +154,9 @@ def _rate_of(settings: PlayedSettings) -> float:
 
 def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], noise: float) -> dict[str, Any]:
     """Contents of truth.json: what the recordings were made with; ``noise`` in metres."""
-    material, fibres = settings.laboratory.material, settings.laboratory.fibres
+    material, fibres, muscles = (getattr(settings.laboratory, key) for key in ("material", "fibres", "muscles"))
     wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
+    wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
     released = {trial.name: _released_at(settings, trial, _random_of(settings, trial)) for trial in trials}
     return {
         "material": {"model": material.model, **material.parameters, **wound},
@@ -196,16 +196,9 @@ def make_setup(settings: PlayedSettings) -> Setup:
     return Setup(gravity, rotation, translation, places[:count], places[count:])
 
 
-def laboratory_settings(settings: PlayedSettings) -> SimulatorSettings:
-    """Settings of the simulator that takes the place of the real body."""
-    played = settings.laboratory
-    own = {"mesh": played.mesh, "time_step": played.time_step, "integrator": played.integrator, "fibres": played.fibres}
-    return SimulatorSettings.of(settings, **own)
-
-
 def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simulator:
     """Simulator that takes the place of the real body, for gravity in the frame of the body [m/s^2]."""
-    simulated = laboratory_settings(settings).model_copy(update={"gravity": tuple(gravity.tolist())})
+    simulated = target_settings(settings, settings.laboratory).model_copy(update={"gravity": tuple(gravity.tolist())})
     return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
 
 
@@ -219,7 +212,9 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     """(K + 1, C) inputs of a trial at the frames, drawn from the seed and the number of its sequence."""
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
     assert settings.data.steps is not None
-    drawn = input_sequences(settings).draw(settings.data.steps, settings.time_step, driven_parts(settings), draw)
+    drawn = input_sequences(settings).draw(
+        settings.data.steps, settings.time_step, driven_parts(settings.laboratory), draw
+    )
     if trial.is_released:
         drawn = np.zeros_like(drawn)
     elif trial.begins == STATIC:
@@ -253,7 +248,8 @@ class _Played(ResumableRollout):
         self._constants, self.like = simulator.prepare(), simulator.rest_positions
         by_name = {trial.name: trial for trial in settings.trials}
         self._trials = [by_name[name] for name in part.names]
-        self._tip, self._substeps = settings.tip, 1 if self._trials[0].is_released else substeps_of(settings)
+        self._tip, released = settings.tip, self._trials[0].is_released
+        self._substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
         markers = bound_markers(binding, simulator.body.mesh, setup.tracked, tuple(binding.tracked))
         self._markers = markers.to(self.like)
         payload = np.array([trial.payload for trial in self._trials])
@@ -262,7 +258,7 @@ class _Played(ResumableRollout):
             **{key: simulator.tensor(masses) for key, masses in hung.items()} if payload.any() else {}
         )
         self._driven: torch.Tensor | None = None
-        quantity = driving_quantity(settings)
+        quantity = driving_quantity(settings.laboratory)
         if self._trials[0].sequence is not None and quantity is not None:
             self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
             self._name = quantity.name
@@ -313,18 +309,3 @@ class _Played(ResumableRollout):
     @override
     def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
         return {"markers": self._markers(self.state.q).cpu().numpy()}
-
-
-def substeps_of(settings: PlayedSettings) -> int:
-    """Number of steps of the laboratory's simulation per time step of the simulator.
-
-    Raises:
-        InputError: the time step is not a multiple of the laboratory's.
-    """
-    ratio = settings.time_step / settings.laboratory.time_step
-    if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
-        raise InputError(
-            f"time_step is {settings.time_step:g} s and laboratory.time_step {settings.laboratory.time_step:g} s: the "
-            "first must be a multiple of the second."
-        )
-    return round(ratio)

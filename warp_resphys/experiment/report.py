@@ -23,7 +23,7 @@ from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
 from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
-from ..report.notes import error_notes, kept_note, material_note, network_note, published_note
+from ..report.notes import error_notes, kept_note, material_note, network_note, published_note, target_note
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
@@ -90,7 +90,7 @@ def make_report(context: StageContext) -> None:
         kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
         simulator=material_note(run.simulation),
-        target="" if run.target is None else material_note(run.target),
+        target=target_note(run),
     )
     write_report(folder / REPORT, data)
 

@@ -1,6 +1,8 @@
 """Stage: simulates trials with the target simulator, with the states of all vertices as data."""
 
 import logging
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +20,22 @@ from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import SimulateStage
-from ..settings.trials import BaseMotion, MotionSettings, MovingBase, ReleaseFromTwist, SimulatedData, Trial
+from ..settings.trials import (
+    BaseMotion,
+    HeldSettings,
+    MotionSettings,
+    MovingBase,
+    ReleaseFromLoad,
+    ReleaseFromTwist,
+    SimulatedData,
+    Trial,
+)
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .build import build_simulator, whole_mesh
+from .build import whole_mesh
 from .files import DATASET, GIVEN, Dataset
 from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from .target import build_target
 
 log = logging.getLogger(__name__)
 
@@ -90,33 +102,59 @@ class _FreeMotion(ResumableRollout):
 
     def __init__(self, part: TrialPart) -> None:
         settings: SimulateStage = part.context.settings
-        self._data, self._simulator = settings.data, build_simulator(settings, settings.target)
+        self._data, self._target = settings.data, build_target(settings, settings.target)
+        self._simulator = self._target.simulator
         self._trials = [trial for trial in settings.trials if trial.name in part.names]
         self._constants, self.like = self._simulator.prepare(), self._simulator.rest_positions
-        shape = (len(self._trials), self._simulator.body.n_vertices, 3)
+        shape = (len(self._trials), len(whole_mesh(settings).vertices), 3)
         self.fields = {"observed": Field(shape, "m", batch_axes=1), "velocity": Field(shape, "m/s", batch_axes=1)}
         self.frames = part.frames
         self._fixed: list[torch.Tensor] | None = None
         if (motion := settings.data.base_motion) is not None:
-            times = settings.time_step * np.arange(1, part.frames)
+            times = self._simulator.time_step * np.arange(1, (part.frames - 1) * self._target.substeps + 1)
             poses = [base_of(motion, trial, times, _motion_scale(settings, trial)) for trial in self._trials]
             self._fixed = fixed_positions(self._simulator, np.stack(poses, axis=1))
 
     @override
     def begin(self) -> State:
-        return initial_state(self._simulator, self._data, np.array([trial.amount for trial in self._trials]))
+        return initial_state(self._simulator, self._data, self._trials)
 
     @override
     def step(self, number: int) -> State:
-        inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[number - 1])
-        return self._simulator.step(self.state, inputs, self._constants)[0]
+        state, substeps = self.state, self._target.substeps
+        for at in range((number - 1) * substeps, number * substeps):
+            inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[at])
+            state = self._simulator.step(state, inputs, self._constants)[0]
+        return state
 
     @override
     def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
-        return {"observed": self.state.q.cpu().numpy(), "velocity": self.state.v.cpu().numpy()}
+        seen = {"observed": self.state.q, "velocity": self.state.v}
+        return {name: self._target.seen(values).cpu().numpy() for name, values in seen.items()}
 
 
-def initial_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:
+def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Trial]) -> State:
+    """Initial states of trials, by ``data.kind``, or as a trial is held by itself."""
+    common = [trial.amount for trial in trials if trial.load is None]
+    states = [_common_state(simulator, data, np.array(common))] if common else []
+    states += [_held_alone(simulator, data, trial.load) for trial in trials if trial.load is not None]
+    order = np.argsort([k for own in (True, False) for k, t in enumerate(trials) if (t.load is None) == own])
+    whole = State(torch.cat([s.q for s in states]), torch.cat([s.v for s in states]))
+    return whole.map(lambda values: values[torch.as_tensor(order, device=values.device)])
+
+
+def _held_alone(simulator: Simulator, data: SimulatedData, held: HeldSettings) -> State:
+    assert isinstance(data, ReleaseFromLoad)
+    if held.twist_deg:
+        angle = simulator.tensor([math.radians(held.twist_deg)])
+        q = twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
+        return State(q, torch.zeros_like(q))
+    along = np.asarray(held.direction, dtype=np.float64) / np.linalg.norm(held.direction)
+    force = 1e-3 * held.weight_g * float(np.linalg.norm(simulator.gravity)) * along
+    return _under_forces(simulator, held.at or data.load, force[None])
+
+
+def _common_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:
     """Initial states of a batch for (B,) weights [kg], angles [rad] or factors of the motion, by ``data.kind``."""
     if isinstance(data, MovingBase):
         return simulator.static_equilibrium(Inputs(), batch=len(values))
@@ -132,12 +170,16 @@ def held_state(simulator: Simulator, load: PlaceSettings, weights: NDArray[Any])
     Raises:
         InputError: all vertices of the place are fixed.
     """
+    log.info("computing the equilibrium under %d weights", len(weights))
+    return _under_forces(simulator, load, weights[:, None] * np.asarray(simulator.gravity))
+
+
+def _under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray) -> State:
+    """Equilibrium of the body under forces (B, 3) [N] on the vertices of a place, in equal shares."""
     face = select_vertices(simulator.body.mesh, **load.arguments())
     if np.isin(face, simulator.body.fixed_vertices).all():
         raise InputError("data.load selects fixed vertices only: hang the weights on vertices that can move.")
-    log.info("computing the equilibrium under %d weights", len(weights))
-    forces = simulator.tensor(weights)[:, None] * simulator.tensor(simulator.gravity)
-    return simulator.static_equilibrium(Inputs(distributed(simulator, face, forces)))
+    return simulator.static_equilibrium(Inputs(distributed(simulator, face, simulator.tensor(forces))))
 
 
 def distributed(simulator: Simulator, vertices: NDArray[np.int64], forces: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,15 @@ import numpy as np
 
 from ..io.errors import DataFileError, InputError
 from ..settings.run import RunSettings
-from ..settings.trials import LaboratorySettings, RecordedData, SimulatedData, Split, Trial, TrialSettings
+from ..settings.trials import (
+    LaboratorySettings,
+    RecordedData,
+    ReleaseFromLoad,
+    SimulatedData,
+    Split,
+    Trial,
+    TrialSettings,
+)
 
 T = TypeVar("T")
 
@@ -55,7 +63,9 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
         variation = VARIATIONS[data.kind]
         values = (*data.amounts.train, *data.amounts.validation, *data.amounts.test)
         amounts = {variation.name(value): variation.factor * value for value in values}
-        return {name: Trial(name=name, begins="given", amount=amount) for name, amount in amounts.items()}
+        trials = {name: Trial(name=name, begins="given", amount=amount) for name, amount in amounts.items()}
+        others = data.others.items() if isinstance(data, ReleaseFromLoad) else ()
+        return trials | {name: Trial(name=name, begins="given", load=held) for name, held in others}
     if data.folder is not None:
         folder = Path(data.folder).expanduser()
         entries = data.trials or _recordings(folder)
@@ -134,7 +144,10 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
     twice = sorted({x for x in everything if everything.count(x) > 1})
     if twice:
         raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: a trial belongs to one split only.")
-    return {name: [kind.name(x) for x in row] for name, row in values.items()}
+    named = {name: [kind.name(x) for x in row] for name, row in values.items()}
+    if isinstance(data, ReleaseFromLoad):
+        named["test"] += data.others
+    return named
 
 
 def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:

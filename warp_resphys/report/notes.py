@@ -1,10 +1,10 @@
 """Notes on the page of a run: its simulator, its network, and contributions to its errors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from ..energies.materials import make_material
-from ..settings.body import MaterialSettings
+from ..settings.body import MaterialSettings, TargetSettings
 from ..settings.run import RunSettings
 from .page import number_text
 
@@ -29,6 +29,7 @@ _MASS: Final = {
         "does not, so its uncorrected error differs."
     ),
 }
+_TARGET: Final = "The published target differs from its simulator in E and ν alone; this run's also has {}."  # noqa: RUF001
 _OF_A_BEAM: Final = (
     "The published errors are for other data: recordings with ten markers on the beam's sides, whose weight is cut off "
     "at the release, compared with trajectories reconstructed from them; the published uncorrected simulation has the "
@@ -38,12 +39,33 @@ _OF_AN_ARM: Final = {
     True: "The published errors are for another body: recordings of a real arm, which this run does not use.",
     False: "The published errors are for the published simulator, of 494 vertices, on the authors' recordings.",
 }
+_OF_A_TARGET: Final = {
+    "mesh": "mesh",
+    "physics": "integration of mass and volume",
+    "parts": "further parts",
+    "glued": "glue",
+    "regions": "regions",
+    "rigid": "rigid parts",
+    "fixed": "fixed vertices",
+    "symmetry": "symmetry planes",
+    "chambers": "chambers",
+    "fibres": "fibres around the chambers",
+    "tendons": "tendons",
+    "muscles": "muscle fibres",
+    "medium": "fluid",
+    "payload_string": "payload string",
+}
 
 
 def published_note(settings: RunSettings) -> str:
     """Returns how the published errors of an experiment differ from ours."""
     if settings.markers is None:
-        return _AGAINST + _MASS[settings.physics.mass]
+        more = list[str]()
+        for target in settings.targets.values():
+            more += ["another model of the material"] if target.material.model != settings.simulation.model else []
+            more += differences(settings, target)
+        also = f" {_TARGET.format(in_a_row(more))}" if more else ""
+        return _AGAINST + _MASS[settings.physics.mass] + also
     return _OF_AN_ARM[settings.is_laboratory] if settings.chambers is not None else _OF_A_BEAM
 
 
@@ -132,3 +154,44 @@ def material_note(material: MaterialSettings) -> str:
     else:
         words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
     return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"
+
+
+def target_note(settings: RunSettings) -> str:
+    """Return the target of simulated data in words: its material, and how else it differs from the simulator."""
+    if settings.recorded is not None or settings.target is None:
+        return ""
+    more = differences(settings, settings.target)
+    return material_note(settings.target.material) + (f"; with {in_a_row(more)}" if more else "")
+
+
+def differences(settings: RunSettings, target: TargetSettings) -> list[str]:
+    """Return how the simulation that plays the real body differs from the simulator, its elastic law left out.
+
+    Args:
+        settings: Of the run.
+        target: One of its `targets`.
+    """
+    words = []
+    for key, name in _OF_A_TARGET.items():
+        own, simulated = getattr(target, key), getattr(settings, key)
+        if own != simulated:
+            other = "other " if name.endswith("s") else "another "
+            words.append(f"{other if own and simulated else '' if own else 'no '}{name}")
+    if target.time_step != settings.time_step:
+        words.append(f"time steps of {target.time_step:g} s")
+    if target.integrator != settings.integrator:
+        words.append(f"the integrator {target.integrator.replace('_', ' ')}")
+    if _damping(target.material) != _damping(settings.simulation):
+        words.append("other damping")
+    return words
+
+
+def _damping(material: MaterialSettings) -> dict[str, float]:
+    """Constants of the viscosity of a material that are not zero."""
+    viscous = {name: value for name, value in material.parameters.items() if "damping" in name or "prony" in name}
+    return {name: value for name, value in viscous.items() if value}
+
+
+def in_a_row(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence: "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

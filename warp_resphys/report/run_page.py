@@ -16,6 +16,7 @@ from .data import MODELS, RunReport
 from .identification_section import identification_section
 from .marker_section import paths_section
 from .motion_sections import body_section, motion_section, start_drawing
+from .notes import differences, in_a_row
 from .page import (
     NONE,
     Canvas,
@@ -56,8 +57,7 @@ _TIMED: Final = {
     "inference": "of which the network",
 }
 _WITHOUT_RECORDINGS: Final = (
-    "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with a finer mesh and "
-    "time step, another material, viscosity{}, and noise on the markers."
+    "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with {}."
 )
 _FOLDS: Final = (
     "Each trial links to the page of the fold in which it is the test: its motion, identification and training."
@@ -103,10 +103,11 @@ def write_report(path: Path, data: RunReport) -> None:
 def results_section(data: RunReport, canvas: Canvas) -> Part:
     """Return the errors of the models and the published ones."""
     blocks: list[Any] = []
-    if data.settings.is_laboratory:
-        laboratory = data.settings.laboratory
-        fibres = ", fibres around the chambers" if laboratory is not None and laboratory.fibres is not None else ""
-        blocks.append(Text(Markup(_WITHOUT_RECORDINGS).format(fibres), "synthetic"))
+    if laboratory := data.settings.targets.get("laboratory"):
+        same = laboratory.material == data.settings.simulation
+        words = [*([] if same else ["another material"]), *differences(data.settings, laboratory)]
+        said = Markup(_WITHOUT_RECORDINGS).format(in_a_row([*words, "noise on the markers"]))
+        blocks.append(Text(said, "synthetic"))
     blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
     if data.network_note:
         blocks.append(Text(data.network_note, "network", note=True))
@@ -177,7 +178,7 @@ def _what_is_measured(data: RunReport) -> str:
     else:
         steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
         text = (
-            "Distance of the simulated vertices from those of the target, in millimetres: mean over "
+            "Distance of the simulated vertices from the same points of the target, in millimetres: mean over "
             f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )

@@ -11,8 +11,8 @@ from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
 from ..dynamics.simulator import Simulator
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
-from ..experiment.experiment import LEARNED, MODELS, Experiment
-from ..experiment.files import ERRORS, IDENTIFICATION, fold_folder, read_if_there
+from ..experiment.experiment import LEARNED, Experiment
+from ..experiment.files import ERRORS, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
@@ -25,7 +25,6 @@ from ..learning.predictors import Range
 from ..mesh.mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.run import models_of
 from ..settings.stages import EvaluateStage
 from ..settings.trials import MarkerSettings
 
@@ -190,13 +189,13 @@ def describe(folder: Path, model: str) -> Description:
     experiment = finished_experiment(folder)
     settings = experiment.settings
     assert isinstance(settings, EvaluateStage)
-    models = models_of(settings.published, settings.identified, settings.correct_uncorrected)
+    models = experiment.models
     if model not in models:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")
-    kind, key = MODELS[model]
+    kind, _ = experiment.sources(model)
     kind = "simulation" if kind == "identified" and settings.identified is None else kind
     simulator, dataset = experiment.simulator(kind), experiment.dataset
-    identified = read_if_there(folder / IDENTIFICATION).get(key or "", {})
+    identified = experiment.identification(model)
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
     learned, actuation = learned_of(experiment, model), settings.actuation

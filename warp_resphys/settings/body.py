@@ -151,8 +151,10 @@ class MuscleSettings(Settings):
     """Contractile fibres in the body."""
 
     bundles: dict[str, BundleSettings] = setting(description="muscles by name")
-    commanded: Literal["stress", "contraction"] | None = setting(description="input of the muscles")
-    stiffness: NotNegative = setting(description="required for commanded contractions", unit="Pa")
+    commanded: Literal["stress", "contraction"] | None = setting(
+        None, "input of the muscles; null: passive fibres, which stiffen the body in tension"
+    )
+    stiffness: NotNegative = setting(description="required for commanded contractions and passive fibres", unit="Pa")
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
 
     @model_validator(mode="after")
@@ -225,12 +227,28 @@ class BodySettings(Settings):
     )
 
 
-class SimulatorSettings(BodySettings):
+class SteppedSettings(BodySettings):
+    """A body and its time integration."""
+
+    time_step: TimeStep = setting(0.01, "of the simulator", "s")
+    integrator: Integrator = setting("implicit_euler", "time integrator")
+
+
+class TargetSettings(SteppedSettings):
+    """The simulation that plays the real body."""
+
+    # `run.filled` moves constants that stand directly in ``target`` into its material.
+    model_config = ConfigDict(
+        json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "string"}]}}
+    )
+
+    material: MaterialSettings = setting(description="of its body")
+
+
+class SimulatorSettings(SteppedSettings):
     """Settings of a simulator, without the material."""
 
     gravity: Vector = setting((0.0, 0.0, -9.80709), unit="m/s^2")
-    time_step: TimeStep = setting(0.01, "of the simulator", "s")
-    integrator: Integrator = setting("implicit_euler", "time integrator")
     solver: SolveSettings = SolveSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
     dtype: Literal["float64", "float32"] = setting("float64", "of the simulation; experiments need float64")

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from ..io.files import write_text
 from ..io.setting_errors import Schema, in_words, options
+from .body import TargetSettings
 from .run import RunSettings
 
 _HEAD: Final = """# Settings
@@ -27,6 +28,15 @@ any name. In `simfree`, keys that are left out are as in the groups `network` an
 complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`. This page is
 made by `python -m warp_resphys.settings.reference docs/settings.md`.
 """
+
+_TARGETS: Final = {
+    "target": " Constants and `model` of the material may stand directly in `target`.",
+    "laboratory": "",
+}
+_LEFT_OUT: Final = (
+    "Any of the keys {} of the run, and `material` with the keys of `simulation`, replaces that of the simulator as a "
+    "whole, and those that are left out are those of the simulator that is corrected."
+)
 
 
 def page() -> str:
@@ -50,8 +60,13 @@ def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) ->
         yield f"## {' '.join([f'`{path}`' if path else 'The run', *words])}\n"
         if path:
             yield f"{kind.get('description', '')}\n"
-        groups = {name: key for name, key in kind["properties"].items() if _groups_of(schema, key)}
-        rows = [_row(schema, kind, name, key) for name, key in kind["properties"].items() if name not in groups]
+        shared = [name for name in TargetSettings.model_fields if path in _TARGETS]
+        if shared:
+            names = ", ".join(f"`{name}`" for name in shared if name != "material")
+            yield f"{_LEFT_OUT.format(names)}{_TARGETS[path]}\n"
+        own = {name: key for name, key in kind["properties"].items() if name not in shared}
+        groups = {name: key for name, key in own.items() if _groups_of(schema, key)}
+        rows = [_row(schema, kind, name, key) for name, key in own.items() if name not in groups]
         if rows:
             yield "\n".join(["| key | it must be | default | meaning |", "|---|---|---|---|", *rows, ""])
         for name, group in groups.items():

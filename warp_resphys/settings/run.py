@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from ..io.settings import Natural, Settings, Word, parse, setting
-from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings
+from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
 from .learning import (
     AblationSettings,
@@ -73,7 +73,7 @@ class RunSettings(SimulatorSettings):
     )
     tip: PlaceSettings = setting(description="vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
-    target: MaterialSettings | None = setting(None, "material of the simulation that plays the real body")
+    target: TargetSettings | None = setting(None, "plays the real body where data are simulated")
     data: DataSettings
     markers: MarkerSettings | None = setting(
         None, "observed markers; null: every vertex is observed, as in simulations"
@@ -123,6 +123,18 @@ class RunSettings(SimulatorSettings):
     def is_laboratory(self) -> bool:
         """Whether a simulated laboratory generates the recordings."""
         return isinstance(self.data, RecordedData) and self.data.folder is None
+
+    @property
+    def targets(self) -> dict[str, TargetSettings]:
+        """The simulation that plays the real body, by its key; empty where the data are recordings of a real one."""
+        own = {"target": None if self.recorded is not None else self.target}
+        own |= {"laboratory": self.laboratory if self.is_laboratory else None}
+        return {key: settings for key, settings in own.items() if settings is not None}
+
+    @property
+    def bodies(self) -> dict[str, SteppedSettings]:
+        """The simulator and its target, by the prefix of their keys, such as ``target.``."""
+        return {"": self, **{f"{key}.": target for key, target in self.targets.items()}}
 
     @property
     def payload_at(self) -> PlaceSettings | None:
@@ -188,8 +200,8 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="before")
     @classmethod
-    def _baseline(cls, values: Any) -> Any:
-        return with_baseline(values)
+    def _left_out(cls, values: Any) -> Any:
+        return filled(values)
 
     @model_validator(mode="after")
     def _markers_and_data(self) -> Self:
@@ -202,7 +214,7 @@ class RunSettings(SimulatorSettings):
                 f"data.kind is {self.data.kind!r}, in which all vertices are observed: leave markers null."
             )
         if self.recorded is None and self.target is None:
-            raise ValueError("target is null: give the material of the simulation that plays the real body.")
+            raise ValueError("target is null: give the simulation that plays the real body, such as its material.")
         if self.is_laboratory and self.laboratory is None:
             raise ValueError("data.folder is not set: give the folder of the recordings.")
         if self.mesh_check is not None and self.markers is None:
@@ -217,18 +229,21 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _drives(self) -> Self:
-        commanded = {
-            "chambers": self.chambers is not None,
-            "tendons": self.tendons is not None,
-            "muscles": self.muscles is not None and self.muscles.commanded is not None,
-        }
-        driven = [group for group, is_driven in commanded.items() if is_driven]
-        if len(driven) > 1:
-            raise ValueError(
-                f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
-            )
-        if self.fibres is not None and self.chambers is None:
-            raise ValueError("fibres are wound around chambers, but chambers is null: leave the fibres out.")
+        for key, body in self.bodies.items():
+            commanded = {
+                "chambers": body.chambers is not None,
+                "tendons": body.tendons is not None,
+                "muscles": body.muscles is not None and body.muscles.commanded is not None,
+            }
+            driven = [f"{key}{group}" for group, is_driven in commanded.items() if is_driven]
+            if len(driven) > 1:
+                raise ValueError(
+                    f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
+                )
+            if body.fibres is not None and body.chambers is None:
+                raise ValueError(
+                    f"{key}fibres are wound around chambers, but {key}chambers is null: leave the fibres out."
+                )
         if self.payload_string is not None and self.payload_at is None:
             raise ValueError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
         if self.identify is not None and "fibre_stiffness" in self.identify.parameters and self.fibres is None:
@@ -237,12 +252,12 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _holds_rigid_parts(self) -> Self:
-        used = {"integrator": self.integrator}
-        used |= {} if self.identify is None else {"identify.integrator": self.identify.integrator or self.integrator}
-        if self.is_laboratory and self.laboratory is not None:
-            used["laboratory.integrator"] = self.laboratory.integrator
-        for key, integrator in used.items():
-            if self.rigid and integrator == "midpoint":
+        used: dict[str, tuple[Any, str]] = {}
+        for prefix, body in self.bodies.items():
+            used[f"{prefix}integrator"] = (body.rigid, body.integrator)
+        used |= {} if self.identify is None else {"identify.integrator": (self.rigid, self.identify.integrator or "")}
+        for key, (rigid, integrator) in used.items():
+            if rigid and integrator == "midpoint":
                 raise ValueError(f"{key} is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2.")
         return self
 
@@ -373,16 +388,36 @@ def models_of(
     return [model for model in get_args(Model) if not absent.get(model)]
 
 
-def with_baseline(values: Any) -> Any:
-    """Returns the plain values of a run, with keys that simfree leaves out copied from network and trainer."""
-    simfree = _mapping(values.get("simfree", {})) if isinstance(values, Mapping) else None
-    if simfree is None or not {*simfree} <= {"network", "trainer"}:
+def filled(values: Any) -> Any:
+    """Returns the plain values of a run, with the keys that some groups leave out copied from other groups.
+
+    These are ``network`` and ``trainer`` of ``simfree``, and in ``target`` and ``laboratory`` all keys of
+    `TargetSettings`, with ``simulation`` as the material. Numbers and the model of a material may stand directly in
+    ``target``.
+    """
+    if not isinstance(values, Mapping):
         return values
-    merged: dict[str, Any] = {}
-    for key in ("network", "trainer"):
-        common, changes = _mapping(values.get(key, {})), _mapping(simfree.get(key, {}))
-        merged[key] = simfree.get(key) if common is None or changes is None else {**common, **changes}
-    return {**values, "simfree": merged}
+    values = dict(values)
+    simfree = _mapping(values.get("simfree", {}))
+    if simfree is not None and {*simfree} <= {"network", "trainer"}:
+        merged: dict[str, Any] = {}
+        for key in ("network", "trainer"):
+            whole, changes = _mapping(values.get(key, {})), _mapping(simfree.get(key, {}))
+            merged[key] = simfree.get(key) if whole is None or changes is None else {**whole, **changes}
+        values["simfree"] = merged
+    keys = TargetSettings.model_fields
+    common = {key: values.get(key) for key, field in keys.items() if key in values or field.is_required()}
+    for group in ("target", "laboratory"):
+        own = values.get(group)
+        if isinstance(own, Mapping):
+            direct = {key for key, value in own.items() if key not in keys and not isinstance(value, Mapping)}
+            constants = {key: own[key] for key in direct} if group == "target" else {}
+            material = _mapping(own.get("material", {}))
+            if constants and material is not None:
+                own = {key: value for key, value in own.items() if key not in constants}
+                own["material"] = {**constants, **material}
+            values[group] = {**common, "material": values.get("simulation"), **own}
+    return values
 
 
 def _mapping(values: Any) -> Mapping[str, Any] | None:

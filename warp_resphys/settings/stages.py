@@ -9,19 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from ..io.settings import Many, Settings, Vector
-from .body import (
-    ChamberSettings,
-    GlueSettings,
-    MaterialSettings,
-    MediumSettings,
-    MuscleSettings,
-    PartSettings,
-    RigidSettings,
-    SimulatorSettings,
-    SolveSettings,
-    StringSettings,
-    TendonSettings,
-)
+from .body import MaterialSettings, SimulatorSettings, SolveSettings, TargetSettings
 from .control import ControlSettings, FeedbackSettings, FigureSettings, PlanSettings, ReductionSettings
 from .learning import (
     ActuationSettings,
@@ -33,7 +21,7 @@ from .learning import (
     ReleaseSettings,
     TrainingSettings,
 )
-from .mesh import BoxSettings, PlaceSettings
+from .mesh import PlaceSettings
 from .run import PublishedSettings, RunSettings
 from .trials import (
     BindingSettings,
@@ -57,7 +45,7 @@ class SimulationStage(SimulatorSettings):
 class SimulateStage(SimulationStage):
     """Trials of a simulation that plays the real body, with all vertices observed."""
 
-    target: MaterialSettings
+    target: TargetSettings
     data: Annotated[SimulatedData, Field(discriminator="kind")]
     trials: Many[Trial]
 
@@ -66,23 +54,14 @@ class PlayedSettings(Settings):
     """A simulated laboratory."""
 
     laboratory: PlaySettings
-    parts: dict[str, PartSettings]
-    glued: Many[GlueSettings]
-    regions: dict[str, BoxSettings]
-    rigid: dict[str, RigidSettings]
-    fixed: PlaceSettings
     tip: PlaceSettings
-    chambers: ChamberSettings | None
-    tendons: TendonSettings | None
-    muscles: MuscleSettings | None
-    medium: MediumSettings | None
-    payload_string: StringSettings | None
     payload_at: PlaceSettings | None
     gravity: Vector
     time_step: float
     solver: SolveSettings
     device: str
     dtype: str
+    coupling: str
     seed: int
     binding: BindingSettings
     data: ReadingSettings
@@ -187,7 +166,7 @@ class EvaluateStage(TestStage):
 class TimeStage(TestStage):
     """Times of the models."""
 
-    target: MaterialSettings | None
+    target: TargetSettings | None
 
 
 class MeshCheckStage(TestStage):
@@ -232,7 +211,7 @@ class DriveStage(LearningStage):
 class MotionStage(SimulationStage):
     """The motion of a marker ablation."""
 
-    target: MaterialSettings
+    target: TargetSettings
     simulation: MaterialSettings
     data: ReleaseFromLoad
 

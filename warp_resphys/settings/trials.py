@@ -2,11 +2,11 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
-from .body import FibreSettings, Integrator, MaterialSettings, TimeStep
-from .mesh import Direction, LengthUnit, MeshSettings, PlaceSettings
+from .body import TargetSettings
+from .mesh import Direction, LengthUnit, PlaceSettings
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; a static pose.
 Begins = Literal["held", "released", "rest", "static"]
@@ -108,6 +108,7 @@ class Trial(Settings):
     input_delay: float = 0.0  # [s]
     labels: Many[str] | None = None
     base_motion: MotionSettings | None = None
+    load: "HeldSettings | None" = None  # how it is held, where that differs from the other trials
 
     @property
     def is_released(self) -> bool:
@@ -171,12 +172,23 @@ class _Simulated(Settings):
         return amounts
 
 
+class HeldSettings(Settings):
+    """How a body is held before its release, in a test trial of its own."""
+
+    weight_g: NotNegative = setting(0.0, "weight", unit="g")
+    direction: Direction = setting((0.0, 0.0, -1.0), "in which it pulls")
+    at: PlaceSettings | None = setting(None, "vertices that carry it, in equal shares; null: data.load")
+    twist_deg: float = setting(0.0, "angle of the high end of a body that is held in a twist instead", "degrees")
+    twist_axis: Axis = setting("x", "along which the angle grows linearly, from zero at the low end")
+
+
 class ReleaseFromLoad(_Simulated):
     """Bodies that are released from rest under weights."""
 
     kind: Literal["release_from_load"]
     load: PlaceSettings = setting(description="vertices that carry the weights, in equal shares")
     weights_g: AmountSettings = setting(description="weights", unit="g")
+    others: dict[str, HeldSettings] = setting({}, "further test trials by name, held in other ways")
 
 
 class ReleaseFromTwist(_Simulated):
@@ -337,14 +349,11 @@ class SequenceSettings(Settings):
     rest: NotNegative = setting(0.1, "duration without inputs at the start and at the end", "s")
 
 
-class PlaySettings(Settings):
-    """A simulation that plays the real body, with physics that differ from those of the simulator."""
+class PlaySettings(TargetSettings):
+    """A simulation that plays the real body, and its cameras."""
 
-    mesh: MeshSettings
-    time_step: TimeStep = setting(description="of its simulation", unit="s")
-    integrator: Integrator = setting(description="of its simulation")
-    material: MaterialSettings = setting(description="of its body")
-    fibres: FibreSettings | None = setting(None, "around its chambers")
+    model_config = ConfigDict(json_schema_extra={"additionalProperties": False})
+
     sequences: SequenceSettings = setting(SequenceSettings(), "random inputs")
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
     noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")

@@ -122,7 +122,7 @@ def _setup(settings: RunSettings) -> dict[str, float]:
     data = settings.data
     assert not isinstance(data, RecordedData)
     assert settings.target is not None
-    constants = {"incorrect": settings.simulation.constants, "correct": settings.target.constants}
+    constants = {"incorrect": settings.simulation.constants, "correct": settings.target.material.constants}
     limits = {} if data.limit is None else dict(data.limit)
     counts = {name: len(getattr(data.amounts, name)) for name in _SPLITS}
     return {

@@ -1,0 +1,202 @@
+"""The simulation that plays the real body: its settings, its own mesh, steps and actuators, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.configured import check, composed, settings
+from warp_resphys import Body, Simulator, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.data.base_motion import rigid
+from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.muscles import Muscle, Muscles
+from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motion
+from warp_resphys.experiment.build import build_body
+from warp_resphys.experiment.files import DATASET, read_dataset
+from warp_resphys.experiment.laboratory import laboratory_simulator
+from warp_resphys.experiment.simulate import simulate
+from warp_resphys.experiment.target import vertices_in
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.settings import parse
+from warp_resphys.io.stages import StageContext
+from warp_resphys.pipeline import acquisition_stages
+from warp_resphys.report.notes import published_note, target_note
+from warp_resphys.settings.run import RunSettings
+from warp_resphys.settings.stages import MotionStage, PlayedSettings
+from warp_resphys.stepping.inputs import Inputs
+
+SIZE = (0.1, 0.03, 0.03)
+OWN = (
+    "target.mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[8,4,4]}",
+    "target.time_step=0.005",
+    "target.integrator=bdf2",
+    "target.material={model:stable_neo_hookean,youngs_modulus:264e3,poissons_ratio:0.45,density:1070.0}",
+    "target.muscles={bundles:{along:{direction:[1,0,0]}},stiffness:80e3,toe:0.02}",
+)
+COARSE = ("mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,2,2]}", "data.steps=3")
+PASSIVE = "laboratory.muscles={bundles:{along:{direction:[0,0,1]}},stiffness:80e3,toe:0.02}"
+
+
+def test_keys_that_are_left_out_are_those_of_the_simulator():
+    run = settings("experiment=beam_oscillation", "integrator=bdf2", "time_step=0.02")
+    target = run.target
+    assert target.material.constants["youngs_modulus"] == 264e3  # directly in the group, as beam_oscillation has them
+    assert (target.mesh, target.integrator, target.time_step) == (run.mesh, "bdf2", 0.02)
+    assert target_note(run) == "E 264 kPa, ν 0.499"  # noqa: RUF001
+    bare = settings("target=null", "target={integrator: midpoint}").target
+    assert (bare.material, bare.integrator) == (run.simulation, "midpoint")
+    fibres = settings("experiment=sopra_fibres", "~laboratory.fibres")
+    assert fibres.laboratory.fibres == fibres.fibres != None  # noqa: E711
+    assert settings("experiment=sopra_fibres", "laboratory.fibres=null").laboratory.fibres is None
+
+
+def test_the_report_tells_how_the_target_differs():
+    run = settings(*OWN, "target.material.stiffness_damping=0.01")
+    words = "another mesh, muscle fibres, time steps of 0.005 s, the integrator bdf2 and other damping"
+    assert target_note(run) == f"E 264 kPa, ν 0.45, stable neo hookean; with {words}"  # noqa: RUF001
+    assert "this run's also has another model of the material, another mesh" in published_note(run)
+    assert "this run's" not in published_note(settings())
+
+
+@pytest.mark.parametrize(
+    ("mesh", "degree"), [(box_hexahedra(SIZE, (3, 1, 2), 27), 2), (box_tetrahedra(SIZE, (3, 1, 2)), 1)]
+)
+def test_fields_of_the_degree_of_the_cells_are_interpolated_exactly(mesh, degree):
+    other = box_hexahedra(SIZE, (5, 3, 3)).vertices
+    powers = [(i, j, k) for i in range(3) for j in range(3) for k in range(3) if i + j + k <= degree]
+    shape = np.random.default_rng(0).normal(size=(len(powers), 3))
+    field = lambda x: sum(np.prod((x / 0.1) ** p, axis=1)[:, None] * c for p, c in zip(powers, shape, strict=True))  # noqa: E731
+    seen = vertices_in(mesh, box_hexahedra(SIZE, (5, 3, 3)))
+    values = torch.as_tensor(np.stack([field(mesh.vertices), 2.0 * field(mesh.vertices)]))
+    np.testing.assert_allclose(seen(values), np.stack([field(other), 2.0 * field(other)]), atol=1e-12)
+
+
+def simulated(folder, *overrides):
+    """The dataset of an experiment with simulated data, and its stage's settings."""
+    run = settings(*overrides)
+    (stage,) = acquisition_stages(run)
+    simulate(StageContext("simulate", Path(folder), "fingerprint", stage.settings))
+    return read_dataset(Path(folder) / DATASET), run
+
+
+def by_hand(weight, steps):
+    """Motion of the target of `OWN` at every one of its steps, (T + 1, N, 3) positions and velocities."""
+    mesh = box_hexahedra(SIZE, (8, 4, 4))
+    muscles = Muscles([Muscle(np.arange(len(mesh.cells)), (1.0, 0.0, 0.0))], 80e3, toe=0.02)
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=(muscles,))
+    material = make_material("stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45, density=1070.0)
+    simulator = Simulator(body, material, time_step=0.005, gravity=(0.0, 0.0, -9.80709), integrator="bdf2")
+    face = select_vertices(mesh, x=0.1)
+    force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
+    force[:, face, 2] = -9.80709 * weight / len(face)
+    with torch.no_grad():
+        moved = simulator.rollout(simulator.static_equilibrium(Inputs(force)), steps)
+    return mesh, moved.q[:, 0].numpy(), moved.v[:, 0].numpy()
+
+
+def test_the_dataset_is_the_motion_of_the_target_at_the_simulators_vertices_and_steps(tmp_path):
+    weights = "data.weights_g={train:[100],validation:[150],test:[200]}"
+    dataset, run = simulated(tmp_path, *COARSE, *OWN, weights)
+    mesh, q, v = by_hand(0.2, 6)
+    vertices = build_body(run).mesh.vertices
+    at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in vertices]  # the meshes are nested
+    np.testing.assert_allclose(dataset.observed[2], q[::2, at], atol=1e-8)
+    np.testing.assert_allclose(dataset.velocity[2], v[::2, at], atol=1e-5)
+    assert np.abs(np.diff(dataset.observed[2], axis=0)).max(axis=(1, 2)).min() > 1e-3
+    assert (dataset.time_step, dataset.times[2, -1]) == (0.01, pytest.approx(0.03))
+
+
+def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
+    swing = "{frequency:5.0,translation:[0,0,0.004],rotation:[0,0.1,0]}"
+    data = ("data.kind=moving_base", "data.steps=4", f"data.base_motion={{swings:{{a:{swing}}}}}")
+    data += ("data.amplitudes={train:[1.0],validation:[1.5],test:[2.0]}",)
+    dataset, run = simulated(tmp_path, COARSE[0], *OWN[:3], "~data.load", "~data.weights_g", *data)
+    body = build_body(run)
+    clamp = body.mesh.vertices[body.fixed_vertices]
+    for row in range(3):
+        moved = rigid(dataset.base[row]).apply(np.broadcast_to(clamp, (5, *clamp.shape)))
+        np.testing.assert_allclose(dataset.observed[row][1:, body.fixed_vertices], moved[1:], atol=1e-12)
+    assert np.abs(dataset.base[2, 1:]).max() > 1e-3
+
+
+def test_the_marker_ablation_follows_its_target(tmp_path):
+    run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
+    generate_motion(StageContext("generate", tmp_path, "fingerprint", MotionStage.of(run, files={})))
+    assert (tmp_path / MOTION).is_file()
+    seen, uncorrected = read_motion(tmp_path)
+    mesh, q, _ = by_hand(0.2, 6)
+    at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in build_body(run).mesh.vertices]
+    np.testing.assert_allclose(seen, q[::2, at], atol=1e-8)
+    np.testing.assert_allclose(uncorrected[0], seen[0], atol=1e-15)
+
+
+def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
+    regions = "laboratory.regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}"
+    run = settings("experiment=beam_real", regions, "laboratory.rigid={tip:{}}", "laboratory.integrator=bdf2", PASSIVE)
+    simulator = laboratory_simulator(PlayedSettings.of(run, files={}), np.array([0.0, 0.0, -9.8]))
+    (muscles,) = (energy for energy in simulator.body.energies if isinstance(energy, Muscles))
+    assert (muscles.stiffness, muscles.toe) == (80e3, 0.02)
+    assert list(simulator.body.rigid) == ["tip"]
+    plain = build_body(run)
+    assert not plain.rigid
+    assert not plain.energies
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["target.time_step=0.004"], "time_step is 0.01 s and target.time_step 0.004 s: the first must be a multiple"),
+        (["target.time_step=0.02"], "target.time_step 0.02 s: the first must be a multiple of the second"),
+        (["laboratory.tme_step=0.005", "experiment=beam_real"], "unknown key 'laboratory.tme_step', did you mean"),
+        (["target.tme_step=0.005"], r"target\.material: .*'tme_step'"),
+        (
+            ["target.fibres={angles:[8.0],stiffness:1e4}"],
+            r"target\.fibres are wound around chambers",
+        ),
+        (["target.muscle={bundles:{}}"], "unknown key 'target.muscle', did you mean 'muscles'"),
+        (
+            ["target.mesh={kind:box_hexahedra,size:[0.08,0.03,0.03],divisions:[8,3,3]}", "data.load={x:0.08}"],
+            r"target\.mesh: the simulator's vertex at \(0\.1, .*\) m lies outside of this mesh: both must be",
+        ),
+        (["target.fixed={x:0.001}"], r"target: no vertex lies within"),
+        (
+            ["target.mesh={kind:box_hexahedra,size:[0.11,0.03,0.03],divisions:[8,3,3]}"],
+            r"data\.load: no vertex lies within 1e-09 m of x = 0\.1 m: the mesh reaches .*",
+        ),
+        (
+            ["target.regions={tip:{x:[0.05,0.1]}}", "target.rigid={tip:{}}", "target.integrator=midpoint"],
+            r"target\.integrator is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2",
+        ),
+        (["target.mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[9000,9000,9000]}"], "target.mesh.divisions"),
+        (
+            ["target.muscles={bundles:{a:{direction:[1,0,0]}},stiffness:0.0}"],
+            r"target\.muscles\.stiffness is 0, but not",
+        ),
+        (
+            ["experiment=beam_real", PASSIVE.replace("stiffness", "commanded:stress,stiffness")],
+            "laboratory: its body takes muscle_stress of 1 muscle, but that of the simulator takes no input",
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused_in_a_sentence(overrides, message):
+    with pytest.raises(InputError, match=message):
+        check(composed(*overrides))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("time_step", -1.0), ("mesh", {"kind": "rod"}), ("muscles", {"bundle": {}})]
+)
+def test_a_wrong_value_of_the_simulator_is_not_blamed_on_its_target(key, value):
+    plain = composed()
+    plain["target"] = plain["target"]["material"]
+    with pytest.raises(InputError, match=f"^(unknown key ')?{key}"):
+        parse(RunSettings, {**plain, key: value})
+
+
+def test_constants_directly_in_the_target_are_named_in_messages():
+    plain = composed()
+    with pytest.raises(InputError, match=r"^target\.youngs_modulus is 'soft': it must be a number"):
+        parse(
+            RunSettings, {**plain, "target": {**plain["target"]["material"], "youngs_modulus": "soft", "regions": {}}}
+        )

@@ -210,7 +210,8 @@ def learning_stages(
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
         # With observed states, a network that replaces the simulator does not depend on it.
-        trained = trained.model_copy(update={"simulation": run.target.material})
+        without = {"simulation": run.target.material, "identified": None, "law": None}
+        trained = trained.model_copy(update=without)
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
     learned.append("train_simfree")

@@ -35,6 +35,10 @@ _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation"
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a refined coefficient is zero
 
+# Steps of differences, as fractions of ranges: motions without noise have narrow valleys.
+_FINE: Final = 1e-5
+_COARSE: Final = 1e-3
+
 Replays = Sequence[tuple[Replay, Start]]
 
 
@@ -69,6 +73,7 @@ class _LawSearch:
         self.settings: IdentifyLawStage = context.settings
         split = self.settings.split
         self.checked = split.validation or split.train
+        self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
         self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
         self.shear = self._guess()["c10"] * 2.0
 
@@ -76,14 +81,13 @@ class _LawSearch:
         """Writes law.json."""
         wanted, split = self.settings.law, self.settings.split
         names = split.train if wanted.trials is None else tuple(evenly(split.train, wanted.trials))
-        states = self.experiment.dataset.bound is None and self.experiment.dataset.velocity is not None
         library = Library(
             terms=tuple(wanted.terms),
             viscous=wanted.viscous,
             times=tuple(np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()),
             families=wanted.families,
         )
-        if states:
+        if self.states:
             classes = self._from_states(library)
             scores = self._scores([law.constants for law in classes], self.checked)
             chosen = self._smallest(scores)
@@ -216,13 +220,14 @@ class _LawSearch:
         wanted = self.settings.law
         guess = dict(law.constants)
         if wanted.viscous:
-            guess["shear_viscosity"] = max(guess.get("shear_viscosity", 0.0), 1e-4 * self.shear)
+            guess.setdefault("shear_viscosity", 0.0)
         simulator = self._simulator(guess)
         bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)}
         others = {name: float(value) for name, value in self._others(simulator).items()}
         if self.settings.identify is not None:
             bounds |= {name: bounds_of(self.settings.identify.parameters[name]) for name in others}
-        identifier = Identifier(self._replays(simulator, names), bounds, wanted.seconds)
+        step = _FINE if self.states else _COARSE
+        identifier = Identifier(self._replays(simulator, names), bounds, wanted.seconds, difference=step)
         with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
 
             def report(_: int, loss: float, values: Mapping[str, float]) -> None:

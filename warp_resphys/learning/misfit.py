@@ -26,7 +26,6 @@ from .replay import Replay, Start
 from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
-_DIFFERENCE = 1e-3  # of a range, for derivatives by differences
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 
 FloatArray = NDArray[np.float64]
@@ -42,6 +41,7 @@ class Misfit:
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         centre: (3,) about which recordings may be rotated [m].
+        difference: step of differences for derivatives, as a fraction of a range.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -59,6 +59,7 @@ class Misfit:
         seconds: float | None = None,
         accuracy: Accuracy | None = None,
         centre: Sequence[float] = (0.0, 0.0, 0.0),
+        difference: float = 1e-3,
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -68,7 +69,7 @@ class Misfit:
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
-        self.prior_weight = 0.0
+        self.prior_weight, self._difference = 0.0, difference
         self._accuracy, self._centre = accuracy, self.simulator.tensor(list(centre))
         self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
         self._replays: list[tuple[Replay, Start]] = []
@@ -155,9 +156,9 @@ class Misfit:
             For every trial, its residuals (T, 3 M), derivatives (3 T M, P) and number of seen coordinates; and the
             derivatives (K, P) of the prior residuals. None where a simulation fails.
         """
-        count, steps = len(unit), np.where(unit < 0.5, _DIFFERENCE, -_DIFFERENCE)
+        count, steps = len(unit), self._difference * np.where(unit < 0.5, 1.0, -1.0)
         if central:
-            unit = np.clip(unit, _DIFFERENCE, 1.0 - _DIFFERENCE)
+            unit = np.clip(unit, self._difference, 1.0 - self._difference)
         sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
         used = sides[: 3 if central else 2] if derivatives else sides[:1]
         points = self.simulator.tensor(np.concatenate(used))

@@ -393,7 +393,7 @@ def filled(values: Any) -> Any:
 
     These are ``network`` and ``trainer`` of ``simfree``, and in ``target`` and ``laboratory`` all keys of
     `TargetSettings`, with ``simulation`` as the material. Numbers and the model of a material may stand directly in
-    ``target``.
+    ``target``; null takes one out.
     """
     if not isinstance(values, Mapping):
         return values
@@ -415,7 +415,7 @@ def filled(values: Any) -> Any:
             material = _mapping(own.get("material", {}))
             if constants and material is not None:
                 own = {key: value for key, value in own.items() if key not in constants}
-                own["material"] = {**constants, **material}
+                own["material"] = {key: value for key, value in {**constants, **material}.items() if value is not None}
             values[group] = {**common, "material": values.get("simulation"), **own}
     return values
 

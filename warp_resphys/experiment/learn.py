@@ -25,7 +25,7 @@ from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
 from ..settings.stages import NetworkStage, RefineStage, TrainStage
 from .build import choose_device
-from .experiment import Experiment
+from .experiment import LAW, Experiment
 from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
 from .reconstruct import reconstructing_simulator
@@ -200,12 +200,16 @@ def _supervised(
 
 
 def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Range | None:
-    """Training range of a network's inputs, to which roll-outs clamp them; None without ``range_guard``."""
+    """Training range of a network's inputs, to which roll-outs clamp them; None without ``range_guard``.
+
+    A force on the law of the material fades out beyond it.
+    """
     assert isinstance(experiment.settings, NetworkStage)
     if not experiment.settings.range_guard:
         return None
     with torch.no_grad():
-        return Range.of(network.encode(train.q, train.v, train.actuation))
+        missed = network.missed(train.q, train.v) if experiment.sources("resphys")[0] == LAW else None
+        return Range.of(network.encode(train.q, train.v, train.actuation), missed)
 
 
 def _in_the_loop(

@@ -181,6 +181,12 @@ class StateMap(nn.Module):
             parts.append(self.actuation.encode(actuation))
         return torch.cat(parts, dim=1).to(self.linear.dtype)
 
+    def missed(self, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        """Root mean square distances (S, 2) of displacements [m] and velocities [m/s] from the modes of the inputs."""
+        pairs = ((self.position, q - self.rest), (self.velocity, v))
+        left = [field - coder.decode(coder.encode(field)) if coder.size else 0.0 * field for coder, field in pairs]
+        return torch.stack([field.square().sum(2).mean(1).sqrt() for field in left], 1)
+
     def encode_outputs(self, *fields: torch.Tensor) -> torch.Tensor:
         """Standardised outputs (S, n_out), in the network's precision, from fields (S, N, 3) in the coders' order."""
         pairs = zip(self.coders, fields, strict=True)

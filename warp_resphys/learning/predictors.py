@@ -9,6 +9,8 @@ from ..dynamics.frames import BaseFrame, VertexFrames
 from ..stepping.state import State
 from .networks import NextState, StateMap
 
+_FADES = (1.25, 2.5)  # ratios of the distance from the modes to that in training, between which a force fades out
+_LEAST = 1e-6  # smallest width of a range in standard deviations
 _MARGIN = 0.25  # of the width of the training range, by which inputs may exceed it on either side
 
 
@@ -17,20 +19,34 @@ class Range:
     """Bounding box of a model's standardised inputs in training, widened by a quarter of its width on every side.
 
     A network extrapolates badly, and a wrong force may drive the body ever further away. So the inputs of the model are
-    clamped to this box, and a roll-out that leaves it is reported.
+    clamped to this box, and a roll-out that leaves it is reported. Where the simulator alone is good beyond the training
+    range, as with the law of its material, the force fades out there: over another quarter of the width beyond the box,
+    and between one and a quarter and two and a half times the largest distance of the state from the network's modes.
 
     Attributes:
         low: (A,) minimum of the standardised inputs in training.
         high: (A,) maximum.
+        missed: (2,) largest root mean square distance of displacements [m] and velocities [m/s] in training from the
+            modes of the inputs; None: the force does not fade out.
     """
 
     low: torch.Tensor
     high: torch.Tensor
+    missed: torch.Tensor | None = None
 
     @classmethod
-    def of(cls, inputs: torch.Tensor) -> "Range":
-        """Returns the range of (S, A) standardised inputs."""
-        return cls(inputs.amin(0), inputs.amax(0))
+    def of(cls, inputs: torch.Tensor, missed: torch.Tensor | None = None) -> "Range":
+        """Returns the range of (S, A) standardised inputs and, for a force that fades out, (S, 2) `StateMap.missed`."""
+        return cls(inputs.amin(0), inputs.amax(0), None if missed is None else missed.amax(0))
+
+    def weight(self, inputs: torch.Tensor, missed: torch.Tensor) -> torch.Tensor:
+        """Returns the factor (B,) of a force that fades out, from unclamped inputs (B, A) and `StateMap.missed`."""
+        assert self.missed is not None
+        low, high = self.edges
+        beyond = torch.maximum(low - inputs, inputs - high) / (_MARGIN * (self.high - self.low)).clamp_min(_LEAST)
+        ratio = missed / self.missed.clamp_min(1e-12)
+        left = torch.cat([beyond, (ratio - _FADES[0]) / (_FADES[1] - _FADES[0])], 1).amax(1).clamp(0.0, 1.0)
+        return 1.0 - left.square() * (3.0 - 2.0 * left)
 
     def clamp(self, inputs: torch.Tensor) -> torch.Tensor:
         """Returns standardised inputs (B, A), clamped to the widened box."""
@@ -49,12 +65,13 @@ class Range:
 
     def description(self) -> dict[str, list[float]]:
         """Returns plain data for a checkpoint's metadata."""
-        return {"low": self.low.tolist(), "high": self.high.tolist()}
+        missed = {} if self.missed is None else {"missed": self.missed.tolist()}
+        return {"low": self.low.tolist(), "high": self.high.tolist(), **missed}
 
     @classmethod
     def restore(cls, description: Mapping[str, Sequence[float]], like: torch.Tensor) -> "Range":
         """Returns the range of a `description`, on the device and in the precision of a tensor."""
-        return cls(like.new_tensor(description["low"]), like.new_tensor(description["high"]))
+        return cls(**{name: like.new_tensor(values) for name, values in description.items()})
 
 
 class LearnedPredictor:
@@ -90,7 +107,7 @@ class LearnedPredictor:
         q, v, like = state.q, state.v, self.model.rest
         if self._base is not None:
             q, v = self._base.enter(q, v, step)
-        context = self._context
+        context, weight = self._context, None
         if context is not None:
             context = (context if context.ndim == 2 else context[min(step, len(context) - 1)]).to(like)
         inputs = self.model.encode(q.to(like), v.to(like), context)
@@ -99,10 +116,14 @@ class LearnedPredictor:
             if self.left_at is None:
                 self.left_at = torch.full((len(q),), -1, dtype=torch.int64, device=q.device)
             self.left_at = torch.where(outside & (self.left_at < 0), step, self.left_at)
+            if self._range.missed is not None:
+                weight = self._range.weight(inputs, self.model.missed(q.to(like), v.to(like)).to(inputs)).to(q)
             inputs = self._range.clamp(inputs)
         outputs, self.hidden = self.model.decode(inputs, self.hidden)
         fields = [field.to(q) for field in outputs]
         if isinstance(self.model, NextState):
             return State(*(fields if self._base is None else self._base.leave(fields[0], fields[1], step + 1)))
+        if weight is not None:
+            fields[0] = fields[0] * weight[:, None, None]
         force = fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])
         return force if self._base is None else self._base.force_outside(force, step)

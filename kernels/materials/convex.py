@@ -14,9 +14,9 @@ a toe (`kernels.laws.muscle`); its strain is less by the slack, as fibres are wa
 shape rule, U at those of the volume rule.
 
 All terms and their derivatives vanish at rest, and stay finite where elements invert. a, S_n for n > 0, and l_f are
-convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so that their powers are convex too, and
-every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational Mechanics and Analysis 63,
-1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1) + sum_n mu_n, and
+convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so that their powers are convex too,
+and every combination with non-negative coefficients is polyconvex (Ball, Archive for Rational Mechanics and Analysis
+63, 1976). The exception is the compression of fibres, <-q_f>^2. At small strains mu is 2 (c_1 + d_1) + sum_n mu_n, and
 lambda, without fibres, 2 (e + g_2), and 2 (1 + 2 / n) mu_n more for each negative n.
 
 The moduli named unit_shear and unit_bulk, of value one, carry the volumes of viscosity alone: its coefficients are

@@ -169,7 +169,7 @@ class _LawSearch:
         return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
 
     def _from_markers(self, library: Library, names: Sequence[str]) -> list["_Refined"]:
-        """Returns classes refined through the simulator, each from the smaller one, with more terms at first guesses."""
+        """Returns classes refined through the simulator, each from the one before with further terms."""
         groups = {
             "elastic": dict.fromkeys(library.terms, 0.02 * self.shear),
             "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),

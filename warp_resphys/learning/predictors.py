@@ -19,9 +19,11 @@ class Range:
     """Bounding box of a model's standardised inputs in training, widened by a quarter of its width on every side.
 
     A network extrapolates badly, and a wrong force may drive the body ever further away. So the inputs of the model are
-    clamped to this box, and a roll-out that leaves it is reported. Where the simulator alone is good beyond the training
-    range, as with the law of its material, the force fades out there: over another quarter of the width beyond the box,
-    and between one and a quarter and two and a half times the largest distance of the state from the network's modes.
+    clamped to this box, and a roll-out that leaves it is reported.
+
+    Where the simulator alone is good beyond the training range, as with the law of its material, the force fades out
+    there: over another quarter of the width beyond the box, and between one and a quarter and two and a half times the
+    largest distance of a state from the network's modes in training.
 
     Attributes:
         low: (A,) minimum of the standardised inputs in training.

@@ -1,0 +1,154 @@
+"""The balance of forces of simulated motions gives the coefficients that made them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.weak_form import ObservedMotion, WeakForm, fit, residual_of
+
+MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
+BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIME, AZIMUTH = 0.04, 0.6
+UNIT = {
+    "c10": 1e5,
+    "c20": 1e5,
+    "bulk_1": 1e6,
+    "ogden_4": 1e5,
+    "shear_viscosity": 1e2,
+    "prony_modulus_1": 1e5,
+    "fibre_tension_1": 1e5,
+}
+TRUE = np.array([0.3, 0.25, 2.0, 0.2, 0.4, 0.15, 0.5])  # in these units
+SHAPE = {"prony_time_1": TIME, "fibre_azimuth_1": AZIMUTH, "fibre_toe_1": 0.02}
+CANDIDATES = [{name: unit} for name, unit in UNIT.items()]
+STIFF = {"c10": 3e4, "bulk_1": 3e6}
+
+
+def simulator(values, integrator):
+    """A beam whose forces are linear in `values`, in the order of `UNIT`."""
+    c10, c20, bulk, ogden, viscosity, prony, tension = values * np.array([*UNIT.values()])
+    material = ConvexMaterial(
+        c10,
+        c20,
+        bulk_1=bulk,
+        shear_viscosity=viscosity,
+        ogden={4: ogden},
+        prony=[(prony, TIME)],
+        fibres=[FibreFamily(azimuth=AZIMUTH, tension=tension)],
+    )
+    return Simulator(BODY, material, time_step=0.005, solver=TIGHT, integrator=integrator)
+
+
+def observed(sim, pulls):
+    """Motions of beams that are released from pulls (B, 3) at the tip [N]."""
+    force = torch.zeros(len(pulls), len(MESH.vertices), 3, dtype=torch.float64)
+    force[:, select_vertices(MESH, x=0.08)] = torch.tensor(pulls, dtype=torch.float64)[:, None] / 4.0
+    with torch.no_grad():
+        held = sim.static_equilibrium(Inputs(external_force=force))
+        return ObservedMotion(sim.rollout(held, 12).q, held.v)
+
+
+@pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "midpoint"])
+def balance(request):
+    """Rows of a motion whose coefficients are known, and the simulator that has none of them."""
+    motion = observed(simulator(TRUE, request.param), [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)])
+    unknown = simulator(np.zeros(len(UNIT)), request.param)
+    return WeakForm(unknown, [motion], SHAPE, STIFF, stride=2)
+
+
+def test_known_coefficients_are_recovered(balance):
+    columns = balance.columns(CANDIDATES)
+    assert columns.shape == (6 * 2 * 16 * 3, len(UNIT))  # steps, motions, free vertices, coordinates
+    found = fit(columns, balance.target)
+    np.testing.assert_allclose(found.coefficients, TRUE, rtol=1e-4)
+    assert found.residual < 1e-7
+    assert residual_of(columns @ (1.1 * TRUE), balance.target) == pytest.approx(0.1, rel=1e-3)
+
+
+def test_terms_that_the_law_does_not_have_get_no_coefficient(balance):
+    without = fit(balance.columns([*CANDIDATES[:3], *CANDIDATES[4:]]), balance.target)
+    others = {"c01": 1e5, "c02": 1e5, "dilation": 1e5, "fibre_stiffening_1": 1e5}
+    found = fit(balance.columns([*CANDIDATES, *({name: unit} for name, unit in others.items())]), balance.target)
+    np.testing.assert_allclose(found.coefficients[len(UNIT) :], 0.0, atol=1e-3)
+    np.testing.assert_allclose(found.coefficients[: len(UNIT)], TRUE, rtol=0.02)
+    assert without.residual > 1e4 * found.residual
+
+
+def test_forces_are_linear_in_coefficients_and_add_up(balance):
+    columns = balance.columns(CANDIDATES)
+    twice = balance.columns([{name: 2.0 * unit} for name, unit in UNIT.items()])
+    together = balance.columns([UNIT])
+    np.testing.assert_allclose(twice, 2.0 * columns, atol=1e-9 * np.abs(columns).max())
+    np.testing.assert_allclose(together[:, 0], columns.sum(1), atol=1e-9 * np.abs(columns).max())
+
+
+def test_a_branch_remembers_the_steps_between_two_rows():
+    """Rows of a larger stride are among those of every step."""
+    sim = simulator(TRUE, "implicit_euler")
+    motion = observed(sim, [(0.3, 0.0, -0.2)])
+    unknown = simulator(np.zeros(len(UNIT)), "implicit_euler")
+    fine, coarse = (WeakForm(unknown, [motion], SHAPE, STIFF, stride).columns(CANDIDATES) for stride in (1, 4))
+    rows = fine.reshape(12, -1, len(UNIT))[::4].reshape(-1, len(UNIT))
+    np.testing.assert_allclose(coarse, rows, rtol=0.0, atol=1e-12 * np.abs(rows).max())
+    assert np.abs(fine[:, 5]).max() > 0.0
+
+
+def test_motions_and_candidates_are_computed_alike_in_any_batch(monkeypatch):
+    sim = simulator(TRUE, "bdf2")
+    pulls = [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)]
+    motions = [observed(sim, [pull]) for pull in pulls]
+    unknown = simulator(np.zeros(len(UNIT)), "bdf2")
+    apart = WeakForm(unknown, motions, SHAPE, STIFF)
+    monkeypatch.setattr("warp_resphys.learning.weak_form._AT_ONCE", 4)
+    together = WeakForm(unknown, [observed(sim, pulls)], SHAPE, STIFF)
+    steps = together.columns(CANDIDATES).reshape(3, 2, -1, len(UNIT))
+    rows = apart.columns(CANDIDATES).reshape(2, 3, -1, len(UNIT)).swapaxes(0, 1)
+    np.testing.assert_allclose(steps, rows, atol=1e-8 * np.abs(rows).max())
+
+
+def test_loads_during_the_motion_are_part_of_the_balance():
+    sim = simulator(TRUE, "implicit_euler")
+    force = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64)
+    force[:, select_vertices(MESH, x=0.08), 1] = 0.05
+    inputs = Inputs(external_force=force)
+    with torch.no_grad():
+        q = sim.rollout(sim.rest_state(), 12, inputs).q
+    motion = ObservedMotion(q, torch.zeros_like(q[0]), inputs)
+    unknown = simulator(np.zeros(len(UNIT)), "implicit_euler")
+    form = WeakForm(unknown, [motion], SHAPE, STIFF)
+    assert residual_of(form.columns(CANDIDATES) @ TRUE, form.target) < 1e-7
+    unloaded = WeakForm(unknown, [replace(motion, inputs=Inputs())], SHAPE, STIFF)
+    assert residual_of(unloaded.columns(CANDIDATES) @ TRUE, unloaded.target) > 0.1
+
+
+def test_a_fit_has_no_negative_coefficient():
+    random = np.random.default_rng(0)
+    columns = random.normal(size=(200, 4)) * [1.0, 1e-3, 1e4, 0.0]
+    true = np.array([2.0, -3e3, 5e-5, 0.0])
+    found = fit(columns, columns @ true)
+    assert found.coefficients.min() == 0.0
+    assert found.coefficients[1] == found.coefficients[3] == 0.0
+    least = np.linalg.lstsq(columns[:, [0, 2]], columns @ true, rcond=None)[0]
+    np.testing.assert_allclose(found.coefficients[[0, 2]], least, rtol=1e-6)
+    assert found.residual == pytest.approx(residual_of(columns @ found.coefficients, columns @ true))
+
+
+def test_equal_columns_share_their_coefficient():
+    column = np.random.default_rng(1).normal(size=(50, 1))
+    found = fit(np.concatenate([column, column], 1), 3.0 * column[:, 0])
+    assert found.coefficients.sum() == pytest.approx(3.0, rel=1e-6)
+    assert found.residual < 1e-6
+
+
+@pytest.mark.parametrize(("motions", "stride"), [(0, 5), (1, 0)])
+def test_nothing_to_balance_is_refused(motions, stride):
+    sim = simulator(TRUE, "implicit_euler")
+    still = ObservedMotion(sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None])
+    with pytest.raises(InputError, match="no step to balance"):
+        WeakForm(sim, [still] * motions, SHAPE, STIFF, stride)

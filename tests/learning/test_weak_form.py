@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
-from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
+from support.known_law import STIFF, beam, pulled, released
+from warp_resphys import Inputs
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.weak_form import ObservedMotion, WeakForm, fit, residual_of
 
-MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
-BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
-TIME, AZIMUTH = 0.04, 0.6
 UNIT = {
     "c10": 1e5,
     "c20": 1e5,
@@ -25,41 +21,27 @@ UNIT = {
     "fibre_tension_1": 1e5,
 }
 TRUE = np.array([0.3, 0.25, 2.0, 0.2, 0.4, 0.15, 0.5])  # in these units
-SHAPE = {"prony_time_1": TIME, "fibre_azimuth_1": AZIMUTH, "fibre_toe_1": 0.02}
+SHAPE = {"prony_time_1": 0.04, "fibre_azimuth_1": 0.6, "fibre_toe_1": 0.02}
+REST = {f"fibre_{name}_1": 0.0 for name in ("elevation", "slack", "stiffening", "compression")}
 CANDIDATES = [{name: unit} for name, unit in UNIT.items()]
-STIFF = {"c10": 3e4, "bulk_1": 3e6}
+PULLS = [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)]  # N
 
 
-def simulator(values, integrator):
+def simulator(values, integrator="implicit_euler"):
     """A beam whose forces are linear in `values`, in the order of `UNIT`."""
-    c10, c20, bulk, ogden, viscosity, prony, tension = values * np.array([*UNIT.values()])
-    material = ConvexMaterial(
-        c10,
-        c20,
-        bulk_1=bulk,
-        shear_viscosity=viscosity,
-        ogden={4: ogden},
-        prony=[(prony, TIME)],
-        fibres=[FibreFamily(azimuth=AZIMUTH, tension=tension)],
-    )
-    return Simulator(BODY, material, time_step=0.005, solver=TIGHT, integrator=integrator)
+    constants = dict(zip(UNIT, values * np.array([*UNIT.values()]), strict=True))
+    return beam({**constants, **SHAPE, **REST}, integrator)
 
 
-def observed(sim, pulls):
-    """Motions of beams that are released from pulls (B, 3) at the tip [N]."""
-    force = torch.zeros(len(pulls), len(MESH.vertices), 3, dtype=torch.float64)
-    force[:, select_vertices(MESH, x=0.08)] = torch.tensor(pulls, dtype=torch.float64)[:, None] / 4.0
-    with torch.no_grad():
-        held = sim.static_equilibrium(Inputs(external_force=force))
-        return ObservedMotion(sim.rollout(held, 12).q, held.v)
+def unknown(integrator="implicit_euler"):
+    return simulator(np.zeros(len(UNIT)), integrator)
 
 
 @pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "midpoint"])
 def balance(request):
     """Rows of a motion whose coefficients are known, and the simulator that has none of them."""
-    motion = observed(simulator(TRUE, request.param), [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)])
-    unknown = simulator(np.zeros(len(UNIT)), request.param)
-    return WeakForm(unknown, [motion], SHAPE, STIFF, stride=2)
+    motion = released(simulator(TRUE, request.param), PULLS)
+    return WeakForm(unknown(request.param), [motion], SHAPE, STIFF, stride=2)
 
 
 def test_known_coefficients_are_recovered(balance):
@@ -90,10 +72,9 @@ def test_forces_are_linear_in_coefficients_and_add_up(balance):
 
 def test_a_branch_remembers_the_steps_between_two_rows():
     """Rows of a larger stride are among those of every step."""
-    sim = simulator(TRUE, "implicit_euler")
-    motion = observed(sim, [(0.3, 0.0, -0.2)])
-    unknown = simulator(np.zeros(len(UNIT)), "implicit_euler")
-    fine, coarse = (WeakForm(unknown, [motion], SHAPE, STIFF, stride).columns(CANDIDATES) for stride in (1, 4))
+    sim = simulator(TRUE)
+    motion = released(sim, PULLS[:1])
+    fine, coarse = (WeakForm(unknown(), [motion], SHAPE, STIFF, stride).columns(CANDIDATES) for stride in (1, 4))
     rows = fine.reshape(12, -1, len(UNIT))[::4].reshape(-1, len(UNIT))
     np.testing.assert_allclose(coarse, rows, rtol=0.0, atol=1e-12 * np.abs(rows).max())
     assert np.abs(fine[:, 5]).max() > 0.0
@@ -101,29 +82,24 @@ def test_a_branch_remembers_the_steps_between_two_rows():
 
 def test_motions_and_candidates_are_computed_alike_in_any_batch(monkeypatch):
     sim = simulator(TRUE, "bdf2")
-    pulls = [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)]
-    motions = [observed(sim, [pull]) for pull in pulls]
-    unknown = simulator(np.zeros(len(UNIT)), "bdf2")
-    apart = WeakForm(unknown, motions, SHAPE, STIFF)
+    motions = [released(sim, [pull]) for pull in PULLS]
+    apart = WeakForm(unknown("bdf2"), motions, SHAPE, STIFF)
     monkeypatch.setattr("warp_resphys.learning.weak_form._AT_ONCE", 4)
-    together = WeakForm(unknown, [observed(sim, pulls)], SHAPE, STIFF)
+    together = WeakForm(unknown("bdf2"), [released(sim, PULLS)], SHAPE, STIFF)
     steps = together.columns(CANDIDATES).reshape(3, 2, -1, len(UNIT))
     rows = apart.columns(CANDIDATES).reshape(2, 3, -1, len(UNIT)).swapaxes(0, 1)
     np.testing.assert_allclose(steps, rows, atol=1e-8 * np.abs(rows).max())
 
 
 def test_loads_during_the_motion_are_part_of_the_balance():
-    sim = simulator(TRUE, "implicit_euler")
-    force = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64)
-    force[:, select_vertices(MESH, x=0.08), 1] = 0.05
-    inputs = Inputs(external_force=force)
+    sim = simulator(TRUE)
+    inputs = Inputs(external_force=pulled([(0.0, 0.2, 0.0)]))
     with torch.no_grad():
         q = sim.rollout(sim.rest_state(), 12, inputs).q
     motion = ObservedMotion(q, torch.zeros_like(q[0]), inputs)
-    unknown = simulator(np.zeros(len(UNIT)), "implicit_euler")
-    form = WeakForm(unknown, [motion], SHAPE, STIFF)
+    form = WeakForm(unknown(), [motion], SHAPE, STIFF)
     assert residual_of(form.columns(CANDIDATES) @ TRUE, form.target) < 1e-7
-    unloaded = WeakForm(unknown, [replace(motion, inputs=Inputs())], SHAPE, STIFF)
+    unloaded = WeakForm(unknown(), [replace(motion, inputs=Inputs())], SHAPE, STIFF)
     assert residual_of(unloaded.columns(CANDIDATES) @ TRUE, unloaded.target) > 0.1
 
 
@@ -148,7 +124,7 @@ def test_equal_columns_share_their_coefficient():
 
 @pytest.mark.parametrize(("motions", "stride"), [(0, 5), (1, 0)])
 def test_nothing_to_balance_is_refused(motions, stride):
-    sim = simulator(TRUE, "implicit_euler")
+    sim = simulator(TRUE)
     still = ObservedMotion(sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None])
     with pytest.raises(InputError, match="no step to balance"):
         WeakForm(sim, [still] * motions, SHAPE, STIFF, stride)

@@ -1,0 +1,107 @@
+"""The classes of laws that the weak form gives: the smallest one that made the motions is among them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from support.known_law import STIFF, beam, released
+from warp_resphys.learning.law import Library, _constants, fit_classes
+from warp_resphys.learning.weak_form import WeakForm
+
+LIBRARY = Library(terms=("c20", "c01", "ogden_4"), times=tuple(np.geomspace(0.01, 0.2, 8).tolist()), families=0)
+PULLS = [(0.4, 0.0, -0.15), (-0.2, 0.15, 0.05), (0.1, -0.1, 0.15)]  # N
+HELD_OUT = [(0.25, 0.12, 0.12)]
+NEO_HOOKEAN = {"c10": 30e3, "bulk_1": 2e6}
+SHAPE = {"prony_time_1": 0.05, "fibre_toe_1": 0.02}
+FIBRE = {f"fibre_{name}_1": 0.0 for name in ("azimuth", "elevation", "slack", "tension", "stiffening", "compression")}
+
+
+def classes(truth, library=LIBRARY, steps=12):
+    """Classes that fit motions of a law, by their groups."""
+    zero = dict.fromkeys((*library.terms, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1"), 0.0)
+    unknown = beam({**zero, **FIBRE, **SHAPE})
+    true = beam(truth)
+    forms = [WeakForm(unknown, [released(true, pulls, steps)], SHAPE, STIFF, 3) for pulls in (PULLS, HELD_OUT)]
+    laws = fit_classes(*forms, library)
+    sizes = [len(law.groups) for law in laws]
+    assert sizes == sorted(sizes)
+    assert laws[0].groups == ()
+    assert laws[0].constants.keys() == {"c10", "bulk_1"}
+    return {law.groups: law for law in laws}
+
+
+def test_a_neo_hookean_beam_needs_no_further_terms():
+    laws = classes(NEO_HOOKEAN)
+    assert laws[()].residual < 1e-7
+    assert laws[()].constants == pytest.approx(NEO_HOOKEAN, rel=1e-4)
+    for law in laws.values():  # Residuals of rounding may keep a term, but it is of rounding, too.
+        assert {n: law.constants[n] for n in NEO_HOOKEAN} == pytest.approx(NEO_HOOKEAN, rel=1e-3)
+
+
+def test_terms_that_the_beam_has_are_found_and_no_others():
+    truth = {**NEO_HOOKEAN, "ogden_4": 20e3, "shear_viscosity": 30.0}
+    laws = classes(truth)
+    found = laws["elastic", "viscosity"]
+    assert found.constants == pytest.approx(truth, rel=1e-3)
+    assert found.residual < 1e-6
+    assert laws["viscosity",].constants["shear_viscosity"] == pytest.approx(30.0, rel=0.02)
+    smaller = [law for groups, law in laws.items() if not {"elastic", "viscosity"} <= {*groups}]
+    assert min(law.residual for law in smaller) > 100.0 * found.residual
+    assert laws["viscosity",].residual < 0.1 * laws[()].residual
+
+
+def test_a_branch_between_two_times_of_the_grid_is_one_branch():
+    times = LIBRARY.times
+    truth = {**NEO_HOOKEAN, "prony_modulus_1": 15e3, "prony_time_1": math.sqrt(times[3] * times[4])}
+    laws = classes(truth)
+    found = laws["branches",]
+    assert {name for name in found.constants if name.startswith("prony")} == {"prony_modulus_1", "prony_time_1"}
+    assert found.constants["prony_time_1"] == pytest.approx(truth["prony_time_1"], rel=0.05)
+    assert found.constants["prony_modulus_1"] == pytest.approx(15e3, rel=0.05)
+    assert found.residual < 0.01 * laws[()].residual
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0), (0.5, -0.35)])
+def test_the_direction_of_a_family_of_fibres_is_found(direction):
+    azimuth, elevation = direction
+    fibre = {"fibre_azimuth_1": azimuth, "fibre_elevation_1": elevation, "fibre_tension_1": 60e3}
+    truth = {**NEO_HOOKEAN, **FIBRE, "fibre_toe_1": 0.02, **fibre}
+    laws = classes(truth, Library(terms=("c20",), viscous=False, times=(), families=1))
+    found = laws["fibres",]
+    axes = [axis(law["fibre_azimuth_1"], law["fibre_elevation_1"]) for law in (truth, found.constants)]
+    assert abs(float(axes[0] @ axes[1])) > math.cos(math.radians(15.0))
+    assert found.constants["fibre_tension_1"] == pytest.approx(60e3, rel=0.3)
+    assert found.constants["c10"] == pytest.approx(30e3, rel=0.1)
+    assert found.residual < 0.5 * laws[()].residual
+    if not any(direction):
+        assert found.residual < 1e-6
+
+
+def axis(azimuth, elevation):
+    level = math.cos(elevation)
+    return np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
+
+
+def branch(time):
+    return {"prony_modulus_1": 1e5, "prony_time_1": time}
+
+
+def test_neighbouring_relaxation_times_become_one_branch():
+    candidates = [{"c10": 1e5}, {"bulk_1": 1e5}, *map(branch, (0.01, 0.015, 0.1, 0.4)), {"shear_viscosity": 1e2}]
+    found = _constants(candidates, np.array([0.4, 20.0, 0.1, 0.3, 0.2, 1e-5, 0.5]))
+    assert {name: found[name] for name in ("c10", "bulk_1", "shear_viscosity")} == pytest.approx(
+        {"c10": 4e4, "bulk_1": 2e6, "shear_viscosity": 50.0}
+    )
+    together = 0.01 ** (1 / 4) * 0.015 ** (3 / 4)  # the mean of the logarithms, weighted by the moduli
+    branches = {"prony_modulus_1": 4e4, "prony_time_1": together, "prony_modulus_2": 2e4, "prony_time_2": 0.1}
+    assert {name: value for name, value in found.items() if name.startswith("prony")} == pytest.approx(branches)
+
+
+def test_families_that_hardly_pull_are_left_out():
+    families = [{"fibre_tension_1": 1e5, "fibre_azimuth_1": a, "fibre_elevation_1": 0.1} for a in (0.2, 0.4)]
+    found = _constants([{"c10": 1e5}, *families], np.array([0.4, 1e-5, 0.3]))
+    assert found["fibre_azimuth_1"] == 0.4
+    assert found["fibre_tension_1"] == pytest.approx(3e4)
+    assert found["fibre_toe_1"] > 0.0
+    assert not any(name.endswith("_2") for name in found)

@@ -17,7 +17,7 @@ from ..data.markers import MarkerMap
 from ..data.registration import axes_rotation
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
-from ..energies.materials import Material
+from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError, listed
@@ -25,7 +25,7 @@ from ..io.memory import available_memory_gib
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
-from ..settings.learning import IdentifySettings
+from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
@@ -69,6 +69,8 @@ def check_run(run: RunSettings) -> None:
         _check_memory(run.model_copy(update={"mesh": finer(run.mesh, run.mesh_check)}))
     if run.control is not None:
         _check_control(run, body)
+    if run.law is not None:
+        _check_law(run, run.law)
     if run.identify is not None:
         names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
@@ -76,6 +78,13 @@ def check_run(run: RunSettings) -> None:
         _check_identification(run.identify, names, simulator)
         _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
+
+
+def _check_law(run: RunSettings, law: LawSettings) -> None:
+    if run.simulation.regions:
+        raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
+    with _naming("law.terms: "):
+        ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
 
 
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
@@ -100,8 +109,10 @@ def _check_target(run: RunSettings, body: Body) -> None:
         with _naming(f"{key}.mesh: "):
             vertices_in(simulator.body.mesh, body.mesh)
         if isinstance(run.data, ReleaseFromLoad):
-            with _naming("data.load: "):
-                select_vertices(simulator.body.mesh, **run.data.load.arguments())
+            places = {f"data.others.{name}.at": held.at for name, held in run.data.others.items() if held.at}
+            for place, at in {"data.load": run.data.load, **places}.items():
+                with _naming(f"{place}: "):
+                    select_vertices(simulator.body.mesh, **at.arguments())
 
 
 def _check_drive(drive: Drive | None, real: Drive | None) -> None:

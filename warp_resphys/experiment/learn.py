@@ -189,7 +189,7 @@ def _supervised(
 ) -> Prepared:
     """Prepares training on single steps, with validation by roll-outs."""
     network = _new_network(experiment, model, train, settings)
-    learned = Learned(network, _range_of(experiment, network, train), experiment.settings.force_frame)
+    learned = Learned(network, _range_of(experiment, model, network, train), experiment.settings.force_frame)
     error = rollout_error(dataclasses.replace(experiment, on_failure="count"), model, judged)
     kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 
@@ -199,7 +199,7 @@ def _supervised(
     return Prepared(kind(network, train, validation, judge, settings.trainer, settings.seed), learned)
 
 
-def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Range | None:
+def _range_of(experiment: Experiment, model: str, network: StateMap, train: Samples) -> Range | None:
     """Training range of a network's inputs, to which roll-outs clamp them; None without ``range_guard``.
 
     A force on the law of the material fades out beyond it.
@@ -208,7 +208,7 @@ def _range_of(experiment: Experiment, network: StateMap, train: Samples) -> Rang
     if not experiment.settings.range_guard:
         return None
     with torch.no_grad():
-        missed = network.missed(train.q, train.v) if experiment.sources("resphys")[0] == LAW else None
+        missed = network.missed(train.q, train.v) if experiment.sources(model)[0] == LAW else None
         return Range.of(network.encode(train.q, train.v, train.actuation), missed)
 
 
@@ -251,8 +251,8 @@ def _in_the_loop(
     judged = loss(validation) if validation else None
     trainer = MarkersInTheLoop(make_network(), loss(train), judged, loop, epochs)
     trainer.begin()
-    learned = Learned(trainer.model, _range_of(experiment, trainer.model, samples), experiment.settings.force_frame)
-    return Prepared(trainer, learned)
+    range_ = _range_of(experiment, model, trainer.model, samples)
+    return Prepared(trainer, Learned(trainer.model, range_, experiment.settings.force_frame))
 
 
 def train(context: StageContext) -> None:

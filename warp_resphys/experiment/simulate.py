@@ -151,7 +151,7 @@ def _held_alone(simulator: Simulator, data: SimulatedData, held: HeldSettings) -
         return State(q, torch.zeros_like(q))
     along = np.asarray(held.direction, dtype=np.float64) / np.linalg.norm(held.direction)
     force = 1e-3 * held.weight_g * float(np.linalg.norm(simulator.gravity)) * along
-    return _under_forces(simulator, held.at or data.load, force[None])
+    return _under_forces(simulator, held.at or data.load, force[None], "data.others" if held.at else "data.load")
 
 
 def _common_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:
@@ -174,11 +174,11 @@ def held_state(simulator: Simulator, load: PlaceSettings, weights: NDArray[Any])
     return _under_forces(simulator, load, weights[:, None] * np.asarray(simulator.gravity))
 
 
-def _under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray) -> State:
+def _under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> State:
     """Equilibrium of the body under forces (B, 3) [N] on the vertices of a place, in equal shares."""
     face = select_vertices(simulator.body.mesh, **load.arguments())
     if np.isin(face, simulator.body.fixed_vertices).all():
-        raise InputError("data.load selects fixed vertices only: hang the weights on vertices that can move.")
+        raise InputError(f"{key} selects fixed vertices only: hang the weights on vertices that can move.")
     return simulator.static_equilibrium(Inputs(distributed(simulator, face, simulator.tensor(forces))))
 
 

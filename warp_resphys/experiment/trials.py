@@ -146,6 +146,8 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
         raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: a trial belongs to one split only.")
     named = {name: [kind.name(x) for x in row] for name, row in values.items()}
     if isinstance(data, ReleaseFromLoad):
+        if double := [name for name in data.others if any(name in row for row in named.values())]:
+            raise InputError(f"data.others names '{double[0]}', which is a trial of data.{kind.key}: rename it.")
         named["test"] += data.others
     return named
 

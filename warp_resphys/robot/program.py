@@ -37,10 +37,15 @@ class _Program(nn.Module):
     ) -> tuple[torch.Tensor, ...]:
         """Returns force, or next state, and next hidden state, with the arguments of `export_network`'s program."""
         inputs = self.network.encode(q, v, conditions)
+        weight = None
         if self._range is not None:
+            if self._range.missed is not None:
+                weight = self._range.weight(inputs, self.network.missed(q, v).to(inputs)).to(q)
             inputs = self._range.clamp(inputs)
         fields, later = self.network.decode(inputs, hidden)
         outputs = [field.to(q.dtype) for field in fields]
+        if weight is not None:
+            outputs[0] = outputs[0] * weight[:, None, None]
         if self._frames is not None:
             outputs = [self._frames.to_world(q, v, outputs[0])]
         return (*outputs, *(() if later is None else (later,)))
@@ -52,7 +57,8 @@ def export_network(robot: Robot, path: str | Path) -> Path:
     Its arguments are q (B, N, 3) [m] and v (B, N, 3) [m/s]; the conditions (B, A) that `condition_names` lists, if the
     network takes any; and the hidden state (B, H), zero at the start, if it is recurrent. It returns the residual force
     (B, N, 3) [N] in the world frame (the data-driven model: the next q and v), and the next hidden state. Inputs are
-    clipped to the training range, as in `Robot.step`. A moving base is not included: give states in the base's frame.
+    clipped to the training range, beyond which a force on an identified law fades out, as in `Robot.step`. A moving
+    base is not included: give states in the base's frame.
 
     Args:
         robot: with a learned force.

@@ -4,9 +4,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Word, setting
+from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Share, Some, Word, setting
 from .body import Integrator
-from .trials import different
+from .trials import different, rising
 
 Size = Annotated[int, Field(ge=1, le=16_384)]
 
@@ -128,7 +128,9 @@ class LawSettings(Settings):
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried; 0: none")
-    relaxation_times: tuple[Positive, Positive] = setting((0.01, 1.0), "shortest and longest", "s")
+    relaxation_times: Annotated[Pair[Positive], AfterValidator(rising)] = setting(
+        (0.01, 1.0), "shortest and longest", "s"
+    )
     families: Count = setting(1, "largest number of families of fibres")
     stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")

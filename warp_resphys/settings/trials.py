@@ -21,7 +21,8 @@ def different(values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
-def _rising(values: tuple[float, ...]) -> tuple[float, ...]:
+def rising(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuses a list whose values do not rise."""
     if list(values) != sorted({*values}):
         raise ValueError("they must rise.")
     return values
@@ -181,6 +182,15 @@ class HeldSettings(Settings):
     twist_deg: float = setting(0.0, "angle of the high end of a body that is held in a twist instead", "degrees")
     twist_axis: Axis = setting("x", "along which the angle grows linearly, from zero at the low end")
 
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.weight_g > 0.0) == (self.twist_deg != 0.0):
+            raise ValueError(
+                f"weight_g is {self.weight_g:g} and twist_deg {self.twist_deg:g}: one of them holds the body, so give "
+                "one, and leave the other at 0."
+            )
+        return self
+
 
 class ReleaseFromLoad(_Simulated):
     """Bodies that are released from rest under weights."""
@@ -268,7 +278,7 @@ class RecordedData(ReadingSettings):
         "applied; static, a pose",
     )
     train_fraction: Share = setting(1.0, "of each trial, from its start, that is used for training")
-    horizons: Annotated[Many[Positive], AfterValidator(_rising)] = setting(
+    horizons: Annotated[Many[Positive], AfterValidator(rising)] = setting(
         (), "durations from the start, over which errors are reported as well", "s"
     )
     input_scales: Annotated[Many[Positive], AfterValidator(different)] = setting(

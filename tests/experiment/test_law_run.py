@@ -1,0 +1,239 @@
+"""The law of a material through the command line: identified, used where it helps, and tested under other loads."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import warp_resphys
+from support.configured import check, composed, settings
+from support.main_job import IN_RUN, run_without_report
+from warp_resphys import select_vertices
+from warp_resphys.experiment.experiment import LAW
+from warp_resphys.experiment.simulate import initial_state
+from warp_resphys.experiment.target import build_target
+from warp_resphys.experiment.trials import all_trials, split_of
+from warp_resphys.io.errors import InputError
+from warp_resphys.mesh.poses import twisted
+from warp_resphys.pipeline import acquisition_stages
+from warp_resphys.robot.description import finished_experiment
+from warp_resphys.robot.program import export_network
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
+
+TINY = [
+    "mesh.divisions=[4,1,1]",
+    "data.steps=24",
+    "data.weights_g.train=[60,140,200]",
+    "data.weights_g.validation=[100]",
+    "data.weights_g.test=[160]",
+    "trainer.epochs=40",
+    "trainer.rollout_every=20",
+    "network.width=32",
+    "timing=false",
+    "law.branches=7",
+    "law.stride=2",
+    "law.trials=2",
+    "law.seconds=0.2",
+    "law.max_evaluations=6",
+    "identify.seconds=0.2",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    IN_RUN,
+]
+RUBBER = ["experiment=law_rubber", *TINY, "identify.trials=2", "identify.max_evaluations=6"]
+RANGES = "{youngs_modulus:{lower:50e3,upper:1e6,logarithmic:true},poissons_ratio:{lower:0.3,upper:0.4995}}"
+KNOWN = [  # E and nu alone describe its target.
+    "experiment=law_beam",
+    "target.poissons_ratio=0.4",
+    f"identify={{parameters:{RANGES},max_evaluations:12,tolerance:1e-10}}",
+    *TINY,
+    "law.families=0",
+]
+OTHERS = ["400 g", "120 g up", "200 g mid-span", "120 g at 45°", "120 g sideways", "twist 90°"]
+
+
+@pytest.fixture(scope="module")
+def rubber(tmp_path_factory):
+    return run_without_report(tmp_path_factory.mktemp("rubber"), *RUBBER)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    return run_without_report(tmp_path_factory.mktemp("known"), *KNOWN)
+
+
+def read(folder, name):
+    return json.loads((folder / name).read_text())
+
+
+def means(folder):
+    return {model: errors["mean"] for model, errors in read(folder, "metrics.json")["errors_mm"].items()}
+
+
+def by_trial(folder):
+    return {trial["name"]: trial["errors_mm"] for trial in read(folder, "metrics.json")["per_trajectory"]}
+
+
+class TestALawThatHelps:
+    def test_it_has_the_terms_of_the_rubber(self, rubber):
+        law = read(rubber, "law.json")
+        assert law["accepted"]
+        assert {"branches", "fibres"} <= {*law["groups"]}
+        constants = law["constants"]
+        along = np.cos(constants["fibre_azimuth_1"]) * np.cos(constants["fibre_elevation_1"])
+        assert abs(along) > np.cos(np.radians(5.0))
+        assert constants["fibre_tension_1"] == pytest.approx(80e3, rel=0.3)
+        moduli = sum(value for name, value in constants.items() if name.startswith("prony_modulus"))
+        assert moduli == pytest.approx(0.3 * 2.0 * 44e3, rel=0.3)
+        assert all(value >= 0.0 for name, value in constants.items() if "azimuth" not in name and "elev" not in name)
+        assert {law["units"][name] for name in ("c10", "fibre_tension_1")} == {"Pa"}
+        assert law["units"]["shear_viscosity"] == "Pa s"
+
+    def test_the_smallest_class_comes_first_and_a_close_one_is_chosen(self, rubber):
+        law = read(rubber, "law.json")
+        sizes = [len(own["groups"]) for own in law["classes"]]
+        assert sizes == sorted(sizes)
+        assert law["classes"][0]["groups"] == []
+        chosen = next(own for own in law["classes"] if own["groups"] == law["groups"])
+        assert chosen["validation"] < 0.1 * law["classes"][0]["validation"]
+        assert law["validation"]["law"] < 0.1 * law["validation"]["below"]
+        assert law["validation"]["trials"] == ["100 g"]
+
+    def test_it_is_better_than_identification_under_every_load(self, rubber):
+        errors = means(rubber)
+        assert list(errors) == ["simulation", "sysid", "law", "simfree", "resphys", "reconstruction"]
+        assert errors["sysid"] < errors["simulation"]
+        assert errors["law"] < 0.05 * errors["sysid"]
+        trials = by_trial(rubber)
+        assert list(trials) == ["160 g", *OTHERS]
+        for name, own in trials.items():
+            assert own["law"] < 0.2 * own["sysid"], name
+
+    def test_the_learned_force_is_zero_far_from_its_training(self, rubber):
+        trials = by_trial(rubber)
+        assert trials["twist 90°"]["resphys"] == trials["twist 90°"]["law"]
+        assert trials["120 g sideways"]["resphys"] == trials["120 g sideways"]["law"]
+        assert trials["160 g"]["resphys"] != trials["160 g"]["law"]
+
+    def test_only_the_force_on_the_law_fades_out(self, rubber):
+        robot = warp_resphys.load(rubber, model="resphys")
+        assert robot.description.learned.range_.missed is not None
+        assert warp_resphys.load(rubber, model="simfree").description.learned.range_.missed is None
+        assert finished_experiment(rubber).sources("resphys") == (LAW, LAW)
+        assert robot.description.material.model == LAW
+
+    def test_an_exported_force_fades_out_as_well(self, rubber, tmp_path):
+        robot = warp_resphys.load(rubber, model="resphys")
+        program = torch.export.load(export_network(robot, tmp_path / "force.pt2")).module()
+        rest = robot.simulator.rest_positions
+        data = finished_experiment(rubber).dataset
+        seen = torch.as_tensor(np.stack([data.observed[0, 4], data.velocity[0, 4]])).to(rest)
+        twist = twisted(rest, rest.new_tensor([np.pi / 2.0]))[0]
+        with torch.no_grad():
+            (force,) = program(torch.stack([seen[0], twist]), torch.stack([seen[1], torch.zeros_like(rest)]))
+        assert force[0].abs().max() > 0.0
+        assert not force[1].any()
+
+
+class TestALawThatDoesNotHelp:
+    def test_it_is_not_used(self, known):
+        law, errors = read(known, "law.json"), means(known)
+        assert not law["accepted"]
+        assert law["validation"]["law"] > law["validation"]["below"]
+        assert list(errors) == ["simulation", "sysid", "simfree", "resphys", "reconstruction"]
+        assert errors["sysid"] < 1e-4 * errors["simulation"]
+
+    def test_the_force_corrects_the_identified_simulator_and_does_not_fade_out(self, known):
+        experiment = finished_experiment(known)
+        assert experiment.sources("resphys") == ("identified", "sysid")
+        assert not experiment.has_law
+        robot = warp_resphys.load(known, model="resphys")
+        assert robot.description.material.model == "corotated"
+        assert robot.description.learned.range_.missed is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}", "simulation.regions={root:{},tip:{}}"],
+            "^law: the simulator has materials by region, and one law is for one material: leave law out.$",
+        ),
+        (["law.terms=[c20,c50]"], r"^law\.terms: the material has no constant 'c50': it has c10"),
+        (["law.terms=[ogden_2]"], r"^law\.terms: ogden has the exponent 2"),
+        (["law.term=[c20]"], "unknown key 'law.term'"),
+        (["data.others.a={weight_g:50,twist_deg:10}"], r"^data\.others\.a\.weight_g is 50 and twist_deg 10: "),
+        (["data.others.a={direction:[0,0,1]}"], r"^data\.others\.a\.weight_g is 0 and twist_deg 0: "),
+        (["data.others.a={weight_g:50,direction:[0,0,0]}"], "others.a.direction"),
+        (["data.others.a={weight_g:50,at:{x:0.3}}"], r"data\.others\.a\.at: no vertex lies"),
+        (["law.relaxation_times=[0.1,0.01]"], r"law\.relaxation_times.* must rise"),
+    ],
+)
+def test_what_cannot_work_is_refused_in_a_sentence(overrides, message):
+    with pytest.raises(InputError, match=message):
+        check(composed("experiment=law_beam", *overrides))
+
+
+def test_a_trial_of_another_name_is_not_replaced():
+    config = composed("experiment=law_beam")
+    config["data"]["others"]["120 g"] = {"weight_g": 50.0}
+    with pytest.raises(InputError, match=r"data\.others names '120 g', which is a trial of data\.weights_g: rename it"):
+        check(config)
+
+
+class TestOtherLoads:
+    """Test trials of a beam that is held in other ways."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def held(cls):
+        """Initial states of all trials by name, with the simulator that played them."""
+        run = settings("experiment=law_beam", "mesh.divisions=[8,2,2]", "data.weights_g.test=[120]")
+        (stage,) = acquisition_stages(run)
+        trials = [all_trials(run)[name] for name in ("50 g", *OTHERS, "120 g")]
+        simulator = build_target(stage.settings, stage.settings.target).simulator
+        with torch.no_grad():
+            state = initial_state(simulator, run.data, trials)
+        assert not state.v.any()
+        return simulator, dict(zip((trial.name for trial in trials), state.q, strict=True))
+
+    def test_they_are_in_the_test_split_alone(self):
+        split = split_of(settings("experiment=law_beam"))
+        assert split.test == ("70 g", "120 g", "140 g", "200 g", "220 g", *OTHERS)
+        assert not {*OTHERS} & {*split.train, *split.validation}
+
+    @pytest.mark.parametrize(
+        ("name", "x", "weight"),
+        [
+            ("400 g", 0.1, (0.0, 0.0, -0.4)),
+            ("120 g up", 0.1, (0.0, 0.0, 0.12)),
+            ("200 g mid-span", 0.05, (0.0, 0.0, -0.2)),
+            ("120 g at 45°", 0.1, (0.0, 0.12 / np.sqrt(2.0), -0.12 / np.sqrt(2.0))),
+            ("120 g sideways", 0.1, (0.0, 0.12, 0.0)),
+            ("120 g", 0.1, (0.0, 0.0, -0.12)),
+        ],
+    )
+    def test_a_weight_in_its_direction_at_its_place_holds_the_beam(self, held, name, x, weight):
+        simulator, states = held
+        face = select_vertices(simulator.body.mesh, x=x)
+        force = torch.zeros_like(simulator.rest_positions)[None]
+        force[:, face] = force.new_tensor(weight) * float(np.linalg.norm(simulator.gravity)) / len(face)
+        q = states[name][None]
+        with torch.no_grad():
+            balanced = simulator.step(State(q, torch.zeros_like(q)), Inputs(external_force=force))[0].q
+            released = simulator.step(State(q, torch.zeros_like(q)))[0].q
+        moved = float((released - q).abs().max())
+        assert moved > 1e-4
+        assert float((balanced - q).abs().max()) < 1e-4 * moved
+
+    def test_a_twist_turns_the_tip(self, held):
+        simulator, states = held
+        expected = twisted(simulator.rest_positions, simulator.tensor([np.pi / 2.0]))[0]
+        torch.testing.assert_close(states["twist 90°"], expected)
+
+    def test_each_trial_keeps_its_place_in_a_batch(self, held):
+        _, states = held
+        tips = {name: float(q[q[:, 0] > 0.05].mean(0)[2]) for name, q in states.items()}
+        assert tips["400 g"] < tips["120 g"] < tips["50 g"] < tips["120 g up"]

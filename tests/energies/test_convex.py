@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Inputs, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
-from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
+from warp_resphys.energies.materials import ConvexMaterial, FibreFamily, make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
@@ -93,3 +93,59 @@ def test_fibres_stiffen_a_beam_along_their_direction_only():
 def test_invalid_coefficients_are_refused(make, key):
     with pytest.raises(InputError, match=key):
         make().prepare()
+
+
+class TestByName:
+    """The model `law` of a configuration."""
+
+    def test_every_constant_by_its_name(self):
+        fibre = {"azimuth": 0.3, "elevation": 0.2, "slack": 0.01, "toe": 0.05, "tension": 4e4, "stiffening": 1e4}
+        fibre["compression"] = 2e3
+        made = make_material(
+            "law",
+            c10=C10,
+            bulk_1=1e6,
+            shear_viscosity=40.0,
+            ogden_m3=5e3,
+            ogden_4=3e4,
+            prony_modulus_1=2e4,
+            prony_time_1=0.03,
+            **{f"fibre_{name}_1": value for name, value in fibre.items()},
+        )
+        direct = ConvexMaterial(
+            C10,
+            bulk_1=1e6,
+            shear_viscosity=40.0,
+            ogden={-3: 5e3, 4: 3e4},
+            prony=[(2e4, 0.03)],
+            fibres=[FibreFamily(**fibre)],
+        )
+        assert isinstance(made, ConvexMaterial)
+        assert made.constants == direct.constants
+        assert made.law is direct.law
+        assert {"ogden_m3", "ogden_4", "fibre_compression_1", "prony_modulus_1"} <= made.constants.keys()
+        assert "stiffness_damping" not in made.constants
+        assert ConvexMaterial.from_constants(made.constants).constants == made.constants
+
+    def test_families_and_branches_are_numbered_from_one(self):
+        branches = {"prony_modulus_2": 1e3, "prony_time_1": 0.5, "prony_modulus_1": 2e3, "prony_time_2": 2.0}
+        assert make_material("law", **branches).prony == [(2e3, 0.5), (1e3, 2.0)]
+
+    @pytest.mark.parametrize(
+        ("constants", "message"),
+        [
+            ({"youngs_modulus": 1e5}, "no constant 'youngs_modulus': it has c10, .*, prony_modulus_1, .*fibre_azimuth"),
+            ({"stiffness_damping": 1e-3}, "no constant 'stiffness_damping'"),
+            ({"prony_ratio_1": 0.3, "prony_time_1": 0.1}, "prony has prony_time_1: give each branch"),
+            ({"prony_modulus_1": 1e3}, "prony has prony_modulus_1: give each branch, numbered from 1"),
+            ({"fibre_tension_1": 1e3}, "fibres has fibre_tension_1: give each family, numbered from 1"),
+            ({"ogden_2": 1e3}, "exponent 2: give whole numbers from 3 up"),
+            ({"ogden_m2": 1e3}, "exponent -2"),
+            ({"ogden_m3": -1.0}, "ogden_m3 is -1"),
+            ({"ogden_x": 1e3}, "no constant 'ogden_x'"),
+            ({"c10": "soft"}, "c10"),
+        ],
+    )
+    def test_what_is_no_law_is_refused(self, constants, message):
+        with pytest.raises(InputError, match=message):
+            make_material("law", **constants)

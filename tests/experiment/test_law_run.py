@@ -132,7 +132,9 @@ class TestALawThatHelps:
         seen = torch.as_tensor(np.stack([data.observed[0, 4], data.velocity[0, 4]])).to(rest)
         twist = twisted(rest, rest.new_tensor([np.pi / 2.0]))[0]
         with torch.no_grad():
-            (force,) = program(torch.stack([seen[0], twist]), torch.stack([seen[1], torch.zeros_like(rest)]))
+            (force,) = program(
+                torch.stack([seen[0], twist]), torch.stack([seen[1], torch.zeros_like(rest)]), None, None
+            )
         assert force[0].abs().max() > 0.0
         assert not force[1].any()
 

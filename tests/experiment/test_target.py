@@ -12,7 +12,7 @@ from warp_resphys.data.base_motion import rigid
 from warp_resphys.energies.materials import make_material
 from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motion
-from warp_resphys.experiment.build import build_body
+from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET, read_dataset
 from warp_resphys.experiment.laboratory import laboratory_simulator
 from warp_resphys.experiment.simulate import simulate
@@ -49,6 +49,26 @@ def test_keys_that_are_left_out_are_those_of_the_simulator():
     fibres = settings("experiment=sopra_fibres", "~laboratory.fibres")
     assert fibres.laboratory.fibres == fibres.fibres != None  # noqa: E711
     assert settings("experiment=sopra_fibres", "laboratory.fibres=null").laboratory.fibres is None
+
+
+def test_null_takes_a_constant_of_the_target_out():
+    rubber = ("target.material.model=mooney_rivlin", "target.material.c10=30e3")
+    own = settings("target.youngs_modulus=null", "target.poissons_ratio=null", *rubber).target.material
+    assert own.model == "mooney_rivlin"
+    assert own.constants == {"c10": 30e3, "density": 1070.0, "mass_damping": 0.0, "stiffness_damping": 0.0}
+    check(composed("target.youngs_modulus=null", "target.poissons_ratio=null", *rubber))
+    with pytest.raises(InputError, match=r"target\.material: the material has no constant '(youngs|poissons)_"):
+        check(composed(*rubber))
+
+
+def test_a_law_of_the_material_is_a_model_as_any_other():
+    out = [f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping")]
+    law = "simulation={model:law,c10:40e3,bulk_1:2e6,ogden_m3:5e3,shear_viscosity:20.0}"
+    run = settings(*COARSE, *out, law)
+    material = build_simulator(run, run.simulation).materials[""]
+    assert (material.ogden, material.shear_viscosity, material.density) == ({-3: 5e3}, 20.0, 1070.0)
+    with pytest.raises(InputError, match="simulation: fibres has fibre_tension_1: give each family"):
+        check(composed(*COARSE, *out, law.replace("}", ",fibre_tension_1:1e3}")))
 
 
 def test_the_report_tells_how_the_target_differs():

@@ -20,7 +20,7 @@ from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identification, Identifier
-from ..learning.law import LawClass, Library, fit_classes
+from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
 from ..learning.replay import Replay, Start
 from ..learning.weak_form import ObservedMotion, WeakForm
 from ..settings.body import MaterialSettings
@@ -130,7 +130,12 @@ class _LawSearch:
         tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
         lame = np.asarray(material.law.LAME).T @ [float(m) for m in material.moduli(tensors)]
         mu, volume = float(lame[0]), float(lame[1])
-        guess = {"c10": 0.5 * mu, "bulk_1": 0.5 * volume, "shear_viscosity": known.get("stiffness_damping", 0.0) * mu}
+        time = known.get("stiffness_damping", 0.0)
+        guess = {
+            "c10": 0.5 * mu,
+            "bulk_1": 0.5 * volume,
+            **dict(zip(VISCOSITIES, (time * mu, time * volume), strict=True)),
+        }
         return {**guess, "density": known["density"], "mass_damping": known["mass_damping"]}
 
     def _simulator(self, constants: Mapping[str, float], settled: bool = False) -> Simulator:
@@ -143,7 +148,7 @@ class _LawSearch:
     def _from_states(self, library: Library) -> list[LawClass]:
         """Returns the classes of the weak form."""
         wanted = self.settings.law
-        zero = {name: 0.0 for name in (*library.terms, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1")}
+        zero = {name: 0.0 for name in (*library.terms, "c10", "bulk_1", *VISCOSITIES, "prony_modulus_1")}
         unset = {"prony_time_1": 0.1, "fibre_azimuth_1": 0.0, "fibre_elevation_1": 0.0, "fibre_tension_1": 0.0}
         unset |= {"fibre_slack_1": 0.0, "fibre_toe_1": 0.02, "fibre_stiffening_1": 0.0, "fibre_compression_1": 0.0}
         simulator = self._simulator({**zero, **unset}, settled=True)
@@ -175,7 +180,7 @@ class _LawSearch:
             "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),
             "fibres": _family(0.1 * self.shear) if library.families else {},
         }
-        guess = {name: value for name, value in self._guess().items() if name in ("c10", "bulk_1")}
+        guess = {name: value for name, value in self._guess().items() if name in ("c10", "bulk_1", *VISCOSITIES)}
         refined = [self._refine(LawClass((), guess, math.nan), names)]
         for name, added in groups.items():
             if added:
@@ -194,7 +199,7 @@ class _LawSearch:
         union: dict[str, float] = {}
         for law in laws:
             union |= {name: value if _is_shape(name) else 0.0 for name, value in law.items()}
-        simulator = self._simulator(union, settled=True)
+        simulator = self._simulator({**union, **laws[0]}, settled=True)
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         own = self._others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
         values |= {name: value.expand(len(laws)) for name, value in own.items()}
@@ -220,7 +225,7 @@ class _LawSearch:
         wanted = self.settings.law
         guess = dict(law.constants)
         if wanted.viscous:
-            guess.setdefault("shear_viscosity", 0.0)
+            guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
         simulator = self._simulator(guess)
         bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)}
         others = {name: float(value) for name, value in self._others(simulator).items()}
@@ -237,7 +242,7 @@ class _LawSearch:
             found = identifier.run([start], wanted.max_evaluations, report, tolerance=wanted.tolerance)
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         weak = {n for n, value in refined.items() if _unit(n) == "Pa" and value < _LEAST * self.shear and n != "c10"}
-        weak |= {n for n, value in refined.items() if n == "shear_viscosity" and value < 1e-6 * self.shear}
+        weak |= {n for n in VISCOSITIES if refined.get(n, 1.0) < 1e-6 * self.shear}
         kept = {name: value for name, value in refined.items() if name not in weak or _is_of_group(name)}
         after = {name: found.parameters[name] for name in others}
         return _Refined(replace(law, constants=kept), after, found, self._scores([kept], self.checked, after)[0])
@@ -253,14 +258,14 @@ class _LawSearch:
             return Bounds(0.0, 0.1)
         if name.startswith("fibre_toe"):
             return Bounds(0.002, 0.1, True)
-        if name == "shear_viscosity":
-            return Bounds(0.0, max(4.0 * value, 0.01 * self.shear))
+        if name in VISCOSITIES:
+            return Bounds(0.0, max(4.0 * value, (0.01 if name == "shear_viscosity" else 1.0) * self.shear))
         return Bounds(0.0, max(4.0 * value, self.shear))
 
 
 def _is_shape(name: str) -> bool:
     """Whether a constant has no coefficient's meaning: a time, a direction, a slack or a toe."""
-    return _unit(name) != "Pa" and name != "shear_viscosity"
+    return _unit(name) != "Pa" and name not in VISCOSITIES
 
 
 def _is_refined(name: str) -> bool:

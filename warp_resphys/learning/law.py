@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .weak_form import Candidate, FloatArray, WeakForm, fit, residual_of
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
+VISCOSITIES: Final = ("shear_viscosity", "bulk_viscosity")
 UNIT: Final = 1e5  # Pa, of a candidate's coefficient
 _UNIT_VISCOSITY: Final = 1e2  # Pa s
 _FIBRE: Final = {"slack": 0.0, "toe": 0.02, "stiffening": 0.0, "compression": 0.0}
@@ -33,7 +34,7 @@ class Library:
 
     Attributes:
         terms: elastic terms by name, as in `ConvexMaterial`, besides `MODULUS`.
-        viscous: whether the law may have a shear viscosity.
+        viscous: whether the law may have viscosities of shear and of bulk.
         times: relaxation times of branches [s], ascending; none: no branches.
         families: largest number of families of fibres.
     """
@@ -97,7 +98,7 @@ def fit_classes(train: WeakForm, held_out: WeakForm | None, library: Library) ->
     modulus = columns.add([{name: UNIT} for name in MODULUS])
     groups = {
         "elastic": columns.add([{name: UNIT} for name in library.terms]),
-        "viscosity": columns.add([{"shear_viscosity": _UNIT_VISCOSITY}] if library.viscous else []),
+        "viscosity": columns.add([{name: _UNIT_VISCOSITY} for name in VISCOSITIES] if library.viscous else []),
         "branches": columns.add([{"prony_modulus_1": UNIT, "prony_time_1": time} for time in library.times]),
     }
     base = modulus + list(chain.from_iterable(groups.values()))

@@ -10,8 +10,10 @@ from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Trajectory as Trajectory
 from .energies.base import Energy as Energy
 from .energies.fibres import Fibres as Fibres
+from .energies.materials import ConvexMaterial as ConvexMaterial
 from .energies.materials import Corotated as Corotated
 from .energies.materials import DensityMaterial as DensityMaterial
+from .energies.materials import FibreFamily as FibreFamily
 from .energies.materials import Gent as Gent
 from .energies.materials import Material as Material
 from .energies.materials import MooneyRivlin as MooneyRivlin

@@ -121,14 +121,20 @@ class IdentifySettings(IdentifiedSettings):
 
 
 class LawSettings(Settings):
-    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`."""
+    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`.
 
+    A path in place of the group, law=FILE, takes the law that another run has written in law.json.
+    """
+
+    file: Word | None = setting(None, "law of another run, in place of an identification")
     terms: Many[Word] = setting(
         ("c20", "c01", "c02", "dilation", "ogden_3", "ogden_4", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried; 0: none")
-    relaxation_times: tuple[Positive, Positive] = setting((0.01, 1.0), "shortest and longest", "s")
+    relaxation_times: Annotated[Many[Positive], Field(min_length=2, max_length=2)] = setting(
+        (0.01, 1.0), "shortest and longest", "s"
+    )
     families: Count = setting(1, "largest number of families of fibres")
     stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions

@@ -193,7 +193,10 @@ def learning_stages(
     if run.identify is not None:
         stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
     if run.law is not None:
-        add("identify_law", identify_law, (LAW_FILE,), IdentifyLawStage.of(run, **common))
+        given = {} if run.law.file is None else {run.law.file: digest(run.law.file)}
+        of_law = IdentifyLawStage.of(run, **common)
+        of_law = of_law.model_copy(update={"files": of_law.files | given})
+        add("identify_law", identify_law, (LAW_FILE,), of_law)
         needs = (*needs, "identify_law")
     reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
     learned = []

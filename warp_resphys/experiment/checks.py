@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import combinations, product
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -25,6 +26,7 @@ from ..io.memory import available_memory_gib
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
+from ..settings.body import MaterialSettings
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
@@ -32,7 +34,8 @@ from ..settings.stages import PlayedSettings
 from ..settings.trials import MarkerSettings, RecordedData, ReleaseFromLoad, Trial
 from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, marker_view_of
-from .files import STATIC, payload_inputs
+from .experiment import LAW
+from .files import STATIC, payload_inputs, read_law
 from .identify import ELASTIC
 from .laboratory import input_sequences
 from .reading import standing_enough
@@ -65,26 +68,29 @@ def check_run(run: RunSettings) -> None:
         _check_ablation(run, simulator)
     else:
         _check_simulated(run, simulator)
+    if run.law is not None:
+        _check_law(run, run.law)
     if run.mesh_check is not None:
         _check_memory(run.model_copy(update={"mesh": finer(run.mesh, run.mesh_check)}))
     if run.control is not None:
         _check_control(run, body)
-    if run.law is not None:
-        _check_law(run, run.law)
     if run.identify is not None:
         names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
         _check_identification(run.identify, names, simulator)
-        _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
 
 
 def _check_law(run: RunSettings, law: LawSettings) -> None:
+    """Checks the identification of a law, or that a law of another run can be used."""
     if run.simulation.regions:
         raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
     with _naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
+    if law.file is not None:
+        constants = read_law(Path(law.file).expanduser())["constants"]
+        build_material(MaterialSettings.model_validate({"model": LAW, **constants}), f"law: {law.file}")
 
 
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:

@@ -8,13 +8,13 @@ best on the validation trials is refined through the simulator, with the other p
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions
@@ -27,7 +27,7 @@ from ..settings.body import MaterialSettings
 from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
 from .experiment import LAW, Experiment
-from .files import LAW_FILE
+from .files import LAW_FILE, LAW_FORMAT, read_law
 from .identify import bounds_of
 from .trials import evenly
 
@@ -46,13 +46,16 @@ def identify_law(context: StageContext) -> None:
     """Writes law.json: the law, its posterior, the classes that were tried, and whether it is used.
 
     Raises:
-        InputError: the simulator has materials by region.
+        DataFileError: the file of the law is missing, damaged or of another version.
     """
     settings: IdentifyLawStage = context.settings
-    experiment = Experiment(settings, context.run_dir)
-    if experiment.material_of("simulation").regions:
-        raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
-    _LawSearch(context, experiment).run()
+    if settings.law.file is not None:
+        content = read_law(Path(settings.law.file).expanduser())
+        write_json(
+            context.run_dir / LAW_FILE, {**content, "accepted": True, "parameters": {}, "file": settings.law.file}
+        )
+        return
+    _LawSearch(context, Experiment(settings, context.run_dir)).run()
 
 
 @dataclass(frozen=True)
@@ -81,10 +84,11 @@ class _LawSearch:
         """Writes law.json."""
         wanted, split = self.settings.law, self.settings.split
         names = split.train if wanted.trials is None else tuple(evenly(split.train, wanted.trials))
+        shortest, longest = wanted.relaxation_times
         library = Library(
             terms=tuple(wanted.terms),
             viscous=wanted.viscous,
-            times=tuple(np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()),
+            times=tuple(np.geomspace(shortest, longest, wanted.branches).tolist()),
             families=wanted.families,
         )
         if self.states:
@@ -101,7 +105,7 @@ class _LawSearch:
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         uncertainty = best.found.uncertainty
         content = {
-            "format": 1,
+            "format": LAW_FORMAT,
             "accepted": best.score < below,
             "groups": list(best.law.groups),
             "constants": best.law.constants,

@@ -101,6 +101,21 @@ class Description:
         body = build_body(settings, self.payload_at, self.mesh)
         return build_simulator(settings, self.material, body, on_failure=on_failure)
 
+    def on(self, mesh: Mesh, parameters: Mapping[str, float], body: Mapping[str, Any]) -> "Description":
+        """Returns the description of a simulator with this material on another body.
+
+        Args:
+            mesh: rest shape.
+            parameters: values of the material's constants that were identified.
+            body: settings of the body that differ.
+
+        Raises:
+            InputError: an unknown or wrong setting.
+        """
+        given = {key: value.plain() if isinstance(value, Settings) else value for key, value in body.items()}
+        settings = parse(SimulatorSettings, {**self.settings.plain(), **given})
+        return Description(self.name, self.model, settings, self.material, mesh, parameters)
+
     def observe(self) -> Markers | None:
         """Returns the map from vertices to markers, in float64 on the CPU; None if every vertex is observed."""
         if self.markers is None or self.bound is None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
 from ..learning.predictors import LearnedPredictor
 from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
+from ..mesh.mesh import Mesh
 from ..stepping.state import State
 from .commands import Commands
 from .description import Description
@@ -100,6 +101,34 @@ class Robot:
         other.__dict__.update(self.__dict__)
         other._set_parameters({**self.parameters, **parameters})
         return other
+
+    def on(self, mesh: Mesh, **body: Any) -> "Robot":
+        """Returns a robot with the material of this one on another body, without learned force and markers.
+
+        A learned force belongs to its mesh; the material does not. Identified parameters of actuators stay behind.
+
+        Args:
+            mesh: rest shape.
+            body: settings of the body that differ, by key of the configuration, such as ``fixed={"z": 0.0}`` or
+                ``chambers=None``.
+
+        Raises:
+            InputError: an unknown setting, or one that does not fit the mesh, such as regions of the material that it
+                lacks; or a robot whose network replaces the simulator.
+            MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
+        """
+        if self.is_data_driven:
+            raise InputError(
+                f"{self.description.model} has no simulator, only a network for its mesh: load another model."
+            )
+        names = {name for name in self.parameters if self._is_material(name)}
+        parameters = {name: float(self.parameters[name][0]) for name in names}
+        return Robot(self.description.on(mesh, parameters, body), self.simulator.device)
+
+    def _is_material(self, name: str) -> bool:
+        """Whether a parameter is a constant of the material, or of that of a region."""
+        materials = self.simulator.materials.items()
+        return any(name in {f"{region}_{q}" if region else q for q in own.quantities} for region, own in materials)
 
     @property
     def driven(self) -> tuple[str, ...]:

@@ -121,8 +121,12 @@ class IdentifySettings(IdentifiedSettings):
 
 
 class LawSettings(Settings):
-    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`."""
+    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`.
 
+    A path in place of the group, law=FILE, takes the law that another run has written in law.json.
+    """
+
+    file: Word | None = setting(None, "law of another run, in place of an identification")
     terms: Many[Word] = setting(
         ("c20", "c01", "c02", "dilation", "ogden_3", "ogden_4", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )

@@ -6,7 +6,7 @@ Checks that need the mesh, the trials or their files are in `experiment.checks`.
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from ..io.settings import Natural, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
@@ -41,6 +41,12 @@ Name = Annotated[
     str,
     Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"}),
 ]
+
+
+def _law_of(value: Any) -> Any:
+    return {"file": value} if isinstance(value, str) else value
+
+
 _LEAST_STEPS = 20  # of a path that is followed
 
 
@@ -81,7 +87,9 @@ class RunSettings(SimulatorSettings):
     laboratory: LaboratorySettings | None = setting(None, "plays the real body where there are no recordings")
     published: PublishedSettings | None = setting(None, "simulation to compare with")
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
-    law: LawSettings | None = setting(None, "law of the material to identify; null: none")
+    law: Annotated[LawSettings | None, BeforeValidator(_law_of, json_schema_input_type=LawSettings | str | None)] = (
+        setting(None, "law of the material to identify; null: none")
+    )
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()

@@ -14,7 +14,7 @@ from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import initial_state
 from warp_resphys.experiment.target import build_target
 from warp_resphys.experiment.trials import all_trials, split_of
-from warp_resphys.io.errors import InputError
+from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.mesh.poses import twisted
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
@@ -137,6 +137,18 @@ class TestALawThatHelps:
             )
         assert force[0].abs().max() > 0.0
         assert not force[1].any()
+
+    def test_another_run_takes_it(self, rubber, tmp_path):
+        others = [word for word in RUBBER if not word.startswith("law.")]
+        folder = run_without_report(tmp_path, *others, f"law={rubber / 'law.json'}")
+        law, given = read(folder, "law.json"), read(rubber, "law.json")
+        assert law["constants"] == given["constants"]
+        assert law["accepted"]
+        assert by_trial(folder)["twist 90°"]["law"] == pytest.approx(by_trial(rubber)["twist 90°"]["law"], rel=0.01)
+
+    def test_a_file_without_a_law_is_refused(self, rubber):
+        with pytest.raises(DataFileError, match=r"errors\.json is not a law of this version"):
+            check(composed("experiment=law_beam", f"law={rubber / 'errors.json'}"))
 
 
 class TestALawThatDoesNotHelp:

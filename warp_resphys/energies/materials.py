@@ -7,7 +7,7 @@ material                 shape terms                                         vol
 `StableNeoHookean`       ``mu/2 (||F||^2 - 3) - mu (J - 1) + mu/2 (J-1)^2``  ``lambda / 2 (J - 1)^2``
 `MooneyRivlin`           W_s (mu = 2 c10) ``+ c01 ((I2 - 3) - 4 (J-1))``     ``lambda / 2 (J - 1)^2``
 `Gent`                   ``-J_m mu / 2 ln(1 - 2 W_s / (J_m mu))``            ``lambda / 2 (J - 1)^2``
-`ConvexMaterial`         any of: powers of invariants, Ogden's terms, fibres  ``g_2 (J - 1)^2 + g_4 (J - 1)^4``
+`ConvexMaterial`         powers of invariants, Ogden's terms, and fibres     ``g_2 (J - 1)^2 + g_4 (J - 1)^4``
 =======================  ==================================================  ====================================
 
 R is the rotation of the polar decomposition, D the nearest matrix of determinant one, J = det F, W_s the shape terms of

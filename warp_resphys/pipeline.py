@@ -191,7 +191,8 @@ def learning_stages(
         stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
 
     if run.identify is not None:
-        stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
+        before = IdentifyStage.of(run, **common).model_copy(update={"with_law": False})
+        stages.append(Stage("identify", identify, (IDENTIFICATION,), before))
     if run.law is not None:
         given = {} if run.law.file is None else {run.law.file: digest(run.law.file)}
         of_law = IdentifyLawStage.of(run, **common)
@@ -213,7 +214,7 @@ def learning_stages(
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
         # With observed states, a network that replaces the simulator does not depend on it.
-        without = {"simulation": run.target.material, "identified": None, "law": None}
+        without = {"simulation": run.target.material, "identified": None, "with_law": False}
         trained = trained.model_copy(update=without)
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))

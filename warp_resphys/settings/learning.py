@@ -128,7 +128,9 @@ class LawSettings(Settings):
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried; 0: none")
-    relaxation_times: tuple[Positive, Positive] = setting((0.01, 1.0), "shortest and longest", "s")
+    relaxation_times: Annotated[tuple[Positive, Positive], Field(strict=False)] = setting(
+        (0.01, 1.0), "shortest and longest", "s"
+    )
     families: Count = setting(1, "largest number of families of fibres")
     stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")

@@ -59,6 +59,7 @@ ROUND_STEPS: Final = (1, 2, 5, 10)  # Distances of ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
 NARROW: Final = 3.7  # [in]
+_BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
@@ -132,6 +133,8 @@ def error_over_time(
         for model, error in (published or {}).items():
             axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
         axes.set_title(title)
+    if len(groups) > 1:
+        figure.set_layout_engine("constrained", wspace=_BETWEEN)
     for axes in every.flat:  # Once everything is drawn, as they share their axis.
         use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
     for axes in every[-1]:

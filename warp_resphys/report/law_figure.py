@@ -11,6 +11,7 @@ from .figures import TONES, FloatArray, in_style, new_figure
 _KILO: Final = 1e-3
 _POINTS: Final = 81
 _LEAST: Final = 0.02  # Least range of strains that is drawn, on either side of rest.
+_SHADE: Final = 0.45  # Opacity.
 _MARGIN: Final = 0.15  # Of the drawn range, over the range of the strains.
 
 
@@ -39,14 +40,14 @@ def stress_over_stretch(
         ranges: Least and largest stretch in trials, by name.
         narrow: Whether the figure is for a narrow page.
     """
-    figure = new_figure(3.2, 3.5, narrow=narrow)
+    figure = new_figure(3.3, 3.7, narrow=narrow)
     axes = figure.subplots()
     law, ink = TONES["law"].light, TONES["ink"].light
     stretches = next(iter(curves.values()))[0]
     highest = max(float(np.nanmax(stress)) for _, stress in curves.values())
     lowest = min(float(np.nanmin(stress)) for _, stress in curves.values())
-    for (name, (low, high)), alpha in zip(ranges.items(), (0.75, 0.35), strict=False):
-        axes.axvspan(low, high, color=TONES["rule"].light, alpha=alpha, linewidth=0.0, label=f"stretches in {name}")
+    for (name, (low, high)), tone in zip(ranges.items(), ("rule", "target"), strict=False):
+        axes.axvspan(low, high, color=TONES[tone].light, alpha=_SHADE, linewidth=0.0, label=f"stretches in {name}")
     looks: list[dict[str, Any]] = [{}, {"linestyle": (0, (4, 1.5))}, {"linestyle": (0, (1, 1.2))}]
     for (label, (x, stress)), look in zip(curves.items(), looks, strict=False):
         axes.plot(x, _KILO * stress, color=law, linewidth=1.9, label=label, **look)
@@ -58,5 +59,6 @@ def stress_over_stretch(
     axes.set(xlim=(stretches[0], stretches[-1]), ylim=(_KILO * (lowest - 0.1 * span), _KILO * (highest + 0.1 * span)))
     axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=1 if narrow else 3, columnspacing=1.6)
+    columns = 1 if narrow else 2
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
     return figure

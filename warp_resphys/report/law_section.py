@@ -22,12 +22,12 @@ _STRAIN: Final = ("%", 1e2)
 _ANGLE: Final = ("°", 180.0 / np.pi)
 # Of each constant: its term in words, its meaning, and unit on the page with its number in an SI unit.
 _TERMS: Final[Mapping[str, tuple[str, str, tuple[str, float]]]] = {
-    "c10": ("Shape, neo-Hookean", "half the shear modulus that it adds; c10 of I₁ − 3", _KPA),  # noqa: RUF001
-    "c20": ("Shape, of second order", "stiffens with strain; c20 of (I₁ − 3)²", _KPA),  # noqa: RUF001
-    "c30": ("Shape, of third order", "stiffens with strain; c30 of (I₁ − 3)³", _KPA),  # noqa: RUF001
-    "c01": ("Shape, Mooney-Rivlin", "softens in tension; c01 of I₂ − 3", _KPA),  # noqa: RUF001
-    "c02": ("Shape, Mooney-Rivlin of second order", "stiffens with strain; c02 of (I₂ − 3)²", _KPA),  # noqa: RUF001
-    "dilation": ("Change of volume, locally", "dilation of (J − 1)²", _KPA),  # noqa: RUF001
+    "c10": ("Neo-Hookean term", "half the shear modulus that it adds; c10 of I₁ − 3", _KPA),  # noqa: RUF001
+    "c20": ("Second-order term in I₁", "stiffens with strain; c20 of (I₁ − 3)²", _KPA),  # noqa: RUF001
+    "c30": ("Third-order term in I₁", "stiffens with strain; c30 of (I₁ − 3)³", _KPA),  # noqa: RUF001
+    "c01": ("Mooney-Rivlin term", "softens in tension; c01 of I₂ − 3", _KPA),  # noqa: RUF001
+    "c02": ("Second-order term in I₂", "stiffens with strain; c02 of (I₂ − 3)²", _KPA),  # noqa: RUF001
+    "dilation": ("Local change of volume", "dilation of (J − 1)²", _KPA),  # noqa: RUF001
     "bulk_1": ("Change of volume", "bulk_1 of (J − 1)²", ("MPa", 1e-6)),  # noqa: RUF001
     "bulk_2": ("Large change of volume", "bulk_2 of (J − 1)⁴", ("MPa", 1e-6)),  # noqa: RUF001
     "shear_viscosity": ("Viscosity in shear", "force in proportion to the rate of shear", ("Pa s", 1.0)),
@@ -61,7 +61,7 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     law, settings = data.law, data.settings.law
     if not law or settings is None:
         return None
-    blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(data, law)]
+    blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     notes += [f"The target is simulated, with the material {data.target}."] if data.target else []
     blocks += [Text(" ".join(notes if law.get("deviation") else notes[1:]), note=True)]
@@ -76,7 +76,7 @@ def wording(name: str) -> tuple[Wording, str]:
         words, meaning, (unit, factor) = _TERMS[name]
         return (words, unit, factor), meaning
     if exponents := [*ogden_terms({name: 0.0})]:
-        return (f"Shape, Ogden's term of exponent {exponents[0]}", *_KPA), _OGDEN
+        return (f"Ogden's term of exponent {exponents[0]}", *_KPA), _OGDEN
     numbered = re.fullmatch(r"(\w+)_(\d+)", name)
     if numbered and numbered[1] in _NUMBERED:
         words, meaning, (unit, factor) = _NUMBERED[numbered[1]]
@@ -84,9 +84,10 @@ def wording(name: str) -> tuple[Wording, str]:
     return parameter_wording(name), ""
 
 
-def _terms_table(data: RunReport, law: Mapping[str, Any]) -> PageTable:
+def _terms_table(law: Mapping[str, Any]) -> PageTable:
     rows = []
     known = {**law["constants"], **law.get("parameters", {})}
+    bounds = [name for name in law.get("at_bounds", ()) if name in known]
     for name, value in known.items():
         deviation = law.get("deviation", {}).get(name)
         if not value and not deviation:  # Of a family of fibres that has no such part.
@@ -94,9 +95,9 @@ def _terms_table(data: RunReport, law: Mapping[str, Any]) -> PageTable:
         (words, unit, factor), meaning = wording(name)
         beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
         cells = [Cell(digits(value, factor, deviation), beside=beside), Cell(unit or NONE)]
-        cells.append(Cell("yes" if name in law.get("at_bounds", ()) else ""))
+        cells += [Cell("yes" if name in bounds else "")] if bounds else []
         rows.append(Row(words, cells, small=meaning))
-    return PageTable("Term", ["Identified", "Unit", "At a bound"], rows)
+    return PageTable("Term", ["Identified", "Unit", *(["At a bound"] if bounds else [])], rows)
 
 
 def open_text(law: Mapping[str, Any]) -> str:
@@ -126,20 +127,27 @@ def _sentence(names: Sequence[str]) -> str:
 
 
 def _lower(words: str) -> str:
-    return words if words.startswith(("Young", "Poisson", "Prony")) else words[:1].lower() + words[1:]
+    return (
+        words if words.startswith(("Young", "Poisson", "Prony", "Mooney", "Ogden")) else words[:1].lower() + words[1:]
+    )
 
 
 def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
     """Return a sentence on the terms of the library that the law does not have; empty if it has all of them."""
     constants = law["constants"]
-    absent = [_lower(wording(name)[0][0]) for name in settings.terms if name not in constants]
+    names = [name for name in settings.terms if name not in constants]
+    exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
+    absent = [_lower(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
+    absent += (
+        [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
+    )
     if settings.viscous and "shear_viscosity" not in constants:
         absent.append("viscosity")
     if settings.branches and not any(name.startswith("prony") for name in constants):
         absent.append("relaxing branches")
     if settings.families and not families(constants):
         absent.append("fibres")
-    return f"Terms of the library that the data did not need: {'; '.join(absent)}." if absent else ""
+    return f"Terms of the library that the data did not need: {in_a_row(absent)}." if absent else ""
 
 
 def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
@@ -169,6 +177,8 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
         fast = 1e-3 * (columns["Law"].mu + branches) if columns["Law"] is not None else 0.0
         notes.append(f"With the relaxing branches, in fast motions, the shear modulus of the law is {fast:.4g} kPa.")
     notes += ["Fibres are left out too."] if families(constants) else []
+    if "corotated" in (start.model, *(target.material.model for target in data.settings.targets.values())):
+        notes.append("Of a corotated material they are effective values: its λ counts a third at small strains.")
     return PageTable("At small strains", [*shown], rows, unbroken(" ".join(notes)))
 
 
@@ -178,7 +188,7 @@ def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> l
 
     stretches = law_figure.drawn_stretches(data.stretches)
     fibres = families(constants)
-    directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "along them": ALONG}
+    directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
     curves = {label: (stretches, uniaxial_stress(constants, stretches, d)) for label, d in directions.items()}
     modulus = small_strain(constants).youngs_modulus
     ends = "; ".join(
@@ -204,14 +214,14 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
     if not tried:
         return []
     weak = any(own.get("residual") is not None for own in tried)
-    columns = ["Constants", *(["Residual of the balance of forces"] if weak else []), "Error on validation trials"]
+    columns = ["Coefficients", *(["Residual of the balance of forces"] if weak else []), "Error on validation trials"]
     rows, chosen = [], False
     for own in tried:
         answer = not chosen and own["groups"] == law["groups"]
         chosen = chosen or answer
         words = in_a_row([_GROUPS.get(group, group) for group in own["groups"]])
         head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
-        cells = [Cell(str(sum(1 for value in own["constants"].values() if value)))]
+        cells = [Cell(str(sum(_is_coefficient(name) for name, value in own["constants"].items() if value)))]
         cells += [Cell(_share(own.get("residual")))] if weak else []
         rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], answer))
     note = (
@@ -220,6 +230,11 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
     )
     note += ", and then refined through the simulator" if weak else ""
     return [PageTable("Classes of laws", columns, rows, f"{note}.")]
+
+
+def _is_coefficient(name: str) -> bool:
+    """Whether a constant multiplies a term, unlike a relaxation time, a direction, a slack or a toe."""
+    return wording(name)[0][1] not in ("ms", "%", "°")
 
 
 def _share(value: float | None) -> str:

@@ -159,11 +159,13 @@ def material_note(material: MaterialSettings) -> str:
     if material.regions:
         return "; ".join(f"{region}: {material_note(part)}" for region, part in material.by_region.items())
     model = material.model
-    constants: dict[str, Any] = dict(make_material(model, **material.constants).constants)
+    own = make_material(model, **material.constants)
+    constants: dict[str, Any] = dict(own.constants)
     if "youngs_modulus" in constants:
         words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
     else:
-        words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
+        moduli = {name: constants[name] for name, quantity in own.quantities.items() if quantity.unit == "Pa"}
+        words = ", ".join(f"{name.replace('_', ' ')} {value / 1e3:g} kPa" for name, value in moduli.items() if value)
     return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"
 
 

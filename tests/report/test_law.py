@@ -91,7 +91,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
         "One test trial: 0.12 <kg>, outside of the training loads",
         "did not need: second-order term in I₁, Mooney-Rivlin term, ",
         "the shear modulus of the law is 108 kPa",
-        "With further elastic terms and relaxing branches40.30 %0.012 %",
+        "With elastic terms and relaxation40.30 %0.012 %",
         "Shape and volume alone (neo-Hookean)22.0 %failed",
     ):
         assert said in page.text
@@ -160,7 +160,8 @@ def test_stress_is_that_of_the_simulated_law(direction):
 
     @wp.kernel(module=module, enable_backward=False)
     def stress_of(f: wp.array[wp.mat33d], m: law_of.moduli, stress_out: wp.array[wp.mat33d]):
-        _, stress_out[wp.tid()] = law_of.response(f[wp.tid()], m)
+        _energy, stress = law_of.response(f[wp.tid()], m)
+        stress_out[wp.tid()] = stress
 
     for stretch in (0.85, 1.25):
         (found,) = uniaxial_stress(constants, np.array([stretch]), direction)

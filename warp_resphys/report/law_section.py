@@ -44,11 +44,11 @@ _NUMBERED: Final[Mapping[str, tuple[str, str, tuple[str, float]]]] = {
     "fibre_azimuth": ("Fibres {}: azimuth", "of their direction, from x towards y", _ANGLE),
     "fibre_elevation": ("Fibres {}: elevation", "of their direction, above the plane of x and y", _ANGLE),
 }
-_OGDEN: Final = "shear modulus that it adds; the larger the exponent, the more it stiffens"
+_OGDEN: Final = "shear modulus that it adds; larger exponents stiffen more"
 _GROUPS: Final[Mapping[str, str]] = {
-    "elastic": "further elastic terms",
+    "elastic": "elastic terms",
     "viscosity": "viscosity",
-    "branches": "relaxing branches",
+    "branches": "relaxation",
     "fibres": "fibres",
 }
 _OPEN: Final = 0.5  # Deviation from which on a constant is not determined, over its value.
@@ -214,7 +214,7 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
     if not tried:
         return []
     weak = any(own.get("residual") is not None for own in tried)
-    columns = ["Coefficients", *(["Residual of the balance of forces"] if weak else []), "Error on validation trials"]
+    columns = ["Coefficients", *(["Force residual"] if weak else []), "Validation error"]
     rows, chosen = [], False
     for own in tried:
         answer = not chosen and own["groups"] == law["groups"]
@@ -225,10 +225,11 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
         cells += [Cell(_share(own.get("residual")))] if weak else []
         rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], answer))
     note = (
-        "Errors are root mean squares over the amplitude of the motion. The smallest class that was close enough to "
-        "the best one was chosen"
+        "Validation errors are root mean squares over the amplitude of the motion. The smallest class that was close "
+        "enough to the best one was chosen"
     )
-    note += ", and then refined through the simulator" if weak else ""
+    if weak:
+        note += ", and refined through the simulator. The force residual is what remains in the balance of forces"
     return [PageTable("Classes of laws", columns, rows, f"{note}.")]
 
 

@@ -23,7 +23,7 @@ from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identification, Identifier
 from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
 from ..learning.replay import Replay, Start
-from ..learning.weak_form import ObservedMotion, WeakForm
+from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.body import MaterialSettings
 from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
@@ -162,11 +162,11 @@ class _LawSearch:
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], library)
 
-    def _motion(self, simulator: Simulator, names: Sequence[str]) -> ObservedMotion:
+    def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         trials = self.experiment.trials(names, simulator)
         start = self.experiment.start(Replay(simulator, self.experiment.observe, trials))
         _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self._others(simulator))
-        return ObservedMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
+        return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
     def _others(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) identified parameters that are not those of the material."""

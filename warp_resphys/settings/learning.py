@@ -132,7 +132,7 @@ class LawSettings(Settings):
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried; 0: none")
-    relaxation_times: Annotated[Many[Positive], Field(min_length=2, max_length=2)] = setting(
+    relaxation_times: Annotated[tuple[Positive, Positive], Field(strict=False)] = setting(
         (0.01, 1.0), "shortest and longest", "s"
     )
     families: Count = setting(1, "largest number of families of fibres")

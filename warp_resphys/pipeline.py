@@ -60,8 +60,9 @@ from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
-from .report.conclusions import conclusions
+from .report.conclusions import conclusions, errors_by_load
 from .report.control_section import controller_name
+from .report.data import other_trials
 from .report.page import number_text
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
@@ -191,7 +192,8 @@ def learning_stages(
         stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
 
     if run.identify is not None:
-        stages.append(Stage("identify", identify, (IDENTIFICATION,), IdentifyStage.of(run, **common)))
+        before = IdentifyStage.of(run, **common).model_copy(update={"with_law": False})
+        stages.append(Stage("identify", identify, (IDENTIFICATION,), before))
     if run.law is not None:
         given = {} if run.law.file is None else {run.law.file: digest(run.law.file)}
         of_law = IdentifyLawStage.of(run, **common)
@@ -213,7 +215,7 @@ def learning_stages(
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
         # With observed states, a network that replaces the simulator does not depend on it.
-        without = {"simulation": run.target.material, "identified": None, "law": None}
+        without = {"simulation": run.target.material, "identified": None, "with_law": False}
         trained = trained.model_copy(update=without)
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
@@ -332,13 +334,19 @@ def _run_folds(
         metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
         write_json(fold.folder / METRICS, metrics[name])
     return {
-        "errors_mm": summarise_folds([of_fold["errors_mm"] for of_fold in metrics.values()]),
+        "errors_mm": summarise_folds(_of_all([of_fold["errors_mm"] for of_fold in metrics.values()])),
         "folds": metrics,
         **intervals_of_folds(folder / DATASET, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
     }
+
+
+def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Errors of the models that all folds have: a law is used in some folds alone."""
+    shared = [model for model in folds[0] if all(model in fold for fold in folds)]
+    return [{model: fold[model] for model in shared} for fold in folds]
 
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
@@ -348,6 +356,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     columns = folds if len(folds) <= _MOST_COLUMNS else {}
     columns |= {f"first {seconds} s": errors for seconds, errors in metrics.get("horizons", {}).items()}
     columns |= {f"{scale} x": errors for scale, errors in metrics.get("scales", {}).items()}
+    columns |= {kind.lower(): errors for kind, errors in errors_by_load(metrics, other_trials(run)).items()}
     columns = {name: errors for name, errors in columns.items() if errors != whole}
     what = "vertices" if run.markers is None else "markers"
     title = f"Error of the {what} in the test trials" + "; x: times the inputs" * ("scales" in metrics)

@@ -142,6 +142,7 @@ class TestAdvice:
 
 SETTINGS = SimpleNamespace(
     name="my_robot",
+    data=None,
     identify=parse(
         IdentifySettings,
         {

@@ -1,8 +1,9 @@
 """Stage: identifies the law of the material from the training trials, and accepts it if it helps on validation trials.
 
-Where the trials give the states of all vertices, the weak form fits every class of laws (`learning.law`). With markers
-alone, classes are tried in order of size, through the simulator. In both cases the smallest class that is close to the
-best on the validation trials is refined through the simulator, with the other parameters of the identification.
+Where the trials give the states of all vertices, the weak form fits every class of laws (`learning.law`), and the
+smallest one that is close to the best on the validation trials is refined through the simulator. With markers alone,
+groups of terms are added one after the other, each time refined through the simulator, and stay in if the validation
+trials are closer. The other identified parameters are refined with the law.
 """
 
 import math
@@ -22,7 +23,7 @@ from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identification, Identifier
 from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
 from ..learning.replay import Replay, Start
-from ..learning.weak_form import ObservedMotion, WeakForm
+from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.body import MaterialSettings
 from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
@@ -33,6 +34,7 @@ from .trials import evenly
 
 _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
+_CLOSER: Final = 0.95  # ratio of validation errors below which more terms are worth while
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a refined coefficient is zero
 
 # Steps of differences, as fractions of ranges: motions without noise have narrow valleys.
@@ -94,13 +96,12 @@ class _LawSearch:
         if self.states:
             classes = self._from_states(library)
             scores = self._scores([law.constants for law in classes], self.checked)
-            chosen = self._smallest(scores)
-            best = self._refine(classes[chosen], names)
+            smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
+            best = self._refine(classes[smallest], names)
         else:
             refined = self._from_markers(library, names)
             classes, scores = [own.law for own in refined], [own.score for own in refined]
-            chosen = self._smallest(scores)
-            best = refined[chosen]
+            best = refined[-1]
         below = self._score_below()
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         uncertainty = best.found.uncertainty
@@ -120,11 +121,6 @@ class _LawSearch:
             "versions": package_versions(),
         }
         write_json(self.context.run_dir / LAW_FILE, content)
-
-    @staticmethod
-    def _smallest(scores: Sequence[float]) -> int:
-        """Returns the first of the classes that are close to the best one."""
-        return next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
 
     def _guess(self) -> dict[str, float]:
         """Returns a neo-Hookean law with the moduli and the viscosity of the identified material."""
@@ -166,11 +162,11 @@ class _LawSearch:
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], library)
 
-    def _motion(self, simulator: Simulator, names: Sequence[str]) -> ObservedMotion:
+    def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         trials = self.experiment.trials(names, simulator)
         start = self.experiment.start(Replay(simulator, self.experiment.observe, trials))
         _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self._others(simulator))
-        return ObservedMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
+        return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
     def _others(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) identified parameters that are not those of the material."""
@@ -178,20 +174,22 @@ class _LawSearch:
         return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
 
     def _from_markers(self, library: Library, names: Sequence[str]) -> list["_Refined"]:
-        """Returns classes refined through the simulator, each from the one before with further terms."""
+        """Returns the classes that were tried through the simulator, the best last; groups that help stay in."""
         groups = {
-            "elastic": dict.fromkeys(library.terms, 0.02 * self.shear),
+            "elastic": dict.fromkeys(library.terms, 0.0),
             "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),
             "fibres": _family(0.1 * self.shear) if library.families else {},
         }
         guess = {name: value for name, value in self._guess().items() if name in ("c10", "bulk_1", *VISCOSITIES)}
-        refined = [self._refine(LawClass((), guess, math.nan), names)]
+        best = self._refine(LawClass((), guess, math.nan), names)
+        tried = [best]
         for name, added in groups.items():
             if added:
-                last = refined[-1].law
-                larger = LawClass((*last.groups, name), {**last.constants, **added}, math.nan)
-                refined.append(self._refine(larger, names))
-        return refined
+                law = LawClass((*best.law.groups, name), {**best.law.constants, **added}, math.nan)
+                tried.append(self._refine(law, names))
+                if tried[-1].score < _CLOSER * best.score:
+                    best = tried[-1]
+        return [own for own in tried if own is not best] + [best]
 
     def _replays(self, simulator: Simulator, names: Sequence[str]) -> Replays:
         return self.experiment.replays(simulator, names, "sysid" if self.sysid else "simulation")

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
+from ..fem.elements import physical_gradients
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
+from ..mesh.elements import BY_NODES
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
 from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
@@ -35,6 +37,7 @@ from .files import (
     DRIVEN,
     ERRORS,
     IDENTIFICATION,
+    LAW_FILE,
     MESH_CHECK,
     METRICS,
     QUALITY,
@@ -54,6 +57,7 @@ from .files import (
 )
 
 FloatArray = NDArray[np.float64]
+_MOST_STATES = 400  # of which stretches are computed
 
 
 def make_report(context: StageContext) -> None:
@@ -67,6 +71,7 @@ def make_report(context: StageContext) -> None:
     body = build_body(run, run.payload_at)
     mesh = body.mesh
     trials, identification = read_trials(folder, run), read_if_there(folder / IDENTIFICATION)
+    law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
     learned = "resphys" in metrics["errors_mm"] and run.in_the_loop is None
@@ -82,11 +87,13 @@ def make_report(context: StageContext) -> None:
         recordings=read_recordings(folder, run, *_at_rest(mesh, trials, film)),
         notes=error_notes(metrics.get("sideways_mm", {}), truth, metrics.get("mesh_check", {})),
         identification=identification,
+        law=law,
+        stretches=read_stretches(folder, mesh, trials, film) if law else {},
         start=data_sheet(run, identification),
         truth=truth.get("material", {}),
         training=_histories(folder, False),
         refinement=_histories(folder, True),
-        network_note=network_note(run) if learned else "",
+        network_note=network_note(run, on_law=bool(law.get("accepted"))) if learned else "",
         kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
         simulator=material_note(run.simulation),
@@ -152,7 +159,12 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         for refined in (False, True)
     }
     identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
+    law = {} if run.law is None else read_if_there(folder / LAW_FILE)
+    if law:
+        law = {key: law[key] for key in ("accepted", "groups", "constants", "validation", "data")}
+        law["against"] = "sysid" if "sysid" in identified else "simulation"
     more = {
+        "law": law,
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
         "control": read_if_there(folder / CONTROL) if run.control is not None else {},
         "mesh_check": {} if run.mesh_check is None else read_if_there(folder / MESH_CHECK),
@@ -221,6 +233,33 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         time_step=dataset.time_step,
         **_seen(run, dataset),
     )
+
+
+def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | None) -> dict[str, tuple[float, float]]:
+    """Least and largest principal stretch at the centres of the cells, in training and in test trials.
+
+    Where markers are observed, it is that of the body of the film, which is simulated.
+    """
+    trained = read_if_there(folder / LAW_FILE).get("data", {}).get("trials", ())
+    if trials.labels:
+        bodies = {} if film is None else {f"the trial {film.trial}": next(reversed([*film.positions.values()]))}
+    else:
+        dataset = read_dataset(common_folder(folder) / DATASET)
+        bodies = {"all trials": dataset.observed[dataset.rows([*trials.names, *trained])]}
+        bodies |= {"the training": dataset.observed[dataset.rows(trained)]} if trained else {}
+    return {name: _stretch_range(mesh, q.reshape(-1, *q.shape[-2:])) for name, q in bodies.items()}
+
+
+def _stretch_range(mesh: Mesh, positions: FloatArray) -> tuple[float, float]:
+    """Least and largest principal stretch at the centres of the cells of some states (S, N, 3) [m]."""
+    element = BY_NODES[mesh.cells.shape[1]]
+    centre = element.shape.nodes[: element.nodes - len(element.parents)].mean(axis=0)
+    gradients, _ = physical_gradients(mesh.vertices, mesh.cells, element.shape(centre[None])[1])
+    chosen = positions[:: max(1, len(positions) // _MOST_STATES)]
+    deformation = np.einsum("scki,ckj->scij", chosen[:, mesh.cells], gradients[:, 0])
+    finite = deformation[np.isfinite(deformation).all((-2, -1))]
+    values = np.linalg.svd(finite, compute_uv=False)
+    return float(values.min()), float(values.max())
 
 
 def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class Library:
         families: largest number of families of fibres.
     """
 
-    terms: tuple[str, ...] = ("c20", "c01", "c02", "dilation", "ogden_3", "ogden_4", "ogden_6")
+    terms: tuple[str, ...] = ("c20", "c01", "dilation", "ogden_3", "ogden_6")
     viscous: bool = True
     times: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 13).tolist())
     families: int = 1

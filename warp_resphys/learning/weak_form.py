@@ -34,7 +34,7 @@ _RIDGE = 1e-14  # of the trace, where columns are dependent
 
 
 @dataclass(frozen=True)
-class ObservedMotion:
+class KnownMotion:
     """B observed motions with the same number of steps T."""
 
     q: torch.Tensor  # (T + 1, B, N, 3) positions of all vertices at the steps [m]
@@ -65,7 +65,7 @@ class WeakForm:
     def __init__(
         self,
         simulator: Simulator,
-        motions: Sequence[ObservedMotion],
+        motions: Sequence[KnownMotion],
         zero: Candidate,
         stiffness: Candidate,
         stride: int = 5,
@@ -85,7 +85,7 @@ class WeakForm:
         """Returns H^-1 a_k (R, K) of K candidates [m]; rows run over steps, motions and free coordinates."""
         return self._rows([self._zero, *candidates])[:, 1:] + self.target[:, None]
 
-    def _along(self, motion: ObservedMotion) -> "list[State]":
+    def _along(self, motion: KnownMotion) -> "list[State]":
         """Returns the states at the start of every step, without memory."""
         method, step = self._simulator.method, self._simulator.time_step
         states = [State(motion.q[0], motion.v)]
@@ -104,9 +104,7 @@ class WeakForm:
             parts.append(np.concatenate([self._of_motion(motion, states, chunk) for chunk in chunks], axis=1))
         return np.concatenate(parts)
 
-    def _of_motion(
-        self, motion: ObservedMotion, states: Sequence[State], candidates: Sequence[Candidate]
-    ) -> FloatArray:
+    def _of_motion(self, motion: KnownMotion, states: Sequence[State], candidates: Sequence[Candidate]) -> FloatArray:
         simulator, count = self._simulator, len(candidates)
         batch = motion.q.shape[1]
         names = set().union(*candidates)

@@ -10,7 +10,9 @@ from typing import Any, Final
 from ..learning.metrics import Gain, PublishedError, paired_gain, published_errors
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .page import MINUS
+from .data import other_trials
+from .notes import in_a_row
+from .page import MINUS, MOST_PERCENT, number_text, significant
 
 # By model: its name in sentences, and the models that it may extend, of which the first available one is compared.
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
@@ -26,6 +28,8 @@ _GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # Keys of 
 _LEARNED: Final = ("simfree", "resphys")  # With published gains; the published identification has other parameters.
 _CLOSE: Final = 1e-4  # Distance from a bound or the first guess that counts as none, over a parameter's range.
 _REFINED: Final = "_refined"  # Suffix of a network refined through the simulator.
+INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
+_TINY: Final = 1e-4  # Errors [mm] below which Python writes an exponent.
 _CALIBRATED: Final[Mapping[str, str]] = {  # Source of prediction intervals.
     "validation": "its errors on the validation trials",
     "training": "its errors on the training trials, which tend to be too small",
@@ -48,10 +52,82 @@ class Identified:
 def conclusions(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
     """Return sentences on a run, from metrics.json of a split or of folds, and its settings."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
-    rows = held_out(metrics)
-    errors = {model: [row.get(model) for row in rows] for model in (rows[0] if rows else ())}
-    sentences = gains(errors, epochs_kept(metrics), published_errors(settings.name))
-    return sentences + intervals_text(metrics) + advice([_identified(fold, settings.identify) for fold in folds])
+    inside, outside = _errors_by_load(metrics, other_trials(settings))
+    sentences = gains(
+        inside or outside, epochs_kept(metrics), published_errors(settings.name), outside if inside else {}
+    )
+    sentences = laws_unused(folds) + sentences + intervals_text(metrics)
+    return sentences + advice([_identified(fold, settings.identify) for fold in folds])
+
+
+def laws_unused(folds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence on identified laws that are not used; none if all are used, or there are none."""
+    laws = [fold["law"] for fold in folds if fold.get("law")]
+    unused = [law for law in laws if not law["accepted"]]
+    if not unused:
+        return []
+    if len(folds) == 1:
+        return [law_text(unused[0])]
+    return [
+        f"In {len(unused)} of {len(folds)} folds the identified law of the material is not used, as it does not reduce "
+        "the error on the validation trials."
+    ]
+
+
+def law_text(law: Mapping[str, Any]) -> str:
+    """Return a sentence on whether the identified law is used, and why.
+
+    Args:
+        law: From metrics.json, with `accepted`, `validation` and the model `against` which it was tested.
+    """
+    checked = law["validation"]
+    trials = checked["trials"]
+    kind = "training" if set(trials) <= set(law.get("data", {}).get("trials", ())) else "validation"
+    where = f"{kind} trial{'s' if len(trials) > 1 else ''} {in_a_row(trials)}"
+    base = _BASES[law.get("against", "simulation")]
+    own, below = (_of_amplitude(checked[key]) for key in ("law", "below"))
+    verdict = "is used" if law["accepted"] else "is not used, and no model builds on it"
+    return (
+        f"The identified law of the material {verdict}: on the {where}, its root mean square error is {own} of the "
+        f"motion's amplitude, and that of {base} is {below}."
+    )
+
+
+def _of_amplitude(value: float | None) -> str:
+    return "not defined, as a roll-out failed," if value is None else f"{significant(100.0 * value)} %"
+
+
+def errors_by_load(metrics: Mapping[str, Any], others: Collection[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return summaries of the errors by kind of load and model; empty if there are no two kinds.
+
+    The means are over trials, and have no deviations.
+
+    Args:
+        metrics: Of a split.
+        others: Names of the test trials outside of the training loads.
+    """
+    groups = dict(zip((INSIDE, OUTSIDE), _errors_by_load(metrics, others), strict=True))
+    if not all(groups.values()):
+        return {}
+    return {kind: {model: _summary(values) for model, values in errors.items()} for kind, errors in groups.items()}
+
+
+def _summary(values: Sequence[float | None]) -> dict[str, Any]:
+    finite = [value for value in values if value is not None]
+    lost = len(values) - len(finite)
+    return {"mean": None if lost else fmean(finite), "std": None, "trajectories": len(values), "diverged": lost}
+
+
+def _errors_by_load(
+    metrics: Mapping[str, Any], others: Collection[str]
+) -> tuple[dict[str, list[float | None]], dict[str, list[float | None]]]:
+    """Errors of the models that all folds have [mm], by model: with loads as in training, and with other loads."""
+    folds = list(metrics.get("folds", {}).values()) or [metrics]
+    rows = [row for fold in folds for row in fold.get("per_trajectory", ())]
+    models = [model for model in (rows[0]["errors_mm"] if rows else ()) if all(model in r["errors_mm"] for r in rows)]
+    kinds = ([row for row in rows if (row["name"] in others) is outside] for outside in (False, True))
+    inside, outside = ({m: [row["errors_mm"][m] for row in own] for m in models} if own else {} for own in kinds)
+    return inside, outside
 
 
 def held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
@@ -63,7 +139,7 @@ def held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
 def intervals_text(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on half-width and coverage of the prediction intervals of the best model."""
     intervals = metrics.get("intervals") or {}
-    for model, name in (("resphys", "ResPhys"), ("sysid", "SysID")):
+    for model, name in (("resphys", "ResPhys"), ("law", "the law"), ("sysid", "SysID")):
         if (of_model := intervals.get("models", {}).get(model)) is not None:
             return [
                 f"Prediction intervals of {name}, from {_CALIBRATED[intervals['calibrated_on']]}: "
@@ -101,6 +177,7 @@ def gains(
     errors: Mapping[str, Sequence[float | None]],
     epochs: Mapping[str, Sequence[int]],
     published: Mapping[str, PublishedError] | None = None,
+    outside: Mapping[str, Sequence[float | None]] | None = None,
 ) -> list[str]:
     """Return a sentence on each step: its gain on held-out trials, and whether it is significant.
 
@@ -111,6 +188,7 @@ def gains(
         errors: Of each model on the same held-out trials [mm], None where its roll-out diverged.
         epochs: Kept by the learned models, in each fold.
         published: Published errors [mm]; the gains of learned models are compared with theirs.
+        outside: Of each model on the same trials outside of the training loads [mm], if there are any.
     """
     sentences, theirs = [], published or {}
     for model, (name, bases) in _STEPS.items():
@@ -122,7 +200,10 @@ def gains(
         if compared:
             ratio = theirs[model].mean / theirs[base].mean
             beside = f"; published: {100.0 * abs(1.0 - ratio):.1f} % {'less' if ratio <= 1.0 else 'more'}"
-        sentence = _gain(name, _BASES[base], errors[model], errors[base], list(epochs.get(model, ())), beside)
+        kept = list(epochs.get(model, ()))
+        sentence = _gain(name, _BASES[base], errors[model], errors[base], kept, beside)
+        if outside and not (kept and not any(kept)):
+            sentence += _gain_outside(_BASES[base], outside[model], outside[base])
         sentences.append(sentence[0].upper() + sentence[1:])
     if sentences and all(len(values) == 1 for values in errors.values()):
         sentences.append("These gains rest on one held-out trial, and others may differ: test on more.")
@@ -145,21 +226,53 @@ def _gain(
     pairs = [(a, b) for a, b in zip(after, before, strict=True) if a is not None and b]
     if len(pairs) < len(before):
         return f"{name} cannot be compared with {base}, which diverged or has no error on held-out trials.{idle}"
+    gain, means = _gain_and_means(pairs, published)
+    many = f" on {gain.trials} trials" if gain.trials > 1 else ""
+    return f"{name} {_compared(gain, base)}{many} ({means}){_outcome(gain)}.{idle}"
+
+
+def _gain_outside(base: str, after: Sequence[float | None], before: Sequence[float | None]) -> str:
+    """A sentence on the gain outside of the training loads, after the one on trials with loads as in training."""
+    count = len(after)
+    where = f" On {count} trial{'s' if count > 1 else ''} outside of the training loads"
+    pairs = [(a, b) for a, b in zip(after, before, strict=True) if a is not None and b]
+    if lost := sum(error is None for error in after):
+        return f"{where}, {lost} of {count} roll-outs diverged."
+    if len(pairs) < count:
+        return f"{where}, it cannot be compared with {base}."
+    gain, means = _gain_and_means(pairs)
+    return f"{where} it {_compared(gain, base)} ({means}){_outcome(gain)}."
+
+
+def _gain_and_means(pairs: Sequence[tuple[float, float]], published: str = "") -> tuple[Gain, str]:
     gain = paired_gain([b for _, b in pairs], [a for a, _ in pairs])
-    means = f"mean {fmean(b for _, b in pairs):.3g} to {fmean(a for a, _ in pairs):.3g} mm{published}"
-    which = "less" if gain.share >= 0.0 else "more"
-    text = f"{name} leaves {_percent(gain)} {which} error than {base}"
+    return gain, f"mean {_short(fmean(b for _, b in pairs))} to {_short(fmean(a for a, _ in pairs))} mm{published}"
+
+
+def _short(value: float) -> str:
+    """A number with three digits; a very small one with a power of ten."""
+    return number_text(value) if 0.0 < value < _TINY else f"{value:.3g}"
+
+
+def _compared(gain: Gain, base: str) -> str:
+    """The size of a gain or loss; a loss of more than 1000 % is written as a multiple."""
+    if gain.share < -MOST_PERCENT:
+        mean, low, high = (f"{float(f'{1.0 - x:.2g}'):,.0f}" for x in (gain.share, gain.upper, gain.lower))
+        return f"has {mean} times{f' (90 %: {low} to {high})' if gain.trials > 1 else ''} the error of {base}"
+    return f"leaves {_percent(gain)} {'less' if gain.share >= 0.0 else 'more'} error than {base}"
+
+
+def _outcome(gain: Gain) -> str:
     if gain.trials == 1:
-        return f"{text} ({means}).{idle}"
-    text += f" on {gain.trials} trials ({means}): "
+        return ""
     if gain.lower <= 0.0 <= gain.upper:
-        return f"{text}other trials may show the opposite.{idle}"
-    return f"{text}it {'helps' if gain.share > 0.0 else 'does harm'}.{idle}"
+        return ": other trials may show the opposite"
+    return f": it {'helps' if gain.share > 0.0 else 'does harm'}"
 
 
 def _percent(gain: Gain) -> str:
     """The size of a gain or loss, with its 90 % interval over draws of the trials."""
-    digits = 2 if 0.99 < gain.share < 1.0 else 0
+    digits = max(2, math.floor(-math.log10(1.0 - gain.share)) - 1) if 0.99 < gain.share < 1.0 else 0
     ends = (gain.lower, gain.upper) if gain.share >= 0.0 else (-gain.upper, -gain.lower)
     interval = " to ".join(f"{100.0 * end:.{digits}f}".replace("-", MINUS) for end in ends)
     return f"{100.0 * abs(gain.share):.{digits}f} %" + (f" (90 %: {interval})" if gain.trials > 1 else "")

@@ -87,7 +87,7 @@ def _table(tracking: Mapping[str, Any]) -> PageTable:
 
 def compared_controllers(control: ControlSettings) -> list[str]:
     """Returns the names of the controllers that are drawn."""
-    models = [model for model in control.models if model in ("sysid", control.models[-1])]
+    models = [model for model in control.models if model in ("sysid", "law", control.models[-1])]
     return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control.receding[-1:])]
 
 

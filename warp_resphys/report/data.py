@@ -12,6 +12,7 @@ from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
 from ..settings.run import RunSettings
+from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
@@ -135,6 +136,8 @@ class RunReport:
     driven: Driven | None = None  # Inputs of all trials.
     recordings: Recordings | None = None  # Quality and registration of all trials.
     identification: Mapping[str, Any] = field(default_factory=dict)  # Content of `identification.json`.
+    law: Mapping[str, Any] = field(default_factory=dict)  # Content of `law.json`.
+    stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
     truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
@@ -164,9 +167,19 @@ class RunReport:
         return self.trials is None or bool(self.trials.labels)
 
     @property
+    def others(self) -> tuple[str, ...]:
+        """Names of the test trials outside of the training loads."""
+        return other_trials(self.settings)
+
+    @property
     def models(self) -> list[str]:
         """Models with errors, in the order of the tables."""
         return [model for model in MODELS if model in self.metrics["errors_mm"]]
+
+
+def other_trials(settings: RunSettings) -> tuple[str, ...]:
+    """Return the names of the test trials outside of the training loads; empty for most experiments."""
+    return tuple(settings.data.others) if isinstance(settings.data, ReleaseFromLoad) else ()
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
@@ -199,7 +212,9 @@ def best_and_worst(trials: TrialResults) -> list[int]:
 def shown_models(positions: Mapping[str, Any]) -> list[str]:
     """Return the models that are drawn as bodies: the uncorrected one, then the best available one."""
     plain = next((m for m in ("simulation", "published") if m in positions), None)
-    solid = next((m for m in ("resphys", "resphys_uncorrected", "sysid", "sysid_elastic") if m in positions), None)
+    solid = next(
+        (m for m in ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic") if m in positions), None
+    )
     return [m for m in (plain, solid) if m is not None]
 
 

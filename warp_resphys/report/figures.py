@@ -6,7 +6,7 @@ Every figure exists in two widths, for a page and, with `narrow`, for a phone. I
 import io
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -59,6 +59,7 @@ ROUND_STEPS: Final = (1, 2, 5, 10)  # Distances of ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
 NARROW: Final = 3.7  # [in]
+_BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
 _DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
@@ -107,6 +108,7 @@ def error_over_time(
     *,
     of: str = "vertex",
     window: float | None = None,
+    panels: Mapping[str, Sequence[int]] | None = None,
     narrow: bool,
 ) -> Figure:
     """Draw each model's mean error over time and, for the main models, the range of the trials.
@@ -118,10 +120,36 @@ def error_over_time(
         of: What is observed: "vertex" or "marker".
         window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
             unfiltered one as a thin line. None for no filter.
-        narrow: Whether the figure is for a narrow page.
+        panels: Rows of trials by title, with a panel for each; without any, one panel has all trials.
+        narrow: Whether the figure is for a narrow page; panels are then stacked.
     """
-    figure = new_figure(3.5, 3.9, narrow=narrow)
-    axes, lowest = figure.subplots(), []
+    groups: dict[str, Any] = {**panels} if panels else {"": slice(None)}
+    figure = new_figure(3.5, 1.2 + 2.7 * len(groups), narrow=narrow)
+    shape = (len(groups), 1) if narrow else (1, len(groups))
+    every = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    lowest: list[float] = []
+    for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
+        lowest += _error_lines(axes, {model: own[rows] for model, own in errors.items()}, times, window)
+        for model, error in (published or {}).items():
+            axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
+        axes.set_title(title)
+    if len(groups) > 1:
+        figure.set_layout_engine("constrained", wspace=_BETWEEN)
+    for axes in every.flat:  # Once everything is drawn, as they share their axis.
+        use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
+    for axes in every[-1]:
+        axes.set_xlabel("time [s]")
+    for axes in every[:, 0]:
+        axes.set_ylabel(f"mean {of} error [mm]")
+    legend_above(figure, every[0, 0], narrow=narrow)
+    return figure
+
+
+def _error_lines(
+    axes: Axes, errors: Mapping[str, FloatArray], times: FloatArray | float, window: float | None
+) -> list[float]:
+    """Draws the errors of some trials; returns the lowest filtered error of each model."""
+    lowest: list[float] = []
     for model, rows in errors.items():
         time = times if isinstance(times, np.ndarray) else times * np.arange(rows.shape[1])
         mean, line = mean_of_trials(rows), model_line(model)
@@ -136,12 +164,7 @@ def error_over_time(
             axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
         axes.plot(time, shown, **line)
         axes.set_xlim(0.0, time[-1])
-    for model, error in (published or {}).items():
-        axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
-    use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
-    axes.set(xlabel="time [s]", ylabel=f"mean {of} error [mm]")
-    legend_above(figure, axes, narrow=narrow)
-    return figure
+    return lowest
 
 
 def mean_of_trials(rows: FloatArray) -> FloatArray:

@@ -115,18 +115,18 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
     deviations = (identified.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in identified["parameters"].items():
-        words, unit, factor = _wording(parameter)
+        words, unit, factor = parameter_wording(parameter)
         deviation = deviations.get(parameter)
         beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
-        cells = [Cell(_digits(start.get(parameter), factor)), Cell(_digits(value, factor, deviation), beside=beside)]
-        cells += [Cell(_digits(truth.get(parameter), factor))] if truth else []
+        cells = [Cell(digits(start.get(parameter), factor)), Cell(digits(value, factor, deviation), beside=beside)]
+        cells += [Cell(digits(truth.get(parameter), factor))] if truth else []
         cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
         rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
     return rows
 
 
-def _wording(parameter: str) -> Wording:
-    """Name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
+def parameter_wording(parameter: str) -> Wording:
+    """Return name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
     if command := re.fullmatch(r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise)", parameter):
         (kind, unit, factor), words = _COMMANDS[command[2]], command[1]
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
@@ -143,8 +143,8 @@ def _wording(parameter: str) -> Wording:
     return _PARAMETERS.get(parameter, (parameter, "", 1.0))
 
 
-def _digits(value: float | None, factor: float, deviation: float | None = None) -> str:
-    """A value in its unit, with two digits of its standard deviation, or with four digits without one."""
+def digits(value: float | None, factor: float, deviation: float | None = None) -> str:
+    """Return a value in its unit, with two digits of its standard deviation, or with four digits without one."""
     if value is None:
         return NONE
     if not deviation:
@@ -183,7 +183,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     if not uncertainty:
         return ""
     names = list(identified["parameters"])
-    words = {parameter: _wording(parameter)[0] for parameter in names}
+    words = {parameter: parameter_wording(parameter)[0] for parameter in names}
     words = {p: w if w.startswith(("Young", "Poisson", "Prony")) else w[0].lower() + w[1:] for p, w in words.items()}
     largest = max(abs(weight) for weight in uncertainty["poorest"].values())
     along = [words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest]
@@ -201,7 +201,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     for parameter, deviation in uncertainty["deviation"].items():
         prior = ranges[parameter].prior if parameter in ranges else None
         if prior is not None and deviation > _UNINFORMED * prior.deviation:
-            _, unit, factor = _wording(parameter)
-            where = f"{_digits(prior.mean, factor)} ± {_digits(prior.deviation, factor)} {unit}".rstrip()
+            _, unit, factor = parameter_wording(parameter)
+            where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
             text += f" They add almost nothing about {words[parameter]}: it stays at its prior, {where}."
     return text.replace(" %", f"{NO_BREAK_SPACE}%")

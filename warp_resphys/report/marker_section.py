@@ -21,12 +21,8 @@ from .data import (
 )
 from .page import Canvas, Drawn, Part
 
-_DRAWN: Final = (
-    "simulation",
-    "sysid",
-    "simfree",
-    "resphys",
-)  # Models whose coordinates are drawn, as more would overlap.
+# Models whose coordinates are drawn, as more would overlap.
+_DRAWN: Final = ("simulation", "sysid", "law", "simfree", "resphys")
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # Of a path in space, where longer ones overlap.
@@ -104,7 +100,8 @@ def _paths(
 def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
     """Half-widths (T, M) [m] of the prediction intervals of some markers, of the last model with intervals."""
     intervals = data.metrics.get("intervals", {}).get("models", {})
-    model = next((m for m in ("resphys", "sysid") if "factor" in intervals.get(m, {}) and m in trials.positions), None)
+    named = (m for m in ("resphys", "law", "sysid") if "factor" in intervals.get(m, {}) and m in trials.positions)
+    model = next(named, None)
     if model is None:
         return {}
     widths = Intervals.from_plain(intervals[model]).half_widths(trials.positions[model][row], trials.bound)
@@ -155,7 +152,7 @@ def _space(data: RunReport, trials: TrialResults, row: int, canvas: Canvas) -> D
 
     name = trials.names[row]
     times, seen, paths = _tip_paths(data, trials, row, _SPACE_SECONDS)
-    last = [m for m in ("sysid", "resphys") if m in paths] or list(paths)[-1:]
+    last = [m for m in ("sysid", "law", "resphys") if m in paths] or list(paths)[-1:]
     return canvas.figure(
         "space",
         partial(motion_figures.tip_in_space, times, seen, {m: paths[m] for m in last}),

@@ -126,7 +126,8 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks += _in_space(data, name)
     same = "The same trial" if blocks else f"The trial {name}"
     blocks += canvas.attempt("motion.png", lambda _: _instants_figure(data, motion, same, colours, canvas))
-    return Part("The motion" if data.sees_markers else f"One test trial: {name}", blocks)
+    where = ", outside of the training loads" if name in data.others else ""
+    return Part("The motion" if data.sees_markers else f"One test trial: {name}{where}", blocks)
 
 
 def _in_space(data: RunReport, name: str) -> list[Block]:

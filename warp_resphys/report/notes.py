@@ -3,10 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
+import torch
+
 from ..energies.materials import make_material
 from ..settings.body import MaterialSettings, TargetSettings
 from ..settings.run import RunSettings
 from .page import number_text
+from .uniaxial import SmallStrain, small_strain
 
 _SELECTED_BY: Final = {"rollout": "roll-out error", "validation_loss": "validation loss"}
 _PUBLISHED_NETWORK: Final = {"kind": "nodal", "blocks": 5, "layers": 3, "width": 512, "activation": "normalised_elu"}
@@ -101,8 +105,13 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_ch
     ]
 
 
-def network_note(settings: RunSettings) -> str:
-    """Returns the network of the residual force and its training, and whether these are the published ones."""
+def network_note(settings: RunSettings, on_law: bool = False) -> str:
+    """Returns the network of the residual force and its training, and whether these are the published ones.
+
+    Args:
+        settings: Of the run.
+        on_law: Whether the force corrects the simulator with the identified law.
+    """
     network, trainer = settings.network, settings.trainer
     who = "the published network" if dict(network).items() >= _PUBLISHED_NETWORK.items() else "our network"
     basis = "force, positions and velocities of every vertex"
@@ -120,6 +129,8 @@ def network_note(settings: RunSettings) -> str:
     )
     if settings.refinement is not None:
         text += f" Then refined through the simulator, over windows of {settings.refinement.window} steps."
+    if on_law:
+        text += " It corrects the simulator with the identified law, and fades out outside its training range."
     return text
 
 
@@ -148,12 +159,26 @@ def material_note(material: MaterialSettings) -> str:
     if material.regions:
         return "; ".join(f"{region}: {material_note(part)}" for region, part in material.by_region.items())
     model = material.model
-    constants: dict[str, Any] = dict(make_material(model, **material.constants).constants)
+    own = make_material(model, **material.constants)
+    constants: dict[str, Any] = dict(own.constants)
     if "youngs_modulus" in constants:
         words = f"E {constants['youngs_modulus'] / 1e3:g} kPa, ν {constants['poissons_ratio']:g}"  # noqa: RUF001
     else:
-        words = ", ".join(f"{name.replace('_', ' ')} {constants[name] / 1e3:g} kPa" for name in [*constants][:-3])
+        moduli = {name: constants[name] for name, quantity in own.quantities.items() if quantity.unit == "Pa"}
+        words = ", ".join(f"{name.replace('_', ' ')} {value / 1e3:g} kPa" for name, value in moduli.items() if value)
     return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"
+
+
+def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
+    """Return the moduli of a material at small strains; None for one with regions."""
+    if material.regions:
+        return None
+    if material.model == "law":
+        return small_strain(material.constants)
+    own = make_material(material.model, **material.constants)
+    tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in own.constants.items()}
+    mu, lame = np.asarray(own.law.LAME).T @ [float(modulus) for modulus in own.moduli(tensors)]
+    return SmallStrain(float(mu), float(lame))
 
 
 def target_note(settings: RunSettings) -> str:

@@ -30,6 +30,7 @@ _LOG = logging.getLogger(__name__)
 NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
+MOST_PERCENT = 10.0  # Relative change above which a multiple is written in place of a percentage.
 _MOST_DECIMALS = 6  # Numbers that need more are written with a power of ten.
 
 
@@ -343,7 +344,14 @@ def data_address(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
+def significant(value: float, digits: int = 2) -> str:
+    """Return a number with some significant digits, without an exponent."""
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0}f}"
+
+
 def percent_text(ratio: float, decimals: int = 0) -> str:
-    """Return a ratio as a percentage with its sign."""
+    """Return a relative change as a percentage with its sign; one above 1000 % as a multiple, such as "12 times"."""
+    if ratio > MOST_PERCENT:
+        return f"{1.0 + ratio:,.0f} times"
     text = f"{100.0 * ratio:+.{decimals}f}"
     return f"{text.replace('-', MINUS) if float(text) else '0'} %"

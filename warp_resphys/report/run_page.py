@@ -10,10 +10,11 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from .conclusions import best, conclusions, epochs_kept, untrained
+from .conclusions import OUTSIDE, best, conclusions, epochs_kept, errors_by_load, untrained
 from .control_section import control_section
-from .data import MODELS, RunReport
+from .data import MODELS, RunReport, TrialResults
 from .identification_section import identification_section
+from .law_section import law_section
 from .marker_section import paths_section
 from .motion_sections import body_section, motion_section, start_drawing
 from .notes import differences, in_a_row
@@ -126,16 +127,21 @@ def _errors_table(data: RunReport) -> PageTable:
     idle = untrained(epochs_kept(data.metrics))
     published = published_beside(data.published, models)
     base, shares = against(errors) if data.sees_markers else ("", {})
-    columns = ["This run", *([f"Against {MODELS[base][0]}"] if base else []), *(["Published"] if published else [])]
-    rows = []
+    by_load = errors_by_load(data.metrics, data.others)
+    columns = ["All test trials", *by_load] if by_load else ["This run"]
+    columns += [*([f"Against {MODELS[base][0]}"] if base else []), *(["Published"] if published else [])]
+    rows: list[Row] = []
     for model, (name, meaning) in MODELS.items():
         if model not in errors and model not in published:
             continue
         if model in idle:
             meaning = "no force: no epoch of its training was kept"
+        elif model == "resphys" and "law" in errors:
+            meaning = "the learned force on the simulator with the identified law"
         elif model == "resphys" and "sysid" in errors:
             meaning = "the learned force on the identified simulator"
         cells = [_pair(error_parts(errors[model])) if model in errors else Cell(NONE)]
+        cells += [_pair(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
         cells += [Cell(shares.get(model, NONE))] if base else []
         cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
         rows.append(Row(name, cells, model == best(errors, idle), meaning))
@@ -185,6 +191,8 @@ def _what_is_measured(data: RunReport) -> str:
     reconstructed = data.metrics.get("reconstruction", {})
     learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]
     published = [data.published_note] if data.published else []
+    if data.others:
+        learned.append(f"{OUTSIDE}: {', '.join(data.others)}. No training trial was held like that.")
     return unbroken(" ".join([text, *data.notes, *learned, *published]))
 
 
@@ -223,6 +231,8 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
         count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
         never = " never" * (len(trials) == 1 and not first)
         text = f"{MODELS[model][0]}: {count}{never} left the training range{_when(first)}."
+        if model == "resphys" and first and "law" in metrics.get("errors_mm", {}):
+            text += " There the learned force fades out, and the law remains."
         scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]
         left = {scale: beyond[scale][model]["first_s"] for scale in scales}
         if any(left.values()):
@@ -236,6 +246,8 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
 def _when(first: Mapping[str, float]) -> str:
     if not first:
         return ""
+    if not any(first.values()):
+        return f", from the start ({', '.join(first)})"
     earliest = min(first, key=lambda trial: first[trial])
     return f", the first after {first[earliest]:.2f} s ({earliest})"
 
@@ -252,18 +264,29 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         times = np.nanmean(trials.times, axis=0)
         window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
         of = "marker" if data.sees_markers else "vertex"
-        draw = partial(figures.error_over_time, trials.errors_mm, times, of=of, window=window)
+        panels = _panels(data, trials)
+        draw = partial(figures.error_over_time, trials.errors_mm, times, of=of, window=window, panels=panels)
         reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
     if len(rows) > 1:
-        blocks.append(model_table("Each trial [mm]", _numbers(rows)))
+        small = dict.fromkeys(data.others, OUTSIDE.lower())
+        blocks.append(model_table("Each trial [mm]", _numbers(rows), small=small))
     if by_model := metrics.get("per_marker"):
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", _numbers(by_label)))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
+
+
+def _panels(data: RunReport, trials: TrialResults) -> dict[str, list[int]]:
+    """Rows of the test trials by kind of load; empty if there are no two kinds."""
+    kinds = errors_by_load(data.metrics, data.others)
+    named = {
+        kind: [row for row, n in enumerate(trials.names) if (n in data.others) is (kind == OUTSIDE)] for kind in kinds
+    }
+    return {f"{kind} ({_count(len(rows), 'trial')})": rows for kind, rows in named.items()}
 
 
 def _error_caption(data: RunReport, window: float | None) -> str:
@@ -273,7 +296,8 @@ def _error_caption(data: RunReport, window: float | None) -> str:
         text += f" and {_count(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
         text += largest_filtered(data.metrics)
     elif count > 1:
-        text += f": the line is the mean of the {count} test trials, the band"
+        parted = bool(errors_by_load(data.metrics, data.others))
+        text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
         text += " of a solid line" if data.sees_markers else ""
         text += " spans the smallest to the largest of them."
     else:
@@ -315,6 +339,7 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     body_section,
     reconstruction_section,
     identification_section,
+    law_section,
     registration_section,
     quality_section,
     training_section,

@@ -34,8 +34,8 @@ _TRAINED: Final = {
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """Return the model with which others are compared, and their errors relative to its error, in per cent."""
-    base = next((m for m in ("sysid_elastic", "sysid") if m in errors and errors[m]["mean"]), "")
+    """Return the model with which others are compared, and their errors relative to its error."""
+    base = next((m for m in ("sysid_elastic", "sysid", "law") if m in errors and errors[m]["mean"]), "")
     if not base:
         return "", {}
     means = {m: summary["mean"] for m, summary in errors.items() if summary["mean"] is not None}
@@ -44,12 +44,19 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 
 def model_table(
-    head: str, rows: Mapping[str, Mapping[str, Cell]], note: str = "", pages: Mapping[str, str] | None = None
+    head: str,
+    rows: Mapping[str, Mapping[str, Cell]],
+    note: str = "",
+    pages: Mapping[str, str] | None = None,
+    small: Mapping[str, str] | None = None,
 ) -> PageTable:
-    """Return a table of cells by row and model; `pages` are the links of rows."""
+    """Return a table of cells by row and model; `pages` are the links of rows, `small` is printed below their heads."""
     models = [model for model in MODELS if any(model in row for row in rows.values())]
-    addresses = pages or {}
-    body = [Row(n, [r.get(m, Cell(NONE)) for m in models], address=addresses.get(n, "")) for n, r in rows.items()]
+    addresses, below = pages or {}, small or {}
+    body = [
+        Row(n, [r.get(m, Cell(NONE)) for m in models], small=below.get(n, ""), address=addresses.get(n, ""))
+        for n, r in rows.items()
+    ]
     return PageTable(head, [MODELS[model][0] for model in models], body, note)
 
 

@@ -7,9 +7,10 @@ from typing import Any
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from ..settings.run import RunSettings
-from .conclusions import epochs_kept, untrained
+from .conclusions import INSIDE, OUTSIDE, epochs_kept, errors_by_load, untrained
 from .data import MODELS, RunReport
-from .page import NO_BREAK_SPACE, mm_text, published_parts
+from .notes import in_a_row
+from .page import MOST_PERCENT, NO_BREAK_SPACE, mm_text, published_parts
 
 
 def verdict(data: RunReport) -> str:
@@ -17,8 +18,11 @@ def verdict(data: RunReport) -> str:
     metrics = data.metrics
     without = untrained(epochs_kept(metrics))
     errors = {model: summary for model, summary in metrics["errors_mm"].items() if model not in without}
+    by_load = errors_by_load(metrics, data.others)
     if not data.sees_markers:
-        sentences = [vertex_verdict(metrics["errors_mm"], data.published, data.simulator, data.target)]
+        shown = by_load.get(INSIDE, metrics["errors_mm"])
+        sentences = [vertex_verdict(shown, data.published, data.simulator, data.target)]
+        sentences.append(outside_text(by_load.get(OUTSIDE, {}), data.others))
     else:
         trials = tuple(data.pages) if data.trials is None else data.trials.names
         parted = learned_in_part(data.settings, trials)
@@ -75,13 +79,42 @@ def vertex_verdict(
             "without."
         )
     else:
+        who = "identified law and the learned force on it bring" if "law" in errors else "learned residual force brings"
         text = (
-            f"The learned residual force brings the simulator ({simulator}) {_closer(before, after)} to its target "
+            f"The {who} the simulator ({simulator}) {_closer(before, after)} to its target "
             f"({target}): on {trials} held out from training, the mean vertex error falls from {old} to {new}."
         )
+    between = [(name, errors[model]) for model, name in (("sysid", "SysID"), ("law", "the law")) if model in errors]
+    if between:
+        text += f" It is {' and '.join(f'{_mean_of(own)} with {name} alone' for name, own in between)}."
     if "resphys" in published:
         text += f" The published result is {published_parts(published['resphys'])[0]} mm."
     return text
+
+
+def outside_text(errors: Mapping[str, Any], trials: Collection[str]) -> str:
+    """Return a sentence on the errors of the models outside of the training loads; empty without such trials."""
+    shown = [m for m in ("simulation", "sysid", "law", "simfree", "resphys") if m in errors]
+    if not shown:
+        return ""
+    means = [f"{_mean_of(errors[m])} {_with(m)}" for m in shown]
+    one = len(trials) == 1
+    return (
+        f"On {len(trials)} further trial{'' if one else 's'}, whose load{' is' if one else 's are'} outside of the "
+        f"training loads ({', '.join(trials)}), it is {in_a_row(means)}."
+    )
+
+
+def _with(model: str) -> str:
+    """Which model simulated, as in "2 mm with SysID"."""
+    return {"simulation": "uncorrected", "law": "with the law"}.get(model, f"with {MODELS[model][0]}")
+
+
+def _mean_of(summary: Mapping[str, Any]) -> str:
+    """A mean error with its unit, or the number of roll-outs that diverged."""
+    if summary["mean"] is None:
+        return f"not defined ({summary['diverged']} of {summary['trajectories']} diverged)"
+    return mm_text(summary["mean"])
 
 
 def _closer(before: float, after: float) -> str:
@@ -123,13 +156,13 @@ def marker_verdict(
             f"{errors[main]['trajectories']} roll-outs, so there is no mean error to report."
         )
     beside = "".join(
-        f", {mm_text(errors[m]['mean'])} {'uncorrected' if m == 'simulation' else 'with ' + MODELS[m][0]}"
-        for m in ("sysid", "sysid_elastic", "simulation")
+        f", {mm_text(errors[m]['mean'])} {_with(m)}"
+        for m in ("law", "sysid", "sysid_elastic", "simulation")
         if m in errors and m != main
     )
     return (
         f"On {who}, {held}, the simulated markers are {mm_text(errors[main]['mean'])} from the measured ones{span} "
-        f"with {MODELS[main][0]}{beside.replace(',', ';', 1)}."
+        f"{_with(main)}{beside.replace(',', ';', 1)}."
     )
 
 
@@ -146,6 +179,7 @@ def growth_text(
     theirs = published_growth(published, first, last).get("resphys")
     beside = "" if theirs is None else f" (published: {100.0 * theirs:.1f} %)"
     by = f"{'grows' if ours >= 0.0 else 'falls'} by {100.0 * abs(ours):.1f} %{beside}"
+    by = f"grows to {1.0 + ours:,.0f} times{beside}" if ours > MOST_PERCENT else by
     return f"From {float(first):g} s to {float(last):g} s the error of ResPhys {by}."
 
 
@@ -160,6 +194,6 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
     if not errors:
         return ""
     largest = max(errors, key=float)
-    means = {m: errors[largest][m]["mean"] for m in ("resphys", "sysid", "simfree") if m in errors[largest]}
-    parts = ", ".join(f"{mm_text(mean)} with {MODELS[model][0]}" for model, mean in means.items())
+    means = {m: errors[largest][m]["mean"] for m in ("resphys", "law", "sysid", "simfree") if m in errors[largest]}
+    parts = ", ".join(f"{mm_text(mean)} {_with(model)}" for model, mean in means.items())
     return f"At {float(largest):g} times the inputs of the training the error is {parts}." if parts else ""

@@ -239,7 +239,9 @@ class TargetSettings(SteppedSettings):
 
     # `run.filled` moves constants that stand directly in ``target`` into its material.
     model_config = ConfigDict(
-        json_schema_extra={"additionalProperties": {"anyOf": [{"type": t} for t in ("number", "string", "null")]}}
+        json_schema_extra={
+            "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "string"}, {"type": "null"}]}
+        }
     )
 
     material: MaterialSettings = setting(description="of its body")

@@ -128,7 +128,7 @@ class LawSettings(Settings):
 
     file: Word | None = setting(None, "law of another run, in place of an identification")
     terms: Many[Word] = setting(
-        ("c20", "c01", "c02", "dilation", "ogden_3", "ogden_4", "ogden_6"), "elastic terms besides c10 and bulk_1"
+        ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried; 0: none")

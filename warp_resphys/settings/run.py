@@ -180,6 +180,11 @@ class RunSettings(SimulatorSettings):
         return None if self.identify is None else IdentifiedSettings.of(self.identify)
 
     @property
+    def with_law(self) -> bool:
+        """Whether the law of the material is identified."""
+        return self.law is not None
+
+    @property
     def binding(self) -> BindingSettings:
         """Positions of markers, and how they are bound to the body."""
         assert self.markers is not None
@@ -193,7 +198,7 @@ class RunSettings(SimulatorSettings):
     @property
     def models(self) -> list[str]:
         """Names of the models that the run compares."""
-        return models_of(self.published, self.identify, self.correct_uncorrected, self.law is not None)
+        return models_of(self.published, self.identify, self.correct_uncorrected, self.with_law)
 
     def training(self, model: str) -> TrainingSettings:
         """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.

@@ -95,7 +95,7 @@ class LearningStage(SimulationStage):
     train_fraction: float
     trial_seconds: float | None
     identified: IdentifiedSettings | None
-    law: LawSettings | None
+    with_law: bool  # whether the law of the material is identified
     batch: int | None
     shared: str  # folder of the dataset, from that of the split
     acquired: str  # fingerprint of the stage that wrote the dataset

@@ -17,14 +17,13 @@ from ..io.stages import finished_record
 from ..report.bodies import ComparedMotion
 from ..report.camera import hangs
 from ..report.control_section import compared_controllers
-from ..report.data import MODELS, at_times
+from ..report.data import MODELS, at_times, shown_models
 from ..report.driven_film import DrivenBodies
 from ..report.render import DrawingError, RenderScene, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 from .tables import show
 
-_USUAL: Final = ("simulation", "resphys")
 _MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices of the tip that are shown where every vertex is observed
 _AT_THE_TIP: Final = 0.97  # distance of these from the fixed vertices, over the largest
@@ -75,7 +74,7 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
         available = tuple(metrics["errors_mm"])
-        models = tuple(model for model in _USUAL if model in available) or available[:2]
+        models = tuple(shown_models(metrics["errors_mm"])) or available[:2]
     name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
     return name, motion.film(seconds, settings.slower)

@@ -29,8 +29,8 @@ from ..report.verdict import learned_in_part
 from .rows import RecordedRobot
 from .runs import Run
 
-_MODELS = ("simulation", "sysid", "simfree", "resphys")
-_GAINS = {"sysid": "simulation", "resphys": "sysid"}  # model: the one that it corrects
+_MODELS = ("simulation", "sysid", "law", "simfree", "resphys")
+_COLUMNS = {"simulation": "Uncorrected", "sysid": "SysID", "law": "Law", "simfree": "SimFree", "resphys": "ResPhys"}
 _MACHINE = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
 _PACKAGES = ("python", "warp-lang", "torch")
 
@@ -74,7 +74,7 @@ class Measured(Settings):
             tested=tuple(tested),
             how=how,
             errors_mm={model: metrics["errors_mm"][model] for model in _MODELS if model in metrics["errors_mm"]},
-            gains={model: _gain(metrics, model, other) for model, other in _GAINS.items()},
+            gains={model: _gain(metrics, model, other) for model, other in _corrected(metrics["errors_mm"]).items()},
             intervals=metrics.get("intervals", {}).get("models", {}).get("resphys"),
             seconds=sum(sum(part["seconds"].values()) for part in (metrics, *metrics.get("folds", {}).values())),
             moved_mm=metrics.get("mesh_check", {}).get("moved_mm"),
@@ -120,6 +120,13 @@ def check_kept(path: Path | None, names: Sequence[str], beyond: Sequence[str]) -
             )
 
 
+def _corrected(errors: Mapping[str, Any]) -> dict[str, str]:
+    """By model, the one that it corrects."""
+    if "law" in errors:
+        return {"sysid": "simulation", "law": "sysid" if "sysid" in errors else "simulation", "resphys": "law"}
+    return {"sysid": "simulation", "resphys": "sysid"}
+
+
 def _gain(metrics: Mapping[str, Any], after: str, before: str) -> Share | None:
     """Gain of a model over another on held-out trials; None where a roll-out diverged."""
     pairs = [(row.get(before), row.get(after)) for row in held_out(metrics)]
@@ -132,10 +139,13 @@ def _gain(metrics: Mapping[str, Any], after: str, before: str) -> Share | None:
 def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured], failed: Container[str]) -> Part:
     """One row per robot. A robot whose run failed keeps its last known result."""
     rows = []
+    with_law = any("law" in result.errors_mm for result in measured.values())
+    models = [model for model in _MODELS if model != "law" or with_law]
+    gained = [model for model in ("sysid", "law", "resphys") if model in models]
     for name, result in measured.items():
         errors = result.errors_mm
-        cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in _MODELS]
-        cells += [Cell(_gain_text(gain)) for gain in result.gains.values()]
+        cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in models]
+        cells += [Cell(_gain_text(result.gains.get(model))) for model in gained]
         held = result.intervals
         coverage = f"{100.0 * held['coverage']:.0f} % (± {held['half_width_mm']:.2g} mm)" if held is not None else NONE
         cells += [Cell(coverage), Cell(duration_text(result.seconds))]
@@ -148,8 +158,10 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: sum "
         "over all stages, also of folds that ran in parallel, on a machine with other load."
     )
-    columns = ["Uncorrected", "SysID", "SimFree", "ResPhys"]
-    columns += ["Less error by SysID", "Less error by ResPhys", "Coverage", "Time"]
+    if with_law:
+        note += " Where there is a law of the material, it is compared with SysID, and ResPhys with the law."
+    columns = [_COLUMNS[model] for model in models]
+    columns += [*(f"Less error by {_COLUMNS[model]}" for model in gained), "Coverage", "Time"]
     return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
 
 

@@ -1,0 +1,194 @@
+"""The identified law on the page: its section, its stress, and trials outside of the training loads."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+import warp as wp
+
+from support.report_page import report
+from support.vertex_run import settings, write_run
+from warp_resphys.energies.materials import ConvexMaterial
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.report.conclusions import conclusions, errors_by_load, law_text
+from warp_resphys.report.law_figure import drawn_stretches
+from warp_resphys.report.law_section import not_needed_text, open_text, wording
+from warp_resphys.report.notes import small_strain_of
+from warp_resphys.report.page import percent_text
+from warp_resphys.report.run_page import range_texts
+from warp_resphys.report.uniaxial import ACROSS, ALONG, small_strain, uniaxial_stress
+from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.settings.learning import LawSettings
+
+OTHER = "0.12 <kg>"
+TERMS = {"c10": 30e3, "c20": 4e3, "c01": 6e3, "c02": 2e3, "bulk_1": 2e6, "bulk_2": 1e6, "dilation": 5e3}
+TERMS |= {"ogden_4": 20e3, "ogden_m3": 5e3}
+FIBRES = {"tension": 50e3, "slack": 0.01, "toe": 0.02, "stiffening": 10e3, "compression": 8e3}
+FIBRES = {f"fibre_{name}_1": value for name, value in FIBRES.items()} | {"fibre_elevation_1": 0.0}
+
+
+def law(**changes):
+    """Content of law.json."""
+    constants = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
+    own = {
+        "accepted": True,
+        "groups": ["elastic", "branches"],
+        "constants": constants,
+        "units": {"c10": "Pa", "bulk_1": "Pa", "ogden_3": "Pa", "prony_modulus_1": "Pa", "prony_time_1": "s"},
+        "parameters": {},
+        "deviation": {"c10": 400.0, "bulk_1": 6.5e6, "ogden_3": 100.0, "prony_modulus_1": 10.0, "prony_time_1": 1e-3},
+        "at_bounds": ["prony_time_1"],
+        "validation": {"trials": ["80 g", "180 g"], "law": 4.9e-5, "below": 0.1025},
+        "classes": [
+            {"groups": [], "constants": {"c10": 44e3, "bulk_1": 7e6}, "residual": 0.02, "validation": None},
+            {"groups": ["elastic", "branches"], "constants": constants, "residual": 0.003, "validation": 1.2e-4},
+        ],
+        "data": {"name": "own", "trials": ["0.05 kg"]},
+    }
+    return {**own, **changes}
+
+
+def released(**changes):
+    """Settings of a beam whose last trial is held in another way."""
+    plain = settings()
+    return plain.changed(law=LawSettings(), data=plain.data.changed(others={OTHER: {"weight_g": 120.0}}), **changes)
+
+
+def run(folder, own, **more):
+    """Writes a run with a law, and returns its page."""
+    models = ("simulation", *(["law"] if own["accepted"] else []), "simfree", "resphys")
+    write_run(folder, settings(), models=models, **more)
+    write_json(folder / "law.json", own)
+    return report(folder, released())
+
+
+@pytest.fixture(autouse=True)
+def _periods(monkeypatch):
+    """A model `law` between the uncorrected simulation and ResPhys."""
+    from support import vertex_run
+
+    monkeypatch.setitem(vertex_run.PERIODS, "law", 0.141)
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_page_has_the_law_and_the_errors_by_load(tmp_path):
+    page = run(tmp_path, law())
+    means = {row["name"]: row["errors_mm"] for row in read_json(tmp_path / "errors.json")["per_trajectory"]}
+    inside, outside = (f"{means[name]['law']:.3f}" for name in ("0.07 kg", OTHER))
+    assert inside != outside
+    for said in (
+        "The identified law and the learned force on it bring the simulator",
+        f"It is {inside} mm with the law alone.",
+        "On 1 further trial, whose load is outside of the training loads",
+        f"({OTHER}), it is",
+        f"{outside} mm with the law",
+        "is used: on the validation trials 80 g and 180 g, its root mean square error is 0.0049 % of",
+        "the learned force on the simulator with the identified law",
+        "40.00 ± 0.40kPa",
+        "Ogden's term of exponent 3",
+        "One test trial: 0.12 <kg>, outside of the training loads",
+        "did not need: second-order term in I₁, Mooney-Rivlin term, ",
+        "the shear modulus of the law is 108 kPa",
+        "With elastic terms and relaxation40.30 %0.012 %",
+        "Shape and volume alone (neo-Hookean)22.0 %failed",
+    ):
+        assert said in page.text
+    assert (tmp_path / "figures" / "law.png").is_file()
+    assert (tmp_path / "figures" / "error_over_time.png").is_file()
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_a_law_that_is_not_used_is_said_first(tmp_path):
+    page = run(tmp_path, law(accepted=False, validation={"trials": ["80 g"], "law": 0.2, "below": 0.1}))
+    metrics = {"law": {**law(accepted=False), "against": "sysid"}, "per_trajectory": []}
+    first, *_ = conclusions(metrics, SimpleNamespace(name="own", identify=None, data=None))
+    assert first.startswith("The identified law of the material is not used, and no model builds on it: on the ")
+    assert first.endswith("and that of SysID is 10 %.")
+    assert page.text.count("is not used, and no model builds on it: on the validation trial 80 g") == 2
+    assert "with the law" not in page.text
+    folds = {"folds": {"a": metrics, "b": {**metrics, "law": {"accepted": True}}}}
+    (said,) = conclusions(folds, SimpleNamespace(name="own", identify=None, data=None))
+    assert said.startswith("In 1 of 2 folds the identified law of the material is not used")
+    assert "failed" in law_text(law(validation={"trials": ["0.05 kg"], "law": 0.1, "below": None}))
+
+
+def test_constants_that_the_trials_leave_open_are_named():
+    said = open_text(law())
+    assert said.startswith("Relaxing branch 1: relaxation time and change of volume are not determined by these trials")
+    zero = {"constants": {"fibre_slack_1": 0.0, "fibre_azimuth_1": 1e-6}, "units": {"fibre_azimuth_1": "rad"}}
+    known = open_text({**zero, "at_bounds": ["fibre_slack_1"], "deviation": {"fibre_azimuth_1": 1e-3}})
+    assert known == "Fibres 1: slack ended at zero: the trials show none of it."
+    assert open_text({**law(at_bounds=[]), "deviation": {}}) == ""
+    assert "viscosity and fibres." in not_needed_text(law(), LawSettings(terms=()))
+    assert wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
+
+
+def test_errors_by_load_and_multiples():
+    rows = [("50 g", 1.0, 0.01), ("70 g", 3.0, 0.03), ("up", 2.0, 80.0), ("twist", 2.0, 120.0)]
+    metrics = {
+        "per_trajectory": [{"name": n, "errors_mm": {"law": a, "simfree": b}} for n, a, b in rows],
+        "errors_mm": {"law": {}},
+        "range": {"resphys": {"first_s": {"up": 0.0}}},
+    }
+    inside, outside = errors_by_load(metrics, ["up", "twist"]).values()
+    assert [own["law"]["mean"] for own in (inside, outside)] == [2.0, 2.0]
+    assert [own["simfree"]["mean"] for own in (inside, outside)] == [0.02, 100.0]
+    assert errors_by_load(metrics, []) == {}
+    config = SimpleNamespace(name="own", identify=None, data=released().data.changed(others={"up": {}, "twist": {}}))
+    (said,) = conclusions(metrics, config)
+    assert "leaves 99 % (90 %: 99 to 99) less error than the law on 2 trials" in said
+    assert said.endswith(
+        " On 2 trials outside of the training loads it has 50 times (90 %: 40 to 60) the error of the law (mean 2 to "
+        "100 mm): it does harm."
+    )
+    assert percent_text(49.0) == "50 times"
+    (left,) = range_texts(metrics, ["50 g", "up"])
+    assert left.endswith("from the start (up). There the learned force fades out, and the law remains.")
+
+
+@pytest.mark.parametrize("direction", [None, ALONG, ACROSS])
+def test_stress_is_that_of_the_simulated_law(direction):
+    """At stretches with free sides, the kernels' stress is along the load alone, and has the value of the curve."""
+    azimuth = 0.0 if direction in (None, ALONG) else np.pi / 2.0
+    constants = {**TERMS, **({} if direction is None else {**FIBRES, "fibre_azimuth_1": azimuth})}
+    material = ConvexMaterial.from_constants(constants)
+    own = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in material.constants.items()}
+    law_of, module = material.law, wp.get_module(f"test_law.{material.law.NAME}")
+    moduli = law_of.moduli(*(float(modulus) for modulus in material.moduli(own)))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def stress_of(f: wp.array[wp.mat33d], m: law_of.moduli, stress_out: wp.array[wp.mat33d]):
+        _energy, stress = law_of.response(f[wp.tid()], m)
+        stress_out[wp.tid()] = stress
+
+    for stretch in (0.85, 1.25):
+        (found,) = uniaxial_stress(constants, np.array([stretch]), direction)
+        sides = scipy.optimize.root(lambda s, x=stretch: stresses(stress_of, moduli, x, s)[1:], np.ones(2)).x
+        expected = stresses(stress_of, moduli, stretch, sides)
+        assert np.abs(expected[1:]).max() < 1e-6 * abs(expected[0])
+        assert found == pytest.approx(expected[0], rel=1e-6)
+        assert found * (stretch - 1.0) > 0.0
+
+
+def stresses(kernel, moduli, stretch, sides):
+    """Nominal stresses (3,) [Pa] along the axes."""
+    f = wp.array(np.diag([stretch, *sides])[None], dtype=wp.mat33d, device="cpu")
+    out = wp.zeros(1, dtype=wp.mat33d, device="cpu")
+    wp.launch(kernel, 1, [f, moduli], [out], device="cpu")
+    return np.diagonal(out.numpy()[0])
+
+
+def test_moduli_at_small_strains():
+    moduli = small_strain(TERMS)
+    step = 1e-5
+    low, high = uniaxial_stress(TERMS, np.array([1.0 - step, 1.0 + step]))
+    assert (high - low) / (2.0 * step) == pytest.approx(moduli.youngs_modulus, rel=1e-6)
+    hookean = MaterialSettings(model="stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45)
+    found = small_strain_of(hookean)
+    assert (found.youngs_modulus, found.poissons_ratio) == pytest.approx((264e3, 0.45))
+    assert small_strain_of(MaterialSettings(model="law", **TERMS)) == moduli
+    x = drawn_stretches({"all trials": (0.8, 1.3)})
+    assert x[0] < 0.8 < 1.3 < x[-1]
+    assert 1.0 in x

@@ -1,0 +1,242 @@
+"""The section on the identified law: its terms, its moduli at small strains, the classes that were tried, its use."""
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from ..settings.body import MaterialSettings
+from ..settings.learning import LawSettings
+from .conclusions import law_text
+from .data import RunReport
+from .identification_section import Wording, digits, parameter_wording
+from .notes import in_a_row, small_strain_of
+from .page import NONE, Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, significant
+from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_strain, uniaxial_stress
+from .verdict import unbroken
+
+_KPA: Final = ("kPa", 1e-3)
+_STRAIN: Final = ("%", 1e2)
+_ANGLE: Final = ("°", 180.0 / np.pi)
+# Of each constant: its term in words, its meaning, and unit on the page with its number in an SI unit.
+_TERMS: Final[Mapping[str, tuple[str, str, tuple[str, float]]]] = {
+    "c10": ("Neo-Hookean term", "half the shear modulus that it adds; c10 of I₁ − 3", _KPA),  # noqa: RUF001
+    "c20": ("Second-order term in I₁", "stiffens with strain; c20 of (I₁ − 3)²", _KPA),  # noqa: RUF001
+    "c30": ("Third-order term in I₁", "stiffens with strain; c30 of (I₁ − 3)³", _KPA),  # noqa: RUF001
+    "c01": ("Mooney-Rivlin term", "softens in tension; c01 of I₂ − 3", _KPA),  # noqa: RUF001
+    "c02": ("Second-order term in I₂", "stiffens with strain; c02 of (I₂ − 3)²", _KPA),  # noqa: RUF001
+    "dilation": ("Local change of volume", "dilation of (J − 1)²", _KPA),  # noqa: RUF001
+    "bulk_1": ("Change of volume", "bulk_1 of (J − 1)²", ("MPa", 1e-6)),  # noqa: RUF001
+    "bulk_2": ("Large change of volume", "bulk_2 of (J − 1)⁴", ("MPa", 1e-6)),  # noqa: RUF001
+    "shear_viscosity": ("Viscosity in shear", "force in proportion to the rate of shear", ("Pa s", 1.0)),
+    "bulk_viscosity": ("Viscosity in volume", "force in proportion to the rate of volume change", ("Pa s", 1.0)),
+}
+_NUMBERED: Final[Mapping[str, tuple[str, str, tuple[str, float]]]] = {
+    "prony_modulus": ("Relaxing branch {}: shear modulus", "adds stiffness to fast motions", _KPA),
+    "prony_time": ("Relaxing branch {}: relaxation time", "after which its stress has decayed to 37 %", ("ms", 1e3)),
+    "fibre_tension": ("Fibres {}: modulus in tension", "beyond the toe", _KPA),
+    "fibre_toe": ("Fibres {}: toe", "strain over which they become taut", _STRAIN),
+    "fibre_slack": ("Fibres {}: slack", "strain at which they begin to pull", _STRAIN),
+    "fibre_stiffening": ("Fibres {}: stiffening", "of the cube of their strain", _KPA),
+    "fibre_compression": ("Fibres {}: modulus in compression", "", _KPA),
+    "fibre_azimuth": ("Fibres {}: azimuth", "of their direction, from x towards y", _ANGLE),
+    "fibre_elevation": ("Fibres {}: elevation", "of their direction, above the plane of x and y", _ANGLE),
+}
+_OGDEN: Final = "shear modulus that it adds; larger exponents stiffen more"
+_GROUPS: Final[Mapping[str, str]] = {
+    "elastic": "elastic terms",
+    "viscosity": "viscosity",
+    "branches": "relaxation",
+    "fibres": "fibres",
+}
+_OPEN: Final = 0.5  # Deviation from which on a constant is not determined, over its value.
+# The same for constants that may well be zero, in an SI unit.
+_OPEN_BY_UNIT: Final[Mapping[str, float]] = {"rad": 0.25, "": 0.05}
+
+
+def law_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the law, whether it is used, what the trials determine of it, and the classes that were tried."""
+    law, settings = data.law, data.settings.law
+    if not law or settings is None:
+        return None
+    blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
+    notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
+    notes += [f"The target is simulated, with the material {data.target}."] if data.target else []
+    blocks += [Text(" ".join(notes if law.get("deviation") else notes[1:]), note=True)]
+    blocks += [Text(unbroken(said)) for said in (open_text(law), not_needed_text(law, settings)) if said]
+    blocks += [_moduli_table(data, law["constants"]), *_curve(data, law["constants"], canvas)]
+    return Part("Law of the material", [*blocks, *_classes(law)])
+
+
+def wording(name: str) -> tuple[Wording, str]:
+    """Return the name, unit and factor of a constant of a law, and its meaning."""
+    if name in _TERMS:
+        words, meaning, (unit, factor) = _TERMS[name]
+        return (words, unit, factor), meaning
+    if exponents := [*ogden_terms({name: 0.0})]:
+        return (f"Ogden's term of exponent {exponents[0]}", *_KPA), _OGDEN
+    numbered = re.fullmatch(r"(\w+)_(\d+)", name)
+    if numbered and numbered[1] in _NUMBERED:
+        words, meaning, (unit, factor) = _NUMBERED[numbered[1]]
+        return (words.format(numbered[2]), unit, factor), meaning
+    return parameter_wording(name), ""
+
+
+def _terms_table(law: Mapping[str, Any]) -> PageTable:
+    rows = []
+    known = {**law["constants"], **law.get("parameters", {})}
+    bounds = [name for name in law.get("at_bounds", ()) if name in known]
+    for name, value in known.items():
+        deviation = law.get("deviation", {}).get(name)
+        if not value and not deviation:  # Of a family of fibres that has no such part.
+            continue
+        (words, unit, factor), meaning = wording(name)
+        beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
+        cells = [Cell(digits(value, factor, deviation), beside=beside), Cell(unit or NONE)]
+        cells += [Cell("yes" if name in bounds else "")] if bounds else []
+        rows.append(Row(words, cells, small=meaning))
+    return PageTable("Term", ["Identified", "Unit", *(["At a bound"] if bounds else [])], rows)
+
+
+def open_text(law: Mapping[str, Any]) -> str:
+    """Return sentences on constants that the trials do not determine; empty if they determine all of them."""
+    constants, deviation, units = law["constants"], law.get("deviation", {}), law.get("units", {})
+    zero = [name for name in law.get("at_bounds", ()) if constants.get(name) == 0.0]
+    unsure = [name for name in law.get("at_bounds", ()) if name in constants and name not in zero]
+    for name, value in constants.items():
+        limit = _OPEN_BY_UNIT.get(units.get(name, ""), _OPEN * abs(value)) if name in units else _OPEN * abs(value)
+        if name not in (*unsure, *zero) and deviation.get(name, 0.0) >= limit > 0.0:
+            unsure.append(name)
+    sentences = []
+    if unsure:
+        verb = "is" if len(unsure) == 1 else "are"
+        guesses = "its first guess" if len(unsure) == 1 else "their first guesses"
+        sentences.append(
+            f"{_sentence(unsure)} {verb} not determined by these trials, and {verb} held near {guesses} or at a bound."
+        )
+    if zero:
+        sentences.append(f"{_sentence(zero)} ended at zero: the trials show none of it.")
+    return " ".join(sentences)
+
+
+def _sentence(names: Sequence[str]) -> str:
+    words = in_a_row([_lower(wording(name)[0][0]) for name in names])
+    return words[:1].upper() + words[1:]
+
+
+def _lower(words: str) -> str:
+    return (
+        words if words.startswith(("Young", "Poisson", "Prony", "Mooney", "Ogden")) else words[:1].lower() + words[1:]
+    )
+
+
+def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
+    """Return a sentence on the terms of the library that the law does not have; empty if it has all of them."""
+    constants = law["constants"]
+    names = [name for name in settings.terms if name not in constants]
+    exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
+    absent = [_lower(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
+    absent += (
+        [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
+    )
+    if settings.viscous and "shear_viscosity" not in constants:
+        absent.append("viscosity")
+    if settings.branches and not any(name.startswith("prony") for name in constants):
+        absent.append("relaxing branches")
+    if settings.families and not families(constants):
+        absent.append("fibres")
+    return f"Terms of the library that the data did not need: {in_a_row(absent)}." if absent else ""
+
+
+def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
+    """Moduli at small strains: of the law, of the simulator that it replaces, and of a simulated target."""
+    columns: dict[str, SmallStrain | None] = {"Law": small_strain(constants)}
+    below = data.identification.get("sysid", {}).get("parameters", {})
+    start = data.settings.simulation
+    if "youngs_modulus" in below or "poissons_ratio" in below:
+        changed = {name: below[name] for name in ("youngs_modulus", "poissons_ratio") if name in below}
+        columns["SysID"] = small_strain_of(MaterialSettings.model_validate({**start.parameters, **changed}))
+    else:
+        columns["Data sheet"] = small_strain_of(start)
+    for target in data.settings.targets.values():
+        columns["Target"] = small_strain_of(target.material)
+    shown = {name: moduli for name, moduli in columns.items() if moduli is not None}
+
+    def row(head: str, attribute: str, factor: float) -> Row:
+        return Row(head, [Cell(f"{factor * getattr(moduli, attribute):.4g}") for moduli in shown.values()])
+
+    rows = [
+        row("Shear modulus [kPa]", "mu", 1e-3),
+        row("Young's modulus [kPa]", "youngs_modulus", 1e-3),
+        row("Poisson's ratio", "poissons_ratio", 1.0),
+    ]
+    notes = ["Of slow motions: viscosity and relaxing branches left out."]
+    if branches := sum(value for name, value in constants.items() if name.startswith("prony_modulus")):
+        fast = 1e-3 * (columns["Law"].mu + branches) if columns["Law"] is not None else 0.0
+        notes.append(f"With the relaxing branches, in fast motions, the shear modulus of the law is {fast:.4g} kPa.")
+    notes += ["Fibres are left out too."] if families(constants) else []
+    if "corotated" in (start.model, *(target.material.model for target in data.settings.targets.values())):
+        notes.append("Of a corotated material they are effective values: its λ counts a third at small strains.")
+    return PageTable("At small strains", [*shown], rows, unbroken(" ".join(notes)))
+
+
+def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
+    """Draws the stress in slow tension and compression."""
+    from . import law_figure
+
+    stretches = law_figure.drawn_stretches(data.stretches)
+    fibres = families(constants)
+    directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
+    curves = {label: (stretches, uniaxial_stress(constants, stretches, d)) for label, d in directions.items()}
+    modulus = small_strain(constants).youngs_modulus
+    ends = "; ".join(
+        f"{label}: {1e-3 * stress[0]:.3g} kPa at a stretch of {x[0]:.2f}, {1e-3 * stress[-1]:.3g} kPa at {x[-1]:.2f}"
+        for label, (x, stress) in curves.items()
+    )
+    without = " Fibres are left out, as there are several families." if fibres > 1 else ""
+    shaded = " Shaded: principal stretches at the centres of the cells." if data.stretches else ""
+    return [
+        canvas.figure(
+            "law",
+            partial(law_figure.stress_over_stretch, curves, modulus, data.stretches),
+            unbroken(f"Nominal stress of the law against stretch. {ends}."),
+            "Nominal stress of the law in slow uniaxial tension and compression; dashed, the straight line with its "
+            f"Young's modulus at small strains.{shaded}{without}",
+        )
+    ]
+
+
+def _classes(law: Mapping[str, Any]) -> list[Block]:
+    """Returns the classes that were tried, with their errors."""
+    tried = law.get("classes", ())
+    if not tried:
+        return []
+    weak = any(own.get("residual") is not None for own in tried)
+    columns = ["Coefficients", *(["Force residual"] if weak else []), "Validation error"]
+    rows, chosen = [], False
+    for own in tried:
+        answer = not chosen and own["groups"] == law["groups"]
+        chosen = chosen or answer
+        words = in_a_row([_GROUPS.get(group, group) for group in own["groups"]])
+        head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
+        cells = [Cell(str(sum(_is_coefficient(name) for name, value in own["constants"].items() if value)))]
+        cells += [Cell(_share(own.get("residual")))] if weak else []
+        rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], answer))
+    note = (
+        "Validation errors are root mean squares over the amplitude of the motion. The smallest class that was close "
+        "enough to the best one was chosen"
+    )
+    if weak:
+        note += ", and refined through the simulator. The force residual is what remains in the balance of forces"
+    return [PageTable("Classes of laws", columns, rows, f"{note}.")]
+
+
+def _is_coefficient(name: str) -> bool:
+    """Whether a constant multiplies a term, unlike a relaxation time, a direction, a slack or a toe."""
+    return wording(name)[0][1] not in ("ms", "%", "°")
+
+
+def _share(value: float | None) -> str:
+    return "failed" if value is None else significant(100.0 * value) + " %"

@@ -9,7 +9,7 @@ import torch
 from support.known_law import STIFF, beam, pulled, released
 from warp_resphys import Inputs
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.weak_form import ObservedMotion, WeakForm, fit, residual_of
+from warp_resphys.learning.weak_form import KnownMotion, WeakForm, fit, residual_of
 
 UNIT = {
     "c10": 1e5,
@@ -96,7 +96,7 @@ def test_loads_during_the_motion_are_part_of_the_balance():
     inputs = Inputs(external_force=pulled([(0.0, 0.2, 0.0)]))
     with torch.no_grad():
         q = sim.rollout(sim.rest_state(), 12, inputs).q
-    motion = ObservedMotion(q, torch.zeros_like(q[0]), inputs)
+    motion = KnownMotion(q, torch.zeros_like(q[0]), inputs)
     form = WeakForm(unknown(), [motion], SHAPE, STIFF)
     assert residual_of(form.columns(CANDIDATES) @ TRUE, form.target) < 1e-7
     unloaded = WeakForm(unknown(), [replace(motion, inputs=Inputs())], SHAPE, STIFF)
@@ -125,6 +125,6 @@ def test_equal_columns_share_their_coefficient():
 @pytest.mark.parametrize(("motions", "stride"), [(0, 5), (1, 0)])
 def test_nothing_to_balance_is_refused(motions, stride):
     sim = simulator(TRUE)
-    still = ObservedMotion(sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None])
+    still = KnownMotion(sim.rest_positions.expand(3, 1, -1, -1), torch.zeros_like(sim.rest_positions)[None])
     with pytest.raises(InputError, match="no step to balance"):
         WeakForm(sim, [still] * motions, SHAPE, STIFF, stride)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, make_material, select_vertices
-from warp_resphys.learning.weak_form import ObservedMotion
+from warp_resphys.learning.weak_form import KnownMotion
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 TIP = select_vertices(MESH, x=0.08)
@@ -27,8 +27,8 @@ def pulled(pulls: Sequence[Sequence[float]]) -> torch.Tensor:
     return force
 
 
-def released(sim: Simulator, pulls: Sequence[Sequence[float]], steps: int = 12) -> ObservedMotion:
+def released(sim: Simulator, pulls: Sequence[Sequence[float]], steps: int = 12) -> KnownMotion:
     """Motions of beams that are released from pulls (B, 3) at the tip [N]."""
     with torch.no_grad():
         held = sim.static_equilibrium(Inputs(external_force=pulled(pulls)))
-        return ObservedMotion(sim.rollout(held, steps).q, held.v)
+        return KnownMotion(sim.rollout(held, steps).q, held.v)

@@ -88,6 +88,11 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
         raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
     with _naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
+    if run.simulation.model == LAW and law.file is None:
+        raise InputError(
+            "law: simulation.model is law already: identify its constants in identify.parameters, or start from another "
+            "model."
+        )
     if law.file is not None:
         constants = read_law(Path(law.file).expanduser())["constants"]
         build_material(MaterialSettings.model_validate({"model": LAW, **constants}), f"law: {law.file}")

@@ -34,7 +34,7 @@ from .trials import evenly
 
 _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
-_CLOSER: Final = 0.95  # ratio of validation errors below which more terms are worth while
+_CLOSER: Final = 0.95  # ratio of validation errors below which a law, or more terms, are worth while
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a refined coefficient is zero
 
 # Steps of differences, as fractions of ranges: motions without noise have narrow valleys.
@@ -107,7 +107,7 @@ class _LawSearch:
         uncertainty = best.found.uncertainty
         content = {
             "format": LAW_FORMAT,
-            "accepted": best.score < below,
+            "accepted": best.score < _CLOSER * below,
             "groups": list(best.law.groups),
             "constants": best.law.constants,
             "units": {name: _unit(name) for name in best.law.constants},
@@ -251,7 +251,8 @@ class _LawSearch:
 
     def _bounds(self, name: str, value: float) -> Bounds:
         if name == "bulk_1":
-            return Bounds(0.1 * value, 10.0 * value, True, Prior(value, value))
+            mean = max(value, self.shear)
+            return Bounds(0.1 * mean, 10.0 * mean, True, Prior(mean, mean))
         if name.startswith("prony_time"):
             return Bounds(value / 4.0, 4.0 * value, True)
         if name.startswith(("fibre_azimuth", "fibre_elevation")):

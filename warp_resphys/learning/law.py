@@ -23,6 +23,7 @@ UNIT: Final = 1e5  # Pa, of a candidate's coefficient
 _UNIT_VISCOSITY: Final = 1e2  # Pa s
 _FIBRE: Final = {"slack": 0.0, "toe": 0.02, "stiffening": 0.0, "compression": 0.0}
 _NEEDLESS: Final = 1.02  # ratio of the residuals without and with a term below which it is left out
+_ROUNDING: Final = 1e-6  # residual below which every term that is left is needed
 _SAME: Final = 1.6  # ratio of neighbouring relaxation times that are one branch
 _TURN: Final = math.radians(15.0)  # of the finer directions about the best coarse one
 _SMALLEST: Final = 1e-3  # fraction of the shear modulus below which a branch or a family is left out
@@ -156,7 +157,7 @@ def _sparse(columns: _Columns, modulus: Sequence[int], others: Sequence[int]) ->
     while kept:
         without = {k: columns.fit([*modulus, *(other for other in kept if other != k)])[1] for k in kept}
         least = min(kept, key=lambda k: without[k])
-        if without[least] > _NEEDLESS * residual:
+        if without[least] > max(_NEEDLESS * residual, _ROUNDING):
             break
         kept.remove(least)
     return [*modulus, *kept]

@@ -90,8 +90,7 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
     if run.simulation.model == LAW and law.file is None:
         raise InputError(
-            "law: simulation.model is law already: identify its constants in identify.parameters, or start from another "
-            "model."
+            "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
         )
     if law.file is not None:
         constants = read_law(Path(law.file).expanduser())["constants"]

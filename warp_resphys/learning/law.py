@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .weak_form import Candidate, FloatArray, WeakForm, fit, residual_of
+from .weak_form import Candidate, FloatArray, NormalEquations, WeakForm
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
 VISCOSITIES: Final = ("shear_viscosity", "bulk_viscosity")
@@ -68,6 +68,7 @@ class _Columns:
         self._forms = [train] if held_out is None else [train, held_out]
         self.candidates: list[Candidate] = []
         self._blocks: list[list[FloatArray]] = [[] for _ in self._forms]
+        self._normal: list[NormalEquations] = []
 
     def add(self, candidates: Sequence[Candidate]) -> list[int]:
         """Adds columns; returns their indices."""
@@ -75,15 +76,16 @@ class _Columns:
             return []
         for blocks, form in zip(self._blocks, self._forms, strict=True):
             blocks.append(form.columns(candidates))
+        pairs = zip(self._blocks, self._forms, strict=True)
+        self._normal = [NormalEquations.of(np.concatenate(blocks, axis=1), form.target) for blocks, form in pairs]
         first = len(self.candidates)
         self.candidates += candidates
         return list(range(first, len(self.candidates)))
 
     def fit(self, indices: Sequence[int]) -> tuple[NDArray[np.float64], float]:
         """Returns the coefficients, and the residual of the held-out motions, or of the training motions."""
-        train, held_out = (np.concatenate(blocks, axis=1)[:, indices] for blocks in (self._blocks[0], self._blocks[-1]))
-        found = fit(train, self._forms[0].target).coefficients
-        return found, residual_of(held_out @ found, self._forms[-1].target)
+        found = self._normal[0].fit(indices)
+        return found, self._normal[-1].residual(indices, found)
 
 
 def fit_classes(train: WeakForm, held_out: WeakForm | None, library: Library) -> list[LawClass]:

@@ -11,6 +11,7 @@ Mechanics and Engineering 381, 2021). H is the Hessian of a longer step, whose i
 displacements that they would cause. Without this weight, forces of nearly incompressible modes rule the sum.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -141,19 +142,47 @@ class WeakForm:
         return rows
 
 
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations of columns (R, K) theta = target (R,), for fits of many subsets of the columns."""
+
+    matrix: FloatArray  # (K, K)
+    right: FloatArray  # (K,)
+    square: float  # |target|^2
+
+    @classmethod
+    def of(cls, columns: FloatArray, target: FloatArray) -> "NormalEquations":
+        """Returns those of columns (R, K) and a target (R,)."""
+        return cls(columns.T @ columns, columns.T @ target, float(target @ target))
+
+    def fit(self, members: Sequence[int]) -> FloatArray:
+        """Returns the non-negative least-squares solution with some of the columns."""
+        picked = np.ix_(members, members)
+        scale = np.sqrt(np.diag(self.matrix)[members])
+        used = scale > 0.0
+        unit = (self.matrix[picked] / np.outer(np.where(used, scale, 1.0), np.where(used, scale, 1.0)))[used][:, used]
+        root = scipy.linalg.cholesky(unit + _RIDGE * np.trace(unit) / max(len(unit), 1) * np.eye(len(unit)))
+        right = scipy.linalg.solve_triangular(root, self.right[members][used] / scale[used], trans=1)
+        theta = np.zeros(len(scale))
+        theta[used] = scipy.optimize.nnls(root, right)[0] / scale[used]
+        return theta
+
+    def residual(self, members: Sequence[int], theta: FloatArray) -> float:
+        """Returns the root mean square of the forces of some columns less the target, over that of the target.
+
+        It has half of the digits of the columns, 1e-8.
+        """
+        quadratic = float(theta @ self.matrix[np.ix_(members, members)] @ theta)
+        left = quadratic - 2.0 * float(theta @ self.right[members]) + self.square
+        return math.sqrt(max(left, 0.0) / self.square)
+
+
 def fit(columns: FloatArray, target: FloatArray) -> Fit:
     """Returns the non-negative least-squares solution of columns (R, K) theta = target (R,).
 
     The columns are scaled to unit length, and the normal equations are solved, as R is much larger than K.
     """
-    scale = np.linalg.norm(columns, axis=0)
-    used = scale > 0.0
-    unit = columns[:, used] / scale[used]
-    normal = unit.T @ unit
-    root = scipy.linalg.cholesky(normal + _RIDGE * np.trace(normal) / max(len(normal), 1) * np.eye(len(normal)))
-    right = scipy.linalg.solve_triangular(root, unit.T @ target, trans=1)
-    theta = np.zeros(len(scale))
-    theta[used] = scipy.optimize.nnls(root, right)[0] / scale[used]
+    theta = NormalEquations.of(columns, target).fit(range(columns.shape[1]))
     return Fit(theta, residual_of(columns @ theta, target))
 
 

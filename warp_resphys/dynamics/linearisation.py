@@ -13,6 +13,7 @@ from ..energies.potential import StepTerms
 from ..fem.coordinates import DeviceCoordinates
 from ..linalg.linear_solver import Factor
 from ..linalg.sparse import SparseSolver
+from ..linalg.threads import threads_for
 from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
@@ -55,6 +56,7 @@ class Linearisation:
         self._potential = workspace.potential
         self._potential.set_terms(terms)
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
+        self._unknowns = 3 * self._potential.n_vertices
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
         """Returns x with fixed and dependent vertices in their places, and sliding vertices in their planes."""
@@ -70,12 +72,14 @@ class Linearisation:
     def factorise(self, x: torch.Tensor) -> None:
         """Prepares H at x (B, N, 3) [m] for `solve` and `product`."""
         self._potential.positions.copy_(x)
-        self._workspace.hessian(self._name).refactor_exact()
+        with threads_for(self._unknowns):
+            self._workspace.hessian(self._name).refactor_exact()
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
         fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
-        solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
+        with threads_for(self._unknowns):
+            solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
         return self._coordinates.expand(solution.unflatten(1, (-1, 3))).flatten(1, 2)
 
     def update(self, x: torch.Tensor) -> None:

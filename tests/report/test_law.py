@@ -121,7 +121,7 @@ def test_constants_that_the_trials_leave_open_are_named():
     known = open_text({**zero, "at_bounds": ["fibre_slack_1"], "deviation": {"fibre_azimuth_1": 1e-3}})
     assert known == "Fibres 1: slack ended at zero: the trials show none of it."
     assert open_text({**law(at_bounds=[]), "deviation": {}}) == ""
-    assert "viscosity and fibres." in not_needed_text(law(), LawSettings(terms=()))
+    assert "viscosity in volume and fibres." in not_needed_text(law(), LawSettings(terms=()))
     assert wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 
 
@@ -136,7 +136,11 @@ def test_errors_by_load_and_multiples():
     assert [own["law"]["mean"] for own in (inside, outside)] == [2.0, 2.0]
     assert [own["simfree"]["mean"] for own in (inside, outside)] == [0.02, 100.0]
     assert errors_by_load(metrics, []) == {}
-    config = SimpleNamespace(name="own", identify=None, data=released().data.changed(others={"up": {}, "twist": {}}))
+    config = SimpleNamespace(
+        name="own",
+        identify=None,
+        data=released().data.changed(others={"up": {"weight_g": 50.0}, "twist": {"twist_deg": 90.0}}),
+    )
     (said,) = conclusions(metrics, config)
     assert "leaves 99 % (90 %: 99 to 99) less error than the law on 2 trials" in said
     assert said.endswith(

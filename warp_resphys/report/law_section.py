@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from .conclusions import law_text
@@ -141,8 +142,8 @@ def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
     absent += (
         [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
     )
-    if settings.viscous and "shear_viscosity" not in constants:
-        absent.append("viscosity")
+    if settings.viscous:
+        absent += [_lower(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
     if settings.branches and not any(name.startswith("prony") for name in constants):
         absent.append("relaxing branches")
     if settings.families and not families(constants):

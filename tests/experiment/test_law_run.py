@@ -175,7 +175,7 @@ class TestALawThatDoesNotHelp:
             ["regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}", "simulation.regions={root:{},tip:{}}"],
             "^law: the simulator has materials by region, and one law is for one material: leave law out.$",
         ),
-        (["law.terms=[c20,c50]"], r"^law\.terms: the material has no constant 'c50': it has c10"),
+        (["law.terms=[c20,c50]"], r"^law\.terms: law has no constant 'c50': it has c10"),
         (["law.terms=[ogden_2]"], r"^law\.terms: ogden has the exponent 2"),
         (["law.term=[c20]"], "unknown key 'law.term'"),
         (["data.others.a={weight_g:50,twist_deg:10}"], r"^data\.others\.a\.weight_g is 50 and twist_deg 10: "),

@@ -135,7 +135,8 @@ class Material(ABC):
         for name in values:
             if name not in own:
                 numbered = [f"{q.name}_1" for q in chain.from_iterable(cls.groups.values())]
-                raise InputError(f"the material has no constant {name!r}: it has {', '.join((*own, *numbered, '...'))}")
+                model = next((word for word, kind in MATERIALS.items() if kind is cls), cls.__name__)
+                raise InputError(f"{model} has no constant {name!r}: it has {', '.join((*own, *numbered, '...'))}")
         return {**values, **groups}
 
     @staticmethod

@@ -30,7 +30,7 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
-MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "law", "simfree", "resphys")}
+MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
 _OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 

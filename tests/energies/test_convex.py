@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Inputs, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.energies.materials import ConvexMaterial, FibreFamily, make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients
@@ -149,3 +150,9 @@ class TestByName:
     def test_what_is_no_law_is_refused(self, constants, message):
         with pytest.raises(InputError, match=message):
             make_material("law", **constants)
+
+
+def test_vibration_modes_do_not_depend_on_viscosity():
+    viscous = {"shear_viscosity": 40.0, "bulk_viscosity": 900.0}
+    quiet, damped = (vibration_modes(simulator(ConvexMaterial(C10, bulk_1=1e6, **v)), 3) for v in ({}, viscous))
+    torch.testing.assert_close(damped, quiet, rtol=0.0, atol=1e-8)

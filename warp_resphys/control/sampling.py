@@ -11,6 +11,7 @@ import torch
 
 from ..data.actuation import InputSequences
 from ..data.input_response import InputResponse, response_of
+from ..energies.materials import VISCOUS
 from ..experiment.models import Learned
 from ..io.errors import InputError
 from ..robot.inputs import RobotInput
@@ -169,7 +170,8 @@ class Source:
             float(delay or 0.0),
             float(rise or 0.0),
         )
-        self._elastic = robot.with_parameters(stiffness_damping=0.0, mass_damping=0.0)
+        damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, "mass_damping"))}
+        self._elastic = robot.with_parameters(**damping)
         free = np.ones(simulator.body.n_vertices)
         free[simulator.body.fixed_vertices] = 0.0
         mass = robot.constants.mass[0].double() * torch.as_tensor(free, device=self.rest.device)

@@ -9,6 +9,7 @@ import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
 
+from ..energies.materials import VISCOUS
 from ..io.errors import InputError
 from .simulator import Simulator
 
@@ -113,7 +114,7 @@ def _about_rest(
     """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] at rest, and the F free vertices."""
     simulator = replace(simulator, dtype=torch.float64)  # The lowest eigenvalues are below the rounding of float32.
     rest = simulator.rest_state()
-    elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith("stiffness_damping")})
+    elastic = simulator.prepare({name: 0.0 for name in simulator.parameters if name.endswith(VISCOUS)})
     linearisation = simulator.linearise(rest, parameters=elastic)
     hessian, _ = linearisation.matrix(rest.q)
     inertia = linearisation.inertia_matrix(rest.q)

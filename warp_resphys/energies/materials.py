@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import torch
 from typing_extensions import override
@@ -38,6 +38,8 @@ def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: A
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
 
 
+# constants of viscosity, whose names end so if they are those of a region
+VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 _PRONY_TIME = Quantity("prony_time", "s", 0.0)
 
 
@@ -331,7 +333,8 @@ class ConvexMaterial(Material):
         """Builds the law.
 
         Raises:
-            InputError: a coefficient is negative or not finite, or an exponent lies between -2 and 2.
+            InputError: a coefficient is negative or not finite, or an exponent is not a whole number of at least 3
+                in size.
         """
         wrong = [n for n in self.ogden if not isinstance(n, int) or -3 < n < 3]
         if wrong:

@@ -57,7 +57,7 @@ def identify_law(context: StageContext) -> None:
             context.run_dir / LAW_FILE, {**content, "accepted": True, "parameters": {}, "file": settings.law.file}
         )
         return
-    _LawSearch(context, Experiment(settings, context.run_dir)).run()
+    _LawSearch(context, Experiment(settings, context.run_dir, "count")).run()
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,8 @@ class _LawSearch:
         self.checked = split.validation or split.train
         self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
         self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
-        self.shear = self._guess()["c10"] * 2.0
+        self.guess = self._guess()
+        self.shear = 2.0 * self.guess["c10"]
 
     def run(self) -> None:
         """Writes law.json."""
@@ -138,27 +139,24 @@ class _LawSearch:
         }
         return {**guess, "density": known["density"], "mass_damping": known["mass_damping"]}
 
-    def _simulator(self, constants: Mapping[str, float], settled: bool = False) -> Simulator:
-        """Returns the simulator of the identified model with a law."""
+    def _simulator(self, constants: Mapping[str, float]) -> Simulator:
+        """Returns the simulator of the identified model with a law; failed steps are counted."""
         settings = self.experiment.settings_of("identified")
-        common = {name: self._guess()[name] for name in ("density", "mass_damping")}
+        common = {name: self.guess[name] for name in ("density", "mass_damping")}
         material = MaterialSettings.model_validate({"model": LAW, **common, **constants})
-        return build_simulator(settings, material, self.experiment.body, on_failure="count" if settled else None)
+        return build_simulator(settings, material, self.experiment.body, on_failure="count")
 
     def _from_states(self, library: Library) -> list[LawClass]:
         """Returns the classes of the weak form."""
         wanted = self.settings.law
-        zero = {name: 0.0 for name in (*library.terms, "c10", "bulk_1", *VISCOSITIES, "prony_modulus_1")}
-        unset = {"prony_time_1": 0.1, "fibre_azimuth_1": 0.0, "fibre_elevation_1": 0.0, "fibre_tension_1": 0.0}
-        unset |= {"fibre_slack_1": 0.0, "fibre_toe_1": 0.02, "fibre_stiffening_1": 0.0, "fibre_compression_1": 0.0}
-        simulator = self._simulator({**zero, **unset}, settled=True)
-        guess = self._guess()
+        zero = dict.fromkeys((*library.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
+        zero |= _branches([0.0], [0.1]) | _family(0.0)
+        simulator, guess = self._simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         forms = []
         for names in (self.settings.split.train, self.settings.split.validation):
             motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
-            known = {"prony_time_1": 0.1, "fibre_toe_1": 0.02}
-            forms.append(WeakForm(simulator, motions, known, stiff, wanted.stride) if motions else None)
+            forms.append(WeakForm(simulator, motions, zero, stiff, wanted.stride) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], library)
 
@@ -180,7 +178,7 @@ class _LawSearch:
             "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),
             "fibres": _family(0.1 * self.shear) if library.families else {},
         }
-        guess = {name: value for name, value in self._guess().items() if name in ("c10", "bulk_1", *VISCOSITIES)}
+        guess = {name: value for name, value in self.guess.items() if name in ("c10", "bulk_1", *VISCOSITIES)}
         best = self._refine(LawClass((), guess, math.nan), names)
         tried = [best]
         for name, added in groups.items():
@@ -201,7 +199,7 @@ class _LawSearch:
         union: dict[str, float] = {}
         for law in laws:
             union |= {name: value if _is_shape(name) else 0.0 for name, value in law.items()}
-        simulator = self._simulator({**union, **laws[0]}, settled=True)
+        simulator = self._simulator({**union, **laws[0]})
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         own = self._others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
         values |= {name: value.expand(len(laws)) for name, value in own.items()}

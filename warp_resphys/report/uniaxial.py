@@ -3,7 +3,7 @@
 The energy and its constants are those of `kernels.materials.convex`; here it is a function of three principal
 stretches, along axes of which one is the direction of fibres. Uniaxial: the sides are free of stress, so that the
 nominal stress is dW/ds_1 at dW/ds_2 = dW/ds_3 = 0. Viscosity and relaxing branches carry no stress in slow loading.
-Verified against the kernels in `tests/report/test_law.py`.
+Verified against the kernels in `tests/report/test_law_section.py`.
 """
 
 import re

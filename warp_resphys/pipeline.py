@@ -35,6 +35,7 @@ from .experiment.files import (
     REPORT,
     ROLLOUTS,
     SCALED_DATASET,
+    SHAPES,
     TIMES,
     TRUTH,
     fold_folder,
@@ -52,6 +53,7 @@ from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
+from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
 from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
@@ -83,6 +85,7 @@ from .settings.stages import (
     ReconstructStage,
     ReduceStage,
     RefineStage,
+    ShapesStage,
     SimulateStage,
     SplitReportStage,
     TimeStage,
@@ -200,6 +203,12 @@ def learning_stages(
         of_law = of_law.model_copy(update={"files": of_law.files | given})
         add("identify_law", identify_law, (LAW_FILE,), of_law)
         needs = (*needs, "identify_law")
+    if run.shapes:
+        assert run.data.steps is not None
+        others = ShapesStage.of(run, **common, steps=run.data.steps)
+        bodies = [own for shape in run.shapes.values() for own in (shape, shape.target_body)]
+        others = others.model_copy(update={"files": {**others.files, **files_read(run, *bodies)}})
+        add("shapes", try_shapes, (SHAPES,), others)
     reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
     learned = []
     for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:
@@ -230,7 +239,7 @@ def learning_stages(
         add("mesh_check", check_mesh, (MESH_CHECK,), MeshCheckStage.of(run, **tested))
     if run.control is not None:
         stages += control_stages(run, run.control, common, workers)
-    last = tuple(stage.name for stage in stages if stage.name in ("evaluate", "time", "mesh_check", "drive"))
+    last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))
     shown = SplitReportStage(config=shown_of(run), acquired=acquired)
     stages.append(Stage("report", make_report, (REPORT,), shown, last))
     return stages

@@ -28,7 +28,7 @@ from ..learning.release import estimate_release
 from ..learning.replay import Replay, Start
 from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
 from ..settings.run import PublishedSettings, models_of
-from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, TestStage, TimeStage
+from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, ShapesStage, TestStage, TimeStage
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, marker_view_of
 from .files import (
@@ -129,7 +129,7 @@ class Experiment:
 
     @property
     def _target(self) -> TargetSettings:
-        assert isinstance(self.settings, TimeStage)
+        assert isinstance(self.settings, TimeStage | ShapesStage)
         assert self.settings.target is not None
         return self.settings.target
 

@@ -31,6 +31,7 @@ REGISTRATION: Final = "registration.json"
 IDENTIFICATION: Final = "identification.json"
 LAW_FILE: Final = "law.json"
 LAW_FORMAT: Final = 1
+SHAPES: Final = "shapes.json"
 RECONSTRUCTION: Final = "reconstruction.json"
 ROLLOUTS: Final = "rollouts.h5"
 ERRORS: Final = "errors.json"

@@ -48,7 +48,7 @@ def identify(context: StageContext) -> None:
     }
     kinds = {model: MODELS[model][0] for model in ranges}
     evaluations = len(ranges) * wanted.starts * wanted.max_evaluations
-    kept = {part: _Checkpoint(context, part) for part in (*ranges, _LANDSCAPE)}
+    kept = {part: Checkpoint(context, part) for part in (*ranges, _LANDSCAPE)}
     done = sum(kept[model].evaluations for model in ranges)
     identified, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
@@ -91,7 +91,7 @@ def _placement(experiment: Experiment) -> dict[str, Any]:
     return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
-class _Checkpoint:
+class Checkpoint:
     """Checkpoint of the finished work of a part, deleted at the end of the stage; ignored if the settings changed."""
 
     def __init__(self, context: StageContext, part: str) -> None:
@@ -119,7 +119,7 @@ def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
 
 
 def _search(
-    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: _Checkpoint, progress: Progress
+    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: Checkpoint, progress: Progress
 ) -> dict[str, Any]:
     """`Identification` of a model from a first guess, as plain data; resumes an interrupted search."""
     if "found" in kept.content:
@@ -142,7 +142,7 @@ def _search(
 
 
 def _landscape(
-    identifier: Identifier, counts: Mapping[str, int], identified: Mapping[str, float], kept: _Checkpoint
+    identifier: Identifier, counts: Mapping[str, int], identified: Mapping[str, float], kept: Checkpoint
 ) -> dict[str, Any]:
     """Losses on a grid over the ranges of parameters, the others at their identified values."""
     finished = kept.content.get("losses", [])

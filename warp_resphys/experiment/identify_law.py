@@ -4,20 +4,25 @@ Where the trials give the states of all vertices, the weak form fits every class
 smallest one that is close to the best on the validation trials is refined through the simulator. With markers alone,
 groups of terms are added one after the other, each time refined through the simulator, and stay in if the validation
 trials are closer. The other identified parameters are refined with the law.
+
+A law of another run stays as it is; the parameters of actuators and of the medium are identified with it.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 
+from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
+from ..fem.stretches import principal_stretches
 from ..io.files import write_json
 from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint
 from ..io.stages import StageContext, package_versions
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identification, Identifier
@@ -29,7 +34,7 @@ from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
 from .experiment import LAW, Experiment
 from .files import LAW_FILE, LAW_FORMAT, read_law
-from .identify import bounds_of
+from .identify import Checkpoint, bounds_of
 from .trials import evenly
 
 _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
@@ -47,17 +52,16 @@ Replays = Sequence[tuple[Replay, Start]]
 def identify_law(context: StageContext) -> None:
     """Writes law.json: the law, its posterior, the classes that were tried, and whether it is used.
 
+    A run that is interrupted keeps the classes of the weak form and the finished searches.
+
     Raises:
         DataFileError: the file of the law is missing, damaged or of another version.
     """
     settings: IdentifyLawStage = context.settings
-    if settings.law.file is not None:
-        content = read_law(Path(settings.law.file).expanduser())
-        write_json(
-            context.run_dir / LAW_FILE, {**content, "accepted": True, "parameters": {}, "file": settings.law.file}
-        )
-        return
-    _LawSearch(context, Experiment(settings, context.run_dir, "count")).run()
+    search = _LawSearch(context, Experiment(settings, context.run_dir, "count"))
+    content = search.run() if settings.law.file is None else search.given(settings.law.file)
+    write_json(context.run_dir / LAW_FILE, content)
+    forget_checkpoint(search.kept.path)
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,7 @@ class _LawSearch:
 
     def __init__(self, context: StageContext, experiment: Experiment) -> None:
         self.context, self.experiment = context, experiment
+        self.kept = Checkpoint(context, "law")
         self.settings: IdentifyLawStage = context.settings
         split = self.settings.split
         self.checked = split.validation or split.train
@@ -83,10 +88,12 @@ class _LawSearch:
         self.guess = self._guess()
         self.shear = 2.0 * self.guess["c10"]
 
-    def run(self) -> None:
-        """Writes law.json."""
-        wanted, split = self.settings.law, self.settings.split
-        names = split.train if wanted.trials is None else tuple(evenly(split.train, wanted.trials))
+        wanted = self.settings.law
+        self.names = split.train if wanted.trials is None else tuple(evenly(split.train, wanted.trials))
+
+    def run(self) -> dict[str, Any]:
+        """Identifies a law; returns the content of law.json."""
+        wanted = self.settings.law
         shortest, longest = wanted.relaxation_times
         library = Library(
             terms=tuple(wanted.terms),
@@ -95,33 +102,70 @@ class _LawSearch:
             families=wanted.families,
         )
         if self.states:
-            classes = self._from_states(library)
+            if "classes" not in self.kept.content:
+                self.kept.keep(classes=[asdict(own) for own in self._from_states(library)])
+            classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in self.kept.content["classes"]]
             scores = self._scores([law.constants for law in classes], self.checked)
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
-            best = self._refine(classes[smallest], names)
+            best = self._refine(classes[smallest])
         else:
-            refined = self._from_markers(library, names)
+            refined = self._from_markers(library)
             classes, scores = [own.law for own in refined], [own.score for own in refined]
             best = refined[-1]
         below = self._score_below()
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
-        uncertainty = best.found.uncertainty
-        content = {
+        return {
             "format": LAW_FORMAT,
             "accepted": best.score < _CLOSER * below,
             "groups": list(best.law.groups),
             "constants": best.law.constants,
             "units": {name: _unit(name) for name in best.law.constants},
             "parameters": best.others,
-            "deviation": {} if uncertainty is None else uncertainty.deviation,
+            "deviation": _deviation(best.found),
             "at_bounds": list(best.found.at_bounds),
             "loss": best.found.loss,
             "validation": {"trials": list(self.checked), "law": best.score, "below": below},
             "classes": tried,
-            "data": {"name": self.settings.name, "trials": list(names)},
+            "stretches": self._stretches(best),
+            "data": {"name": self.settings.name, "trials": list(self.names)},
             "versions": package_versions(),
         }
-        write_json(self.context.run_dir / LAW_FILE, content)
+
+    def given(self, file: str) -> dict[str, Any]:
+        """Identifies the parameters beside a law of another run; returns the content of law.json."""
+        content = read_law(Path(file).expanduser())
+        constants: dict[str, float] = content["constants"]
+        simulator, others, found = self._simulator(constants), dict[str, float](), None
+        if bounds := self._bounds_of_others(simulator):
+            found = self._search("given", simulator, bounds, {})
+            others = found.parameters
+        score = self._scores([constants], self.checked, others)[0]
+        return {
+            **content,
+            "accepted": True,
+            "file": file,
+            "parameters": others,
+            "deviation": content.get("deviation", {}) | _deviation(found),
+            "at_bounds": [*content.get("at_bounds", ()), *(() if found is None else found.at_bounds)],
+            "validation": {"trials": list(self.checked), "law": score, "below": self._score_below()},
+        }
+
+    def _stretches(self, best: "_Refined") -> list[float]:
+        """Returns the least and the largest principal stretch in the training trials."""
+        dataset, mesh = self.experiment.dataset, self.experiment.body.mesh
+        if self.states:
+            positions = dataset.observed[dataset.rows(self.names)].reshape(-1, *mesh.vertices.shape)
+            stretches = principal_stretches(mesh, positions)
+        else:
+            simulator = self._simulator(best.law.constants)
+            values = {name: simulator.tensor([value]) for name, value in best.others.items()}
+            with torch.no_grad():
+                bodies = [
+                    Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).flatten(0, 2)
+                    for replay, start in self._replays(simulator, self.names)
+                ]
+            stretches = np.concatenate([principal_stretches(mesh, q.cpu().numpy()) for q in bodies])
+        return [float(np.nanmin(stretches)), float(np.nanmax(stretches))]
 
     def _guess(self) -> dict[str, float]:
         """Returns a neo-Hookean law with the moduli and the viscosity of the identified material."""
@@ -171,7 +215,7 @@ class _LawSearch:
         own = self.experiment.simulator("simulation").materials[""].quantities
         return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
 
-    def _from_markers(self, library: Library, names: Sequence[str]) -> list["_Refined"]:
+    def _from_markers(self, library: Library) -> list["_Refined"]:
         """Returns the classes that were tried through the simulator, the best last; groups that help stay in."""
         groups = {
             "elastic": dict.fromkeys(library.terms, 0.0),
@@ -179,12 +223,12 @@ class _LawSearch:
             "fibres": _family(0.1 * self.shear) if library.families else {},
         }
         guess = {name: value for name, value in self.guess.items() if name in ("c10", "bulk_1", *VISCOSITIES)}
-        best = self._refine(LawClass((), guess, math.nan), names)
+        best = self._refine(LawClass((), guess, math.nan))
         tried = [best]
         for name, added in groups.items():
             if added:
                 law = LawClass((*best.law.groups, name), {**best.law.constants, **added}, math.nan)
-                tried.append(self._refine(law, names))
+                tried.append(self._refine(law))
                 if tried[-1].score < _CLOSER * best.score:
                     best = tried[-1]
         return [own for own in tried if own is not best] + [best]
@@ -220,32 +264,54 @@ class _LawSearch:
         simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
         return self._errors(simulator, self.experiment.parameters("sysid"), self.checked, 1)[0]
 
-    def _refine(self, law: LawClass, names: Sequence[str]) -> "_Refined":
+    def _refine(self, law: LawClass) -> "_Refined":
         """Returns a law that is refined through the simulator, with the other identified parameters."""
-        wanted = self.settings.law
         guess = dict(law.constants)
-        if wanted.viscous:
+        if self.settings.law.viscous:
             guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
         simulator = self._simulator(guess)
-        bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)}
-        others = {name: float(value) for name, value in self._others(simulator).items()}
-        if self.settings.identify is not None:
-            bounds |= {name: bounds_of(self.settings.identify.parameters[name]) for name in others}
-        step = _FINE if self.states else _COARSE
-        identifier = Identifier(self._replays(simulator, names), bounds, wanted.seconds, difference=step)
-        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
-
-            def report(_: int, loss: float, values: Mapping[str, float]) -> None:
-                progress.advance(1, loss=f"{loss:.3g}", c10=f"{values['c10']:.4g}")
-
-            start = {name: (guess | others)[name] for name in bounds}
-            found = identifier.run([start], wanted.max_evaluations, report, tolerance=wanted.tolerance)
+        others = self._bounds_of_others(simulator)
+        bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)} | others
+        found = self._search(" ".join(law.groups), simulator, bounds, guess)
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         weak = {n for n, value in refined.items() if _unit(n) == "Pa" and value < _LEAST * self.shear and n != "c10"}
         weak |= {n for n in VISCOSITIES if refined.get(n, 1.0) < 1e-6 * self.shear}
         kept = {name: value for name, value in refined.items() if name not in weak or _is_of_group(name)}
         after = {name: found.parameters[name] for name in others}
         return _Refined(replace(law, constants=kept), after, found, self._scores([kept], self.checked, after)[0])
+
+    def _bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:
+        """Returns the ranges of the identified parameters that are not those of the material."""
+        if self.settings.identify is None:
+            return {}
+        return {name: bounds_of(self.settings.identify.parameters[name]) for name in self._others(simulator)}
+
+    def _search(
+        self, key: str, simulator: Simulator, bounds: Mapping[str, Bounds], guess: Mapping[str, float]
+    ) -> Identification:
+        """Returns the parameters that are closest to the training trials, from a guess and SysID's values.
+
+        Args:
+            key: of the checkpoint.
+            simulator: with a law.
+            bounds: of the parameters.
+            guess: of the constants of the law that are among them.
+        """
+        wanted, finished = self.settings.law, self.kept.content.get("searches", {})
+        step = _FINE if self.states else _COARSE
+        identifier = Identifier(self._replays(simulator, self.names), bounds, wanted.seconds, difference=step)
+        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
+
+            def report(_: int, loss: float, values: Mapping[str, float]) -> None:
+                name, value = next(iter(values.items()))
+                progress.advance(1, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
+
+            def keep(attempts: list[Any]) -> None:
+                self.kept.keep(searches={**finished, key: attempts})
+
+            start = {name: {**self.sysid, **guess}[name] for name in bounds}
+            done = finished.get(key, ())
+            return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
 
     def _bounds(self, name: str, value: float) -> Bounds:
         if name == "bulk_1":
@@ -262,6 +328,11 @@ class _LawSearch:
         if name in VISCOSITIES:
             return Bounds(0.0, max(4.0 * value, (0.01 if name == "shear_viscosity" else 1.0) * self.shear))
         return Bounds(0.0, max(4.0 * value, self.shear))
+
+
+def _deviation(found: Identification | None) -> dict[str, float]:
+    """Standard deviations of identified parameters; none where they are not known."""
+    return {} if found is None or found.uncertainty is None else found.uncertainty.deviation
 
 
 def _is_shape(name: str) -> bool:

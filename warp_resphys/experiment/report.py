@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
-from ..fem.elements import physical_gradients
+from ..fem.stretches import principal_stretches
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
-from ..mesh.elements import BY_NODES
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
 from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
@@ -46,6 +45,7 @@ from .files import (
     REPORT,
     ROLLOUTS,
     SCALED_DATASET,
+    SHAPES,
     STATIC,
     TIMES,
     TRUTH,
@@ -57,7 +57,6 @@ from .files import (
 )
 
 FloatArray = NDArray[np.float64]
-_MOST_STATES = 400  # of which stretches are computed
 
 
 def make_report(context: StageContext) -> None:
@@ -161,12 +160,14 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     if law:
-        law = {key: law[key] for key in ("accepted", "groups", "constants", "validation", "data")}
+        kept = ("accepted", "groups", "constants", "validation", "data", "file")
+        law = {key: law[key] for key in kept if key in law}
         law["against"] = "sysid" if "sysid" in identified else "simulation"
     more = {
         "law": law,
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
         "control": read_if_there(folder / CONTROL) if run.control is not None else {},
+        "shapes": read_if_there(folder / SHAPES) if run.shapes else {},
         "mesh_check": {} if run.mesh_check is None else read_if_there(folder / MESH_CHECK),
         "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if run.timing else {},
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
@@ -252,14 +253,8 @@ def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | 
 
 def _stretch_range(mesh: Mesh, positions: FloatArray) -> tuple[float, float]:
     """Least and largest principal stretch at the centres of the cells of some states (S, N, 3) [m]."""
-    element = BY_NODES[mesh.cells.shape[1]]
-    centre = element.shape.nodes[: element.nodes - len(element.parents)].mean(axis=0)
-    gradients, _ = physical_gradients(mesh.vertices, mesh.cells, element.shape(centre[None])[1])
-    chosen = positions[:: max(1, len(positions) // _MOST_STATES)]
-    deformation = np.einsum("scki,ckj->scij", chosen[:, mesh.cells], gradients[:, 0])
-    finite = deformation[np.isfinite(deformation).all((-2, -1))]
-    values = np.linalg.svd(finite, compute_uv=False)
-    return float(values.min()), float(values.max())
+    stretches = principal_stretches(mesh, positions)
+    return float(np.nanmin(stretches)), float(np.nanmax(stretches))
 
 
 def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:

@@ -137,21 +137,36 @@ def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Tr
     """Initial states of trials, by ``data.kind``, or as a trial is held by itself."""
     common = [trial.amount for trial in trials if trial.load is None]
     states = [_common_state(simulator, data, np.array(common))] if common else []
-    states += [_held_alone(simulator, data, trial.load) for trial in trials if trial.load is not None]
+    states += [_alone(simulator, data, trial.load) for trial in trials if trial.load is not None]
     order = np.argsort([k for own in (True, False) for k, t in enumerate(trials) if (t.load is None) == own])
     whole = State(torch.cat([s.q for s in states]), torch.cat([s.v for s in states]))
     return whole.map(lambda values: values[torch.as_tensor(order, device=values.device)])
 
 
-def _held_alone(simulator: Simulator, data: SimulatedData, held: HeldSettings) -> State:
+def _alone(simulator: Simulator, data: SimulatedData, held: HeldSettings) -> State:
     assert isinstance(data, ReleaseFromLoad)
+    return held_alone(simulator, held, held.at or data.load, "data.others" if held.at else "data.load")
+
+
+def held_alone(simulator: Simulator, held: HeldSettings, load: PlaceSettings, key: str) -> State:
+    """Returns the state (1, N, 3) of a body that is held in a way of its own.
+
+    Args:
+        simulator: of the body.
+        held: how it is held.
+        load: vertices that carry the weight.
+        key: of these vertices in the configuration, for errors.
+
+    Raises:
+        InputError: all vertices of the place are fixed.
+    """
     if held.twist_deg:
         angle = simulator.tensor([math.radians(held.twist_deg)])
         q = twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
         return State(q, torch.zeros_like(q))
     along = np.asarray(held.direction, dtype=np.float64) / np.linalg.norm(held.direction)
     force = 1e-3 * held.weight_g * float(np.linalg.norm(simulator.gravity)) * along
-    return _under_forces(simulator, held.at or data.load, force[None], "data.others" if held.at else "data.load")
+    return _under_forces(simulator, load, force[None], key)
 
 
 def _common_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:

@@ -87,9 +87,14 @@ def law_text(law: Mapping[str, Any]) -> str:
     base = _BASES[law.get("against", "simulation")]
     own, below = (_of_amplitude(checked[key]) for key in ("law", "below"))
     verdict = "is used" if law["accepted"] else "is not used, and no model builds on it"
+    head, tail = f"The identified law of the material {verdict}", ""
+    if law.get("file"):
+        head = f"The law of {law['file']} is used as it was given"
+        closer = checked["below"] is None or (checked["law"] is not None and checked["law"] < checked["below"])
+        tail = "" if closer else " It does not help here: leave law out."
     return (
-        f"The identified law of the material {verdict}: on the {where}, its root mean square error is {own} of the "
-        f"motion's amplitude, and that of {base} is {below}."
+        f"{head}: on the {where}, its root mean square error is {own} of the motion's amplitude, and that of {base} is "
+        f"{below}.{tail}"
     )
 
 

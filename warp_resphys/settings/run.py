@@ -27,6 +27,7 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import PlaceSettings
+from .shapes import ShapeSettings
 from .trials import (
     BindingSettings,
     DataSettings,
@@ -89,6 +90,9 @@ class RunSettings(SimulatorSettings):
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
     law: Annotated[LawSettings | None, BeforeValidator(_law_of, json_schema_input_type=LawSettings | str | None)] = (
         setting(None, "law of the material to identify; null: none")
+    )
+    shapes: dict[str, ShapeSettings] = setting(
+        {}, "other bodies by name, on which the identified material is tested, where a simulation plays the real body"
     )
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     network: NetworkSettings = NetworkSettings()
@@ -225,6 +229,11 @@ class RunSettings(SimulatorSettings):
                 raise ValueError("markers is null, but data.kind is recorded: name the markers, with their places.")
             raise ValueError(
                 f"data.kind is {self.data.kind!r}, in which all vertices are observed: leave markers null."
+            )
+        if self.shapes and (self.recorded is not None or (self.identify is None and self.law is None)):
+            why = "nothing is identified" if self.recorded is None else "data.kind is recorded"
+            raise ValueError(
+                f"shapes are bodies with the identified material of a simulated target, but {why}: leave shapes out."
             )
         if self.recorded is None and self.target is None:
             raise ValueError("target is null: give the simulation that plays the real body, such as its material.")

@@ -23,6 +23,7 @@ from .learning import (
 )
 from .mesh import PlaceSettings
 from .run import PublishedSettings, RunSettings
+from .shapes import ShapeSettings
 from .trials import (
     BindingSettings,
     MarkerSettings,
@@ -115,6 +116,14 @@ class IdentifyLawStage(LearningStage):
     law: LawSettings
     identify: IdentifySettings | None
     name: str
+
+
+class ShapesStage(LearningStage):
+    """Other bodies with the identified material."""
+
+    target: TargetSettings
+    shapes: dict[str, ShapeSettings]
+    steps: int
 
 
 class ReconstructStage(LearningStage):

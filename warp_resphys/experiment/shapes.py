@@ -1,0 +1,144 @@
+"""Stage: puts the identified material on other bodies, and compares them with targets of the same shapes.
+
+The target of a shape has the material of the run's target, its passive muscles (fibres in the material), its time step
+and its integrator. It is held or inflated, released, and its state at the release is that of the models, as in the
+simulated trials of a run (`experiment.simulate`).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..dynamics.simulator import Simulator
+from ..fem.stretches import principal_stretches
+from ..io.errors import ConvergenceError, InputError
+from ..io.files import read_json, write_json
+from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint
+from ..io.stages import StageContext
+from ..learning.metrics import marker_errors, summarise
+from ..settings.body import BodySettings, SimulatorSettings
+from ..settings.shapes import ShapeSettings
+from ..settings.stages import ShapesStage
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .actuators import driving_quantity
+from .build import build_body, build_simulator
+from .experiment import LAW, Experiment
+from .files import LAW_FILE, SHAPES
+from .identify import Checkpoint
+from .simulate import held_alone
+from .target import substeps_of, target_settings, vertices_in
+
+FloatArray = NDArray[np.float64]
+
+
+def try_shapes(context: StageContext) -> None:
+    """Writes shapes.json: for every shape the errors of the models [mm], and how far it moves.
+
+    An interrupted run keeps the finished shapes.
+
+    Raises:
+        ConvergenceError: the target of a shape fails.
+        InputError: inputs do not fit a shape.
+    """
+    settings: ShapesStage = context.settings
+    experiment = Experiment(settings, context.run_dir, "count")
+    kept = Checkpoint(context, "shapes")
+    results: dict[str, Any] = dict(kept.content.get("shapes", {}))
+    with Progress(context.name, len(settings.shapes), "bodies", len(results)) as progress:
+        for name, shape in settings.shapes.items():
+            if name not in results:
+                try:
+                    results[name] = _compared(experiment, settings, shape)
+                except InputError as error:
+                    raise InputError(f"shapes.{name}: {error}") from error
+                except ConvergenceError as error:
+                    raise ConvergenceError(
+                        f"shapes.{name}, its target: {error}", error.positions, error.report
+                    ) from error
+                kept.keep(shapes=results)
+                progress.advance(1, body=name)
+    write_json(context.run_dir / SHAPES, results)
+    forget_checkpoint(kept.path)
+
+
+def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> dict[str, Any]:
+    """Returns the result of a shape."""
+    target = _target(settings, shape)
+    plain = build_body(BodySettings.of(shape))
+    seen = vertices_in(target.body.mesh, plain.mesh).to(target.rest_positions)
+    with torch.no_grad():
+        start = _held(target, shape)
+        states = _rolled(target, start, settings.steps, substeps_of(settings.time_step, settings.target, "target"))
+        observed = torch.stack([seen(state.q)[0] for state in states]).cpu().numpy()
+        begin = State(seen(start.q), seen(start.v))
+        errors = {}
+        for model in (
+            "simulation",
+            *(("sysid",) if settings.identified else ()),
+            *((LAW,) if experiment.has_law else ()),
+        ):
+            simulator, values = _model(experiment, model, shape)
+            its_steps = round(settings.time_step / simulator.time_step)
+            rolled = _rolled(simulator, begin, settings.steps, its_steps, values)
+            points = torch.stack([state.q[0] for state in rolled]).cpu().numpy()
+            errors[model] = summarise([marker_errors(points, observed)])["mean"]
+    moved = 1e3 * np.linalg.norm(observed - plain.mesh.vertices, axis=-1)
+    found = {"vertices": len(plain.mesh.vertices), "moved_mm": float(moved.max()), "errors_mm": errors}
+    if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
+        found["outside"] = _outside(principal_stretches(plain.mesh, observed), *law["stretches"])
+    return found
+
+
+def _target(settings: ShapesStage, shape: ShapeSettings) -> Simulator:
+    """Returns the simulator of the target of a shape."""
+    target, body = settings.target, shape.target_body
+    own = {key: getattr(body, key) for key in BodySettings.model_fields} | {"physics": target.physics}
+    if shape.muscles is None and target.muscles is not None and target.muscles.commanded is None:
+        own["muscles"] = target.muscles
+    made_of = target_settings(SimulatorSettings.of(settings), target).model_copy(update=own)
+    return build_simulator(made_of, target.material)
+
+
+def _model(experiment: Experiment, model: str, shape: ShapeSettings) -> tuple[Simulator, dict[str, torch.Tensor]]:
+    """Returns the simulator of a model on a shape, and the identified values of its material's constants."""
+    kind = experiment.sources(model)[0]
+    body = {key: getattr(shape, key) for key in BodySettings.model_fields}
+    made_of, material = experiment.settings_of(kind).model_copy(update=body), experiment.material_of(kind)
+    simulator = build_simulator(made_of, material, on_failure="count")
+    known = simulator.materials[""].quantities
+    return simulator, {name: value for name, value in experiment.parameters(model).items() if name in known}
+
+
+def _held(simulator: Simulator, shape: ShapeSettings) -> State:
+    """Returns the state before the release."""
+    if shape.held is not None:
+        return held_alone(simulator, shape.held, shape.held.at or shape.fixed, "held.at")
+    quantity = driving_quantity(shape)
+    if quantity is None:
+        raise InputError(
+            "inputs are given, but it has neither chambers nor tendons nor commanded muscles: leave them out."
+        )
+    return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))
+
+
+def _rolled(
+    simulator: Simulator, state: State, steps: int, substeps: int, values: Mapping[str, torch.Tensor] | None = None
+) -> list[State]:
+    """Returns the states from the release on, at the time steps of the run."""
+    constants, states = simulator.prepare(values or {}), [state]
+    for _ in range(steps):
+        for _ in range(substeps):
+            state, _ = simulator.step(state, Inputs(), constants)
+        states.append(state)
+    return states
+
+
+def _outside(stretches: FloatArray, low: float, high: float) -> float:
+    """Returns the share of cells and states in which a principal stretch lies outside of a range."""
+    beyond = (stretches.min(-1) < low) | (stretches.max(-1) > high)
+    return float(beyond.mean())

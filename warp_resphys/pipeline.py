@@ -66,6 +66,7 @@ from .report.conclusions import conclusions, errors_by_load
 from .report.control_section import controller_name
 from .report.data import other_trials
 from .report.page import number_text
+from .report.shapes_section import shapes_table, shapes_text
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
 from .settings.run import RunSettings
@@ -389,9 +390,21 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
         console.print(_driven(metrics["control"]["tracking"]))
     if "noise_mm" in metrics:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
+    if metrics.get("shapes"):
+        console.print(_of_shapes(metrics["shapes"]))
+        console.print(shapes_text(metrics["shapes"]), soft_wrap=True)
     for sentence in conclusions(metrics, run):
         console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
+
+
+def _of_shapes(shapes: Mapping[str, Any]) -> Table:
+    """Table of the errors on other bodies."""
+    shown = shapes_table(shapes)
+    table = Table("body", *shown.columns, title=shown.head)
+    for row in shown.rows:
+        table.add_row(row.head, *(", ".join(filter(None, (cell.text, cell.small))) for cell in row.cells))
+    return table
 
 
 def _driven(tracking: Mapping[str, Mapping[str, Any]]) -> Table:

@@ -46,6 +46,7 @@ from .sections import (
     scales_section,
     training_section,
 )
+from .shapes_section import shapes_section
 from .verdict import unbroken, verdict
 
 _LOG = logging.getLogger(__name__)
@@ -340,6 +341,7 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     reconstruction_section,
     identification_section,
     law_section,
+    shapes_section,
     registration_section,
     quality_section,
     training_section,

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ..io.files import write_text
 from ..io.setting_errors import Schema, in_words, options
-from .body import TargetSettings
+from .body import BodySettings, TargetSettings
 from .run import RunSettings
 
 _HEAD: Final = """# Settings
@@ -37,6 +37,8 @@ _LEFT_OUT: Final = (
     "Any of the keys {} of the run, and `material` with the keys of `simulation`, replaces that of the simulator as a "
     "whole, and those that are left out are those of the simulator that is corrected."
 )
+_SHAPE: Final = "shapes.NAME"
+_OF_SHAPE: Final = "It has the keys {} of a body, of which `mesh` and `fixed` are required.\n"
 
 
 def page() -> str:
@@ -61,9 +63,11 @@ def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) ->
         if path:
             yield f"{kind.get('description', '')}\n"
         shared = [name for name in TargetSettings.model_fields if path in _TARGETS]
+        if path == _SHAPE:
+            shared = [*BodySettings.model_fields]
         if shared:
             names = ", ".join(f"`{name}`" for name in shared if name != "material")
-            yield f"{_LEFT_OUT.format(names)}{_TARGETS[path]}\n"
+            yield _OF_SHAPE.format(names) if path == _SHAPE else f"{_LEFT_OUT.format(names)}{_TARGETS[path]}\n"
         own = {name: key for name, key in kind["properties"].items() if name not in shared}
         groups = {name: key for name, key in own.items() if _groups_of(schema, key)}
         rows = [_row(schema, kind, name, key) for name, key in own.items() if name not in groups]
@@ -78,7 +82,7 @@ def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) ->
             if path or null != "default":
                 meaning = group.get("description", "")
                 yield f"`{at}` is a group, {null}{f': {meaning}' if meaning else ''}.\n"
-            content = json.dumps([option.get("title") for option in options(schema, inner)])
+            content = json.dumps([option["title"] for option in options(schema, inner) if "title" in option])
             if shown.setdefault(content, f"{at}{suffix}") != f"{at}{suffix}":
                 yield f"`{at}{suffix}` has the keys of `{shown[content]}`.\n"
                 continue

@@ -13,7 +13,7 @@ from .trials import HeldSettings
 class ShapeSettings(BodySettings):
     """Another body of the same material, simulated beside a target of its own: held, released, and compared.
 
-    It has none of the actuators of the first body.
+    It has its own actuators alone.
     """
 
     target_mesh: MeshSettings | None = setting(None, "mesh of its target; null: the same")

@@ -189,6 +189,12 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
     differences = (ahead - behind) / 2e-4
     assert float(differences.abs().min()) > 0.0
     torch.testing.assert_close(gradient[0] * scale, differences, rtol=1e-4, atol=1e-5 * float(differences.abs().max()))
+    points = torch.cat([at[None], at + 0.1 * steps])
+    varied = replay.varied(release, dict(zip(replay.parameter_names, points.mT, strict=True)))
+    along = replay.errors(varied).square().sum((1, 2, 3, 4))
+    torch.testing.assert_close(
+        (along[1:] - along[0]) / 1e-5, differences, rtol=1e-3, atol=1e-4 * float(differences.abs().max())
+    )
 
 
 def test_markers_that_were_not_seen_have_no_influence():

@@ -1,7 +1,8 @@
 """Stage: identifies the law of the material from the training trials, and accepts it if it helps on validation trials.
 
 Where the trials give the states of all vertices, the weak form fits every class of laws (`learning.law`), and the
-smallest one that is close to the best on the validation trials is refined through the simulator. With markers alone,
+smallest one that is close to the best on the validation trials is refined through the simulator, and larger ones that
+balance the forces clearly better, too. With markers alone,
 groups of terms are added one after the other, each time refined through the simulator, and stay in if the validation
 trials are closer. The other identified parameters are refined with the law.
 
@@ -39,12 +40,11 @@ from .trials import evenly
 
 _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
+_BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 _CLOSER: Final = 0.95  # ratio of validation errors below which a law, or more terms, are worth while
+_GROUPED: Final = ("prony", "fibre")
+_OF_MASS: Final = ("density", "mass_damping")
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a refined coefficient is zero
-
-# Steps of differences, as fractions of ranges: motions without noise have narrow valleys.
-_FINE: Final = 1e-5
-_COARSE: Final = 1e-3
 
 Replays = Sequence[tuple[Replay, Start]]
 
@@ -70,6 +70,7 @@ class _Refined:
 
     law: LawClass
     others: dict[str, float]  # identified parameters that are not those of the material
+    names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
     found: Identification
     score: float  # error on the validation trials
 
@@ -107,12 +108,12 @@ class _LawSearch:
             classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in self.kept.content["classes"]]
             scores = self._scores([law.constants for law in classes], self.checked)
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
-            best = self._refine(classes[smallest])
+            best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
             refined = self._from_markers(library)
             classes, scores = [own.law for own in refined], [own.score for own in refined]
             best = refined[-1]
-        below = self._score_below()
+        below, deviation = self._score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
@@ -121,8 +122,8 @@ class _LawSearch:
             "constants": best.law.constants,
             "units": {name: _unit(name) for name in best.law.constants},
             "parameters": best.others,
-            "deviation": _deviation(best.found),
-            "at_bounds": list(best.found.at_bounds),
+            "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
+            "at_bounds": [name for name, old in best.names.items() if old in best.found.at_bounds],
             "loss": best.found.loss,
             "validation": {"trials": list(self.checked), "law": best.score, "below": below},
             "classes": tried,
@@ -150,6 +151,16 @@ class _LawSearch:
             "validation": {"trials": list(self.checked), "law": score, "below": self._score_below()},
         }
 
+    def _enlarged(self, best: "_Refined", classes: Sequence[LawClass]) -> "_Refined":
+        """Returns the best refined law of larger classes that balance the forces clearly better."""
+        residual = min(own.residual for own in classes if _refined_groups(own) == _refined_groups(best.law))
+        for law in classes:
+            if _refined_groups(law) > _refined_groups(best.law) and law.residual < _BALANCED * residual:
+                larger = self._refine(law)
+                if larger.score * _CLOSE < best.score:
+                    best, residual = larger, law.residual
+        return best
+
     def _stretches(self, best: "_Refined") -> list[float]:
         """Returns the least and the largest principal stretch in the training trials."""
         dataset, mesh = self.experiment.dataset, self.experiment.body.mesh
@@ -168,7 +179,7 @@ class _LawSearch:
         return [float(np.nanmin(stretches)), float(np.nanmax(stretches))]
 
     def _guess(self) -> dict[str, float]:
-        """Returns a neo-Hookean law with the moduli and the viscosity of the identified material."""
+        """Returns a neo-Hookean law with the moduli, the viscosity and the creep of the identified material."""
         material = self.experiment.simulator("simulation").materials[""]
         known = {name: float(torch.as_tensor(value)) for name, value in material.constants.items()}
         known |= {name: value for name, value in self.sysid.items() if name in known}
@@ -181,12 +192,15 @@ class _LawSearch:
             "bulk_1": 0.5 * volume,
             **dict(zip(VISCOSITIES, (time * mu, time * volume), strict=True)),
         }
+        ratios = [(known.get(f"prony_ratio_{k}", 0.0), known.get(f"prony_time_{k}", 0.0)) for k in (1, 2)]
+        relaxing = [(ratio * mu, time) for ratio, time in ratios if ratio > _LEAST]
+        guess |= _branches([modulus for modulus, _ in relaxing], [time for _, time in relaxing])
         return {**guess, "density": known["density"], "mass_damping": known["mass_damping"]}
 
     def _simulator(self, constants: Mapping[str, float]) -> Simulator:
         """Returns the simulator of the identified model with a law; failed steps are counted."""
         settings = self.experiment.settings_of("identified")
-        common = {name: self.guess[name] for name in ("density", "mass_damping")}
+        common = {name: self.guess[name] for name in _OF_MASS}
         material = MaterialSettings.model_validate({"model": LAW, **common, **constants})
         return build_simulator(settings, material, self.experiment.body, on_failure="count")
 
@@ -222,7 +236,9 @@ class _LawSearch:
             "branches": _branches([0.1 * self.shear] * 2, library.times[:: max(len(library.times) - 1, 1)]),
             "fibres": _family(0.1 * self.shear) if library.families else {},
         }
-        guess = {name: value for name, value in self.guess.items() if name in ("c10", "bulk_1", *VISCOSITIES)}
+        guess = {name: value for name, value in self.guess.items() if name not in _OF_MASS}
+        if any(name.startswith("prony") for name in guess):
+            del groups["branches"]
         best = self._refine(LawClass((), guess, math.nan))
         tried = [best]
         for name, added in groups.items():
@@ -274,11 +290,10 @@ class _LawSearch:
         bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)} | others
         found = self._search(" ".join(law.groups), simulator, bounds, guess)
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
-        weak = {n for n, value in refined.items() if _unit(n) == "Pa" and value < _LEAST * self.shear and n != "c10"}
-        weak |= {n for n in VISCOSITIES if refined.get(n, 1.0) < 1e-6 * self.shear}
-        kept = {name: value for name, value in refined.items() if name not in weak or _is_of_group(name)}
-        after = {name: found.parameters[name] for name in others}
-        return _Refined(replace(law, constants=kept), after, found, self._scores([kept], self.checked, after)[0])
+        names = _strong(refined, self.shear)
+        kept, after = ({n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others})
+        score = self._scores([kept], self.checked, after)[0]
+        return _Refined(replace(law, constants=kept), after, {**names, **{n: n for n in others}}, found, score)
 
     def _bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:
         """Returns the ranges of the identified parameters that are not those of the material."""
@@ -298,8 +313,7 @@ class _LawSearch:
             guess: of the constants of the law that are among them.
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
-        step = _FINE if self.states else _COARSE
-        identifier = Identifier(self._replays(simulator, self.names), bounds, wanted.seconds, difference=step)
+        identifier = Identifier(self._replays(simulator, self.names), bounds, wanted.seconds)
         with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
 
             def report(_: int, loss: float, values: Mapping[str, float]) -> None:
@@ -313,10 +327,20 @@ class _LawSearch:
             done = finished.get(key, ())
             return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
 
+    def _prior_of_modulus(self) -> Prior | None:
+        """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""
+        wanted = None if self.settings.identify is None else self.settings.identify.parameters.get("youngs_modulus")
+        if wanted is None or wanted.prior is None:
+            return None
+        share = self.guess["c10"] / self.sysid["youngs_modulus"]
+        return Prior(share * wanted.prior.mean, share * wanted.prior.deviation)
+
     def _bounds(self, name: str, value: float) -> Bounds:
         if name == "bulk_1":
             mean = max(value, self.shear)
             return Bounds(0.1 * mean, 10.0 * mean, True, Prior(mean, mean))
+        if name == "c10":
+            return Bounds(0.0, max(4.0 * value, self.shear), prior=self._prior_of_modulus())
         if name.startswith("prony_time"):
             return Bounds(value / 4.0, 4.0 * value, True)
         if name.startswith(("fibre_azimuth", "fibre_elevation")):
@@ -328,6 +352,11 @@ class _LawSearch:
         if name in VISCOSITIES:
             return Bounds(0.0, max(4.0 * value, (0.01 if name == "shear_viscosity" else 1.0) * self.shear))
         return Bounds(0.0, max(4.0 * value, self.shear))
+
+
+def _refined_groups(law: LawClass) -> set[str]:
+    """Groups of terms of a law when it is refined, which adds viscosities."""
+    return {*law.groups, "viscosity"}
 
 
 def _deviation(found: Identification | None) -> dict[str, float]:
@@ -344,8 +373,23 @@ def _is_refined(name: str) -> bool:
     return not name.startswith(("fibre_stiffening", "fibre_compression"))
 
 
-def _is_of_group(name: str) -> bool:
-    return name.startswith(("prony", "fibre"))
+def _strong(constants: Mapping[str, float], shear: float) -> dict[str, str]:
+    """Names of constants by their names without terms, branches and families that hardly resist, which are left out.
+
+    Args:
+        constants: of a law.
+        shear: shear modulus of the material [Pa].
+    """
+    weak = {name for name, value in constants.items() if _unit(name) == "Pa" and value < _LEAST * shear}
+    weak |= {name for name in VISCOSITIES if constants.get(name, 1.0) < 1e-6 * shear}
+    kept = {name: name for name in constants if name == "c10" or not (name in weak or name.startswith(_GROUPED))}
+    for leading in ("prony_modulus_", "fibre_tension_"):
+        group = leading.split("_")[0]
+        strong = [name.removeprefix(leading) for name in constants if name.startswith(leading) and name not in weak]
+        for number, old in enumerate(strong, 1):
+            members = [name for name in constants if name.startswith(group) and name.endswith(f"_{old}")]
+            kept |= {f"{name.removesuffix(old)}{number}": name for name in members}
+    return kept
 
 
 def _unit(name: str) -> str:

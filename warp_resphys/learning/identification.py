@@ -1,7 +1,7 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
-`linalg.least_squares` minimises the `Misfit` within bounds, from the best of a coarse set of starts, with gradients
-through the simulator.
+`linalg.least_squares` minimises the `Misfit` within bounds, from the best of a coarse set of starts, with derivatives
+along the motions (`Replay.varied`).
 """
 
 import math
@@ -52,7 +52,6 @@ class Identifier:
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         labels: names of the markers, where `accuracy` is given.
         centre: (3,) about which recordings may be rotated [m].
-        difference: step of differences for derivatives, as a fraction of a range.
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
@@ -66,9 +65,8 @@ class Identifier:
         accuracy: Accuracy | None = None,
         labels: Sequence[str] = (),
         centre: Sequence[float] = (0.0, 0.0, 0.0),
-        difference: float = 1e-3,
     ) -> None:
-        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre, difference)
+        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre)
         self._labels = tuple(labels)
 
     @property
@@ -186,27 +184,23 @@ class Identifier:
         """Result of one start: the parameters, their loss (None if the simulation fails there) and the history."""
         misfit, history = self._misfit, list[dict[str, float]]()
 
-        def objective(unit: FloatArray) -> tuple[float, FloatArray]:
-            loss, gradient = misfit.loss_and_gradient(unit)
-            values = misfit.from_unit(unit)
-            if np.isfinite(loss):
+        def objective(unit: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+            linear, values = misfit.linearise(unit), misfit.from_unit(unit)
+            failed = linear is None or not np.isfinite(linear.gauss_newton).all()
+            loss = math.inf if linear is None or failed else linear.loss
+            if not failed:
                 history.append({"loss": loss, **values})
             if report is not None:
                 report(number, loss, values)
-            return loss, gradient
-
-        def hessian(unit: FloatArray) -> FloatArray | None:
-            linearised = misfit.linearise(unit)
-            if linearised is None:
-                return None
-            trials, prior = linearised
-            return 2.0 * (np.stack([j.T @ j for _, j, _ in trials]).sum(0) + prior.T @ prior)
+            if linear is None or failed:
+                return loss, np.zeros_like(unit), np.zeros((len(unit), len(unit)))
+            return loss, linear.gradient, linear.gauss_newton
 
         first = misfit.to_unit(start)
         misfit.prior_weight = 0.0
         misfit.forget()
         misfit.update_prior_weight(first)
-        problem = UnitBox(objective, hessian)
+        problem = UnitBox(objective)
         point = problem.evaluate(torch.as_tensor(first)[None])
         simulated = math.isfinite(float(point.value))
         if simulated:

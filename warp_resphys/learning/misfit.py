@@ -26,6 +26,7 @@ from .replay import Replay, Start
 from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
+_DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +42,6 @@ class Misfit:
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         centre: (3,) about which recordings may be rotated [m].
-        difference: step of differences for derivatives, as a fraction of a range.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -59,7 +59,6 @@ class Misfit:
         seconds: float | None = None,
         accuracy: Accuracy | None = None,
         centre: Sequence[float] = (0.0, 0.0, 0.0),
-        difference: float = 1e-3,
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -69,7 +68,7 @@ class Misfit:
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
-        self.prior_weight, self._difference = 0.0, difference
+        self.prior_weight = 0.0
         self._accuracy, self._centre = accuracy, self.simulator.tensor(list(centre))
         self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
         self._replays: list[tuple[Replay, Start]] = []
@@ -133,51 +132,32 @@ class Misfit:
                 left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
         return losses
 
-    def loss_and_gradient(self, unit: FloatArray) -> tuple[float, FloatArray]:
-        """Loss of (P,) parameters and its gradient; infinite and zero where the simulation fails."""
-        x = self.simulator.tensor(unit)[None].requires_grad_()
-        try:
-            with torch.enable_grad():
-                loss = self.losses(x)[0]
-                (gradient,) = torch.autograd.grad(loss, x)
-        except ConvergenceError:
-            return np.inf, np.zeros_like(unit)
-        self._keep_equilibria(x)
-        return float(loss.detach()), gradient[0].double().cpu().numpy()
+    def linearise(self, unit: FloatArray, derivatives: bool = True) -> "LinearMisfit | None":
+        """Linearises the residuals at (P,) parameters; None where the simulation fails.
 
-    def linearise(
-        self, unit: FloatArray, central: bool = False, derivatives: bool = True
-    ) -> tuple[list[Linearised], FloatArray] | None:
-        """Weighted residuals of every trial and their derivatives by (P,) parameters, from finite differences.
+        Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into the range.
 
-        One-sided differences point into the range; central ones are taken at least one step away from its bounds.
-
-        Returns:
-            For every trial, its residuals (T, 3 M), derivatives (3 T M, P) and number of seen coordinates; and the
-            derivatives (K, P) of the prior residuals. None where a simulation fails.
+        Args:
+            unit: the parameters, as fractions of their ranges.
+            derivatives: whether to compute derivatives; they are zero otherwise.
         """
-        count, steps = len(unit), self._difference * np.where(unit < 0.5, 1.0, -1.0)
-        if central:
-            unit = np.clip(unit, self._difference, 1.0 - self._difference)
-        sides = [unit[None], unit + np.diag(steps), unit - np.diag(steps)]
-        used = sides[: 3 if central else 2] if derivatives else sides[:1]
-        points = self.simulator.tensor(np.concatenate(used))
+        steps = _DIFFERENCE * np.where(unit < 0.5, 1.0, -1.0)
+        points = self.simulator.tensor(np.concatenate([unit[None], unit + np.diag(steps)][: 1 + derivatives]))
         try:
             with torch.no_grad():
                 if derivatives and not any(self._equilibria):
                     self._find_equilibria(points[:1])
-                residuals, prior = self._residuals(points)
+                residuals, prior = self._residuals(points, varied=derivatives)
         except ConvergenceError:
             return None
-        self._keep_equilibria(points[: count + 1])
+        self._keep_equilibria(points)
 
         def slopes(values: FloatArray) -> FloatArray:
             """(..., P) derivatives of values (E, ...) at the points."""
             if not derivatives:
-                return np.zeros((*values.shape[1:], count))
-            behind, width = (values[count + 1 :], 2.0 * steps) if central else (values[:1], steps)
-            change = values[1 : count + 1] - behind
-            return np.moveaxis(change / width.reshape(-1, *[1] * (change.ndim - 1)), 0, -1)
+                return np.zeros((*values.shape[1:], len(unit)))
+            change = values[1:] - values[:1]
+            return np.moveaxis(change / steps.reshape(-1, *[1] * (change.ndim - 1)), 0, -1)
 
         trials = list[Linearised]()
         for (replay, _), errors, weight in zip(self._replays, residuals, self._weights, strict=True):
@@ -186,7 +166,8 @@ class Misfit:
             seen = replay.trials.observed.shape[-1] * replay.trials.seen.sum((1, 2)).cpu().numpy()
             rows = weighted[0].reshape(*weighted.shape[1:3], -1)
             trials += zip(rows, jacobian, seen.tolist(), strict=True)
-        return trials, slopes(prior.double().cpu().numpy())
+        rows = prior.double().cpu().numpy()
+        return LinearMisfit(trials, rows[0], slopes(rows))
 
     def update_prior_weight(self, unit: FloatArray) -> float:
         """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
@@ -196,7 +177,7 @@ class Misfit:
         linearised = self.linearise(unit, derivatives=False)
         if linearised is None:
             return 1.0
-        trials, _ = linearised
+        trials = linearised.trials
         seen = sum(count for *_, count in trials)
         squares = [np.square(rows).sum() * redundancy(rows) for rows, _, _ in trials]
         self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
@@ -204,8 +185,10 @@ class Misfit:
 
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
         """Uncertainty of (P,) parameters; None if a simulation close by fails."""
-        linearised = self.linearise(unit, central=True)
-        return None if linearised is None else uncertainty_of(*linearised, self.prior_weight, self.bounds, unit)
+        found = self.linearise(unit)
+        if found is None:
+            return None
+        return uncertainty_of(found.trials, found.prior_slopes, self.prior_weight, self.bounds, unit)
 
     def placement(self, unit: FloatArray) -> Placement | None:
         """The best placement of the markers with (P,) parameters; None where it is exact."""
@@ -217,9 +200,9 @@ class Misfit:
             self._keep_equilibria(x)
             return self._placed([points[0] for points in series])[0]
 
-    def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+    def _residuals(self, unit: torch.Tensor, varied: bool = False) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
-        series = self._simulated(unit)
+        series = self._simulated(unit, varied)
         weight = math.sqrt(self.prior_weight)
         priors = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
         columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in priors]
@@ -261,12 +244,13 @@ class Misfit:
         """(E,) values of each parameter."""
         return {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
 
-    def _simulated(self, unit: torch.Tensor) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m]."""
+    def _simulated(self, unit: torch.Tensor, varied: bool = False) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m], alike if they are `varied`."""
         values, simulated = self._values(unit), []
         for (replay, start), equilibria in zip(self._replays, self._equilibria, strict=True):
             begin = start if equilibria is None else start.near(equilibria.predicted(unit.detach()))
-            simulated.append(replay(begin, values))
+            alike = varied and not replay.is_static
+            simulated.append(replay.varied(begin, values) if alike else replay(begin, values))
         return simulated
 
     def _find_equilibria(self, unit: torch.Tensor) -> None:
@@ -296,6 +280,32 @@ class Misfit:
                 steps = (unit[1:] - unit[:1]).diagonal()
                 slopes = (torch.stack(others) - first) / steps[:, None, None, None]
             self._equilibria[number] = _Equilibria(unit[0], first, slopes)
+
+
+@dataclass(frozen=True)
+class LinearMisfit:
+    """Weighted residuals at some parameters and their derivatives, whose squares sum to the loss."""
+
+    trials: list[Linearised]
+    prior: FloatArray  # (K,) weighted residuals of the priors
+    prior_slopes: FloatArray  # (K, P)
+
+    @property
+    def loss(self) -> float:
+        """Sum of the squares."""
+        return float(sum(np.square(rows).sum() for rows, _, _ in self.trials) + np.square(self.prior).sum())
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(P,) gradient of the loss."""
+        parts = [jacobian.T @ rows.ravel() for rows, jacobian, _ in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
+
+    @property
+    def gauss_newton(self) -> FloatArray:
+        """(P, P) Gauss-Newton matrix of the loss."""
+        parts = [jacobian.T @ jacobian for _, jacobian, _ in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ at once, and interpolates the observation at the times of the frames. All of it 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -186,6 +187,48 @@ class Replay:
             state, _ = self.simulator.step(state, inputs.at(k).plus(added), constants)
             series.append(self.observe(state.q))
         return self.at_frames(torch.stack(series, 1), start).unflatten(0, (sets, -1))
+
+    @torch.no_grad()
+    def varied(self, start: Start, parameters: Parameters) -> torch.Tensor:
+        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first.
+
+        The first set is simulated. In each of its steps, with the solution x, the residual g(x) and its derivative H,
+        the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from there: differences
+        to the first set are exact to first order, for one factor and one residual each.
+
+        Args:
+            start: of the R trials.
+            parameters: (E,) values, by any of `parameter_names`; E is two or more.
+
+        Raises:
+            ConvergenceError: see `Simulator.step`.
+        """
+        sets, count = _count(parameters), len(self.trials.names)
+        constants, _, resting = self.prepare(parameters)
+        whole = self.initial_state(start, constants, resting, sets)
+        state, varied = whole.map(lambda t: t[:count]), whole.map(lambda t: t[count:])
+        own, inputs, _ = self.prepare({name: value[:1] for name, value in parameters.items()})
+        their, their_inputs, _ = self.prepare({name: value[1:] for name, value in parameters.items()})
+        series = [self.observe(whole.q)]
+        for k in range(self.steps(start)):
+            now = inputs.at(k)
+            solved, _ = self.simulator.step(state, now, own)
+            x = self.simulator.method.solution_for(state, solved.q)
+            here = self._beside[0].linearise(state, now, own)
+            here.factorise(x)
+            residual = here.residual(x)
+            there = self._beside[1].linearise(varied, their_inputs.at(k), their)
+            at = x.repeat(sets - 1, 1, 1)
+            forces = (there.residual(at) - residual.repeat(sets - 1, 1, 1)).unflatten(0, (sets - 1, count))
+            moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
+            state, varied = solved, there.finish(at - moved.permute(3, 0, 1, 2).flatten(0, 1))
+            series.append(self.observe(torch.cat([state.q, varied.q])))
+        return self.at_frames(torch.stack(series, 1), start).unflatten(0, (sets, -1))
+
+    @cached_property
+    def _beside(self) -> tuple[Simulator, Simulator]:
+        """Simulators whose buffers the steps of this one do not use."""
+        return replace(self.simulator), replace(self.simulator)
 
     def at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
         """(E R, T, M, 3) points at the frames [m], from points (E R, K + 1, M, 3) at the steps."""

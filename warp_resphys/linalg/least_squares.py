@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 Array = NDArray[np.float64]
-Objective = Callable[[Array], tuple[float, Array]]
+Objective = Callable[[Array], tuple[float, Array, Array]]
 Move = Callable[[torch.Tensor], torch.Tensor]
 
 _DECREASE, _INCREASE, _MAX_DAMPING = 0.1, 10.0, 1e12
 _MARQUARDT = 1e-2  # a damping of one adds this fraction of a diagonal entry to it
 _RIDGE = 1e-10  # fraction of the trace added to the diagonal, against motion in directions without influence
-_LARGEST_STEP, _FIRST_STEP = 0.25, 0.1  # fractions of the range of a variable
+_LARGEST_STEP = 0.25  # fraction of the range of a variable
 _SMALL = 1e-4
 
 
@@ -110,30 +110,23 @@ class UnitBox(Problem):
     value, or over 1e-4 if that is larger.
 
     Args:
-        objective: maps variables (P,) to value and gradient; the value is infinite if the evaluation fails.
-        matrix: maps variables (P,) to the Gauss-Newton matrix 2 J^T J (P, P), or to None if it is not available: then
-            the last matrix gets a BFGS update.
+        objective: maps variables (P,) to the value, its gradient (P,) and the Gauss-Newton matrix 2 J^T J (P, P); the
+            value is infinite if the evaluation fails.
     """
 
-    def __init__(self, objective: Objective, matrix: Callable[[Array], Array | None]) -> None:
-        self._objective, self._matrix = objective, matrix
-        self._last: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
-        value, gradient = self._objective(x[0].numpy())
-        return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None],))
+        value, gradient, matrix = self._objective(x[0].numpy())
+        return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None], x.new_tensor(matrix)[None]))
 
     @override
     def linearise(self, point: Point) -> Move:
-        (x,), (gradient,) = point.x, point.kept[0]
-        gauss_newton = self._matrix(x.numpy())
-        if gauss_newton is None or not np.isfinite(gauss_newton).all() or not np.trace(gauss_newton) > 0.0:
-            matrix = self._updated(x, gradient)
-        else:
-            added = _RIDGE * np.trace(gauss_newton)
-            matrix = torch.as_tensor(gauss_newton) + added * torch.eye(len(x), dtype=x.dtype)
-        self._last = x, gradient, matrix
+        (x,), (gradient,), (gauss_newton,) = point.x, *point.kept
+        added = _RIDGE * float(gauss_newton.trace()) or 1.0
+        matrix = gauss_newton + added * torch.eye(len(x), dtype=x.dtype)
         bounds = (-x).clamp_min(-_LARGEST_STEP).numpy(), (1.0 - x).clamp_max(_LARGEST_STEP).numpy()
 
         def step(damping: torch.Tensor) -> torch.Tensor:
@@ -143,17 +136,6 @@ class UnitBox(Problem):
             return (x + torch.as_tensor(change)).clamp(0.0, 1.0)[None]
 
         return step
-
-    def _updated(self, x: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-        """Returns the BFGS update of the last matrix; at first, a multiple of one that limits the first step."""
-        if self._last is None:
-            return torch.eye(len(x), dtype=x.dtype) * (gradient.norm() / _FIRST_STEP).clamp_min(1e-12)
-        matrix = self._last[2]
-        s, y = x - self._last[0], gradient - self._last[1]
-        if not s @ y > 1e-10 * s.norm() * y.norm():
-            return matrix
-        product = matrix @ s
-        return matrix - product.outer(product) / (s @ product) + y.outer(y) / (s @ y)
 
     @override
     def distance(self, old: Point, new: Point) -> torch.Tensor:

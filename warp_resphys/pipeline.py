@@ -401,9 +401,9 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
 def _of_shapes(shapes: Mapping[str, Any]) -> Table:
     """Table of the errors on other bodies."""
     shown = shapes_table(shapes)
-    table = Table("body", *shown.columns, title=shown.head)
+    table = Table("body", *shown.columns, title=f"{shown.head}, and the share that is removed")
     for row in shown.rows:
-        table.add_row(row.head, *(", ".join(filter(None, (cell.text, cell.small))) for cell in row.cells))
+        table.add_row(row.head, *(f"{cell.text}{cell.small.replace('removes', ',')}" for cell in row.cells))
     return table
 
 

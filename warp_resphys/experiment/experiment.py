@@ -203,8 +203,14 @@ class Experiment:
         """How a trial begins."""
         return self.dataset.begins[self.dataset.names.index(name)]
 
-    def start(self, replay: Replay, model: str = "simulation") -> Start:
-        """Estimates how the trials of a replay begin, with the simulator of a model."""
+    def start(self, replay: Replay, model: str = "simulation", parameters: Mapping[str, float] | None = None) -> Start:
+        """Estimates how the trials of a replay begin, with the simulator of a model.
+
+        Args:
+            replay: of trials that begin in the same way.
+            model: whose identified parameters the simulator has.
+            parameters: values of these parameters, if they are not those of the finished identification.
+        """
         simulator, trials = replay.simulator, replay.trials
         begins = self.begins(trials.names[0])
         if begins == GIVEN:
@@ -213,7 +219,9 @@ class Experiment:
             v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         if begins == "released":
-            return estimate_release(simulator, replay.observe, trials, self.settings.release)
+            known = self.parameters(model) if parameters is None else _tensors(parameters, simulator)
+            values = {name: value for name, value in known.items() if name in replay.parameter_names}
+            return estimate_release(simulator, replay.observe, trials, self.settings.release, values or None)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
@@ -245,8 +253,7 @@ class Experiment:
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
-        values = self.identification(model).get("parameters", {})
-        return {name: torch.tensor([x]).to(self.like) for name, x in values.items()}
+        return _tensors(self.identification(model).get("parameters", {}), self.simulator("simulation"))
 
     @property
     def models(self) -> list[str]:
@@ -359,3 +366,8 @@ def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> 
         near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
         positions[r, near, m] = CubicSpline(t, y)(steps[near])
     return positions
+
+
+def _tensors(values: Mapping[str, float], simulator: Simulator) -> dict[str, torch.Tensor]:
+    """(1,) values of parameters."""
+    return {name: simulator.tensor([value]) for name, value in values.items()}

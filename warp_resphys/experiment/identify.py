@@ -23,7 +23,7 @@ from .files import IDENTIFICATION
 from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
-_LANDSCAPE = "landscape"
+_LANDSCAPE, _AGAIN = "landscape", "{}_again"
 _AT_ONCE = 4  # points of the landscape per batch
 
 Replays = Sequence[tuple[Replay, Start]]
@@ -34,7 +34,8 @@ def identify(context: StageContext) -> None:
 
     E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
     the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
-    training trials. An interrupted run keeps its finished starts, searches and points.
+    training trials. Releases are estimated again with the identified parameters, which are then refined. An interrupted
+    run keeps its finished starts, searches and points.
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
@@ -47,9 +48,10 @@ def identify(context: StageContext) -> None:
         if search
     }
     kinds = {model: MODELS[model][0] for model in ranges}
-    evaluations = len(ranges) * wanted.starts * wanted.max_evaluations
-    kept = {part: Checkpoint(context, part) for part in (*ranges, _LANDSCAPE)}
-    done = sum(kept[model].evaluations for model in ranges)
+    released = any(experiment.begins(name) == "released" for name in names)
+    evaluations = len(ranges) * (wanted.starts + released) * wanted.max_evaluations
+    kept = {part: Checkpoint(context, part) for part in (*ranges, *map(_AGAIN.format, ranges), _LANDSCAPE)}
+    done = sum(part.evaluations for part in kept.values())
     identified, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
@@ -58,7 +60,13 @@ def identify(context: StageContext) -> None:
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
             guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
             guess = {name: guess[name] for name in bounds}
-            identified[model] = _search(settings, identifier, guess, kept[model], progress) | {"first_guess": guess}
+            found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
+            if released:  # The release was estimated with the first guess.
+                values = found["parameters"]
+                replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
+                identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
+                found = _search(settings, identifier, values, kept[_AGAIN.format(model)], progress, 1)
+            identified[model] = found | {"first_guess": guess}
     if wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
@@ -119,14 +127,19 @@ def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
 
 
 def _search(
-    settings: IdentifyStage, identifier: Identifier, guess: Mapping[str, float], kept: Checkpoint, progress: Progress
+    settings: IdentifyStage,
+    identifier: Identifier,
+    guess: Mapping[str, float],
+    kept: Checkpoint,
+    progress: Progress,
+    count: int,
 ) -> dict[str, Any]:
     """`Identification` of a model from a first guess, as plain data; resumes an interrupted search."""
     if "found" in kept.content:
         return dict(kept.content["found"])
     wanted = settings.identify
     if "starts" not in kept.content:
-        starts = identifier.starts(guess, wanted.starts, wanted.candidates, settings.seed)
+        starts = identifier.starts(guess, count, wanted.candidates, settings.seed)
         kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:

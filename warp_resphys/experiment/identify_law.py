@@ -84,6 +84,7 @@ class _LawSearch:
         self.settings: IdentifyLawStage = context.settings
         split = self.settings.split
         self.checked = split.validation or split.train
+        self.released = any(experiment.begins(name) == "released" for name in self.settings.split.train)
         self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
         self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
         self.guess = self._guess()
@@ -288,7 +289,11 @@ class _LawSearch:
         simulator = self._simulator(guess)
         others = self._bounds_of_others(simulator)
         bounds = {name: self._bounds(name, value) for name, value in guess.items() if _is_refined(name)} | others
-        found = self._search(" ".join(law.groups), simulator, bounds, guess)
+        key = " ".join(law.groups)
+        found = self._search(key, simulator, bounds, guess)
+        if self.released:  # The release was estimated with the first guess.
+            guess |= {name: value for name, value in found.parameters.items() if name in guess}
+            found = self._search(f"{key} again", self._simulator(guess), bounds, guess, found.parameters)
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         names = _strong(refined, self.shear)
         kept, after = ({n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others})
@@ -302,7 +307,12 @@ class _LawSearch:
         return {name: bounds_of(self.settings.identify.parameters[name]) for name in self._others(simulator)}
 
     def _search(
-        self, key: str, simulator: Simulator, bounds: Mapping[str, Bounds], guess: Mapping[str, float]
+        self,
+        key: str,
+        simulator: Simulator,
+        bounds: Mapping[str, Bounds],
+        guess: Mapping[str, float],
+        others: Mapping[str, float] | None = None,
     ) -> Identification:
         """Returns the parameters that are closest to the training trials, from a guess and SysID's values.
 
@@ -311,6 +321,7 @@ class _LawSearch:
             simulator: with a law.
             bounds: of the parameters.
             guess: of the constants of the law that are among them.
+            others: guess of the other ones, in place of SysID's values.
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
         identifier = Identifier(self._replays(simulator, self.names), bounds, wanted.seconds)
@@ -323,7 +334,7 @@ class _LawSearch:
             def keep(attempts: list[Any]) -> None:
                 self.kept.keep(searches={**finished, key: attempts})
 
-            start = {name: {**self.sysid, **guess}[name] for name in bounds}
+            start = {name: {**self.sysid, **(others or {}), **guess}[name] for name in bounds}
             done = finished.get(key, ())
             return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
 

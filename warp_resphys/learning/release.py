@@ -19,7 +19,7 @@ from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .replay import Replay, Start
+from .replay import Parameters, Replay, Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
@@ -29,7 +29,13 @@ _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
-def estimate_release(simulator: Simulator, markers: Observation, motions: Trials, settings: ReleaseSettings) -> Start:
+def estimate_release(
+    simulator: Simulator,
+    markers: Observation,
+    motions: Trials,
+    settings: ReleaseSettings,
+    parameters: Parameters | None = None,
+) -> Start:
     """Returns the start of every motion, estimated with a simulator.
 
     Args:
@@ -37,30 +43,32 @@ def estimate_release(simulator: Simulator, markers: Observation, motions: Trials
         markers: maps positions of the vertices (B, N, 3) to markers (B, M, 3) [m].
         motions: observed trials.
         settings: see the class.
+        parameters: (1,) values that replace the simulator's, by name.
 
     Raises:
         ConvergenceError: the body cannot be held, or a step of the simulation fails.
     """
-    q = hold(Replay(simulator, markers, motions), settings.hold_modes)
+    q = hold(Replay(simulator, markers, motions), settings.hold_modes, parameters)
     release = Start(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
-    return _initial_motion(simulator, markers, motions.first(settings.window), release, settings)
+    return _initial_motion(simulator, markers, motions.first(settings.window), release, settings, parameters)
 
 
-def hold(replay: Replay, modes: int) -> torch.Tensor:
+def hold(replay: Replay, modes: int, parameters: Parameters | None = None) -> torch.Tensor:
     """Positions (R, N, 3) at rest under gravity, weights and the virtual force that fits the held markers best [m].
 
     Args:
         replay: of the trials, with their held markers.
         modes: number of columns of B (see `_HoldProblem`), the inertial forces of the slowest vibrations.
+        parameters: (1,) values that replace the simulator's, by name.
 
     Raises:
         ConvergenceError: no equilibrium was found.
     """
     if modes == 0:
         with torch.no_grad():
-            constants, _, resting = replay.prepare()
+            constants, _, resting = replay.prepare(parameters)
             return replay.simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names)).q
-    problem = _HoldProblem(replay, modes)
+    problem = _HoldProblem(replay, modes, parameters)
     return minimise(problem, problem.straight, _HOLD_TOLERANCE, _HOLD_ITERATIONS).point.kept[0]
 
 
@@ -71,9 +79,9 @@ class _HoldProblem(Problem):
     residual of the held markers (R, 3 M), and its derivative (R, 3 M, modes) [m].
     """
 
-    def __init__(self, replay: Replay, modes: int) -> None:
+    def __init__(self, replay: Replay, modes: int, parameters: Parameters | None) -> None:
         with torch.no_grad():
-            self._constants, _, self._resting = replay.prepare()
+            self._constants, _, self._resting = replay.prepare(parameters)
         self._replay, self._basis = replay, vibration_modes(replay.simulator, modes)
         count = len(replay.trials.names)
         self._near, none = replay.simulator.rest_state(count).q, self._basis.new_zeros(count, modes)
@@ -113,7 +121,12 @@ class _HoldProblem(Problem):
 
 
 def _initial_motion(
-    simulator: Simulator, markers: Observation, motions: Trials, held: Start, settings: ReleaseSettings
+    simulator: Simulator,
+    markers: Observation,
+    motions: Trials,
+    held: Start,
+    settings: ReleaseSettings,
+    parameters: Parameters | None,
 ) -> Start:
     """Returns the starts with the smallest error in the first frames (`_ReleaseModel`).
 
@@ -127,7 +140,7 @@ def _initial_motion(
     delays = simulator.tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
     start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
     copies = motions.select(list(range(count)) * len(delays) * (1 + unknowns))
-    problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise)
+    problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise, parameters)
     solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, settings.iterations).point
     best = solution.value.view(-1, count).argmin(0)
     return model(solution.x.view(-1, count, unknowns)[best, torch.arange(count, device=best.device)])
@@ -142,17 +155,20 @@ class _FirstFrames(Problem):
         replay: of 1 + P copies of the trials, for P unknowns.
         model: maps unknowns to releases.
         noise: see `ReleaseSettings` [m].
+        parameters: (1,) values that replace the simulator's.
     """
 
-    def __init__(self, replay: Replay, model: "_ReleaseModel", noise: float) -> None:
-        self._replay, self._model, self._noise = replay, model, noise
+    def __init__(
+        self, replay: Replay, model: "_ReleaseModel", noise: float, parameters: Parameters | None = None
+    ) -> None:
+        self._replay, self._model, self._noise, self._parameters = replay, model, noise, parameters
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
         runs, unknowns = x.shape
         identity = torch.eye(unknowns, dtype=x.dtype, device=x.device)
         offsets = torch.cat([torch.zeros_like(identity[:1]), _DIFFERENCE * identity]).repeat_interleave(runs, 0)
-        simulated = self._replay(self._model(x.repeat(1 + unknowns, 1) + offsets))
+        simulated = self._replay(self._model(x.repeat(1 + unknowns, 1) + offsets), self._parameters)
         residual = self._replay.errors(simulated)[0].flatten(1).unflatten(0, (-1, runs)) / self._noise
         slope = ((residual[1:] - residual[0]) / _DIFFERENCE).permute(1, 2, 0)
         gradient = (slope.mT @ residual[0][..., None])[..., 0] + x

@@ -1,0 +1,207 @@
+"""Simulators with laws on the trials of an experiment, and their errors there."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import torch
+
+from ..dynamics.simulator import Simulator
+from ..learning.bounds import Bounds, Prior
+from ..learning.law import VISCOSITIES
+from ..learning.replay import Replay, Start
+from ..settings.body import MaterialSettings
+from ..settings.stages import IdentifyLawStage
+from .build import build_simulator
+from .experiment import LAW, Experiment
+from .identify import bounds_of
+
+LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
+_UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
+_OF_MASS: Final = ("density", "mass_damping")
+_EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
+
+Replays = Sequence[tuple[Replay, Start]]
+
+
+class LawTrials:
+    """The trials of an experiment, simulated with laws.
+
+    A law is tested on validation trials. Without any, it is identified from the first part of the training trials, and
+    tested on the rest of them, which SysID has seen.
+
+    Args:
+        experiment: the experiment.
+
+    Attributes:
+        checked: names of the trials that laws are tested on.
+        states: whether all vertices are observed.
+        sysid: parameters of SysID by name; empty if nothing was identified.
+        guess: constants of a law with the moduli, the viscosity and the creep of the identified material.
+        shear: its shear modulus [Pa].
+        seconds: duration of the trials that may be learned from [s]; None for whole trials.
+    """
+
+    def __init__(self, experiment: Experiment) -> None:
+        settings = experiment.settings
+        assert isinstance(settings, IdentifyLawStage)
+        self.experiment, self.settings, split = experiment, settings, settings.split
+        self.checked = split.validation or split.train
+        self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
+        self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
+        self.guess, self.mass = self._guess()
+        self.shear = 2.0 * self.guess["c10"]
+        self.seconds = settings.trial_seconds
+        if settings.train_fraction < 1.0:
+            longest = float(experiment.dataset.times.max())
+            self.seconds = min(settings.train_fraction * longest, self.seconds or math.inf)
+
+    @property
+    def early(self) -> float | None:
+        """Duration from which a law is identified before it is tested on the same trials [s]; None with validation."""
+        if self.settings.split.validation:
+            return None
+        return _EARLY * (self.seconds or float(self.experiment.dataset.times.max()))
+
+    def simulator(self, constants: Mapping[str, float]) -> Simulator:
+        """Returns the simulator of the identified model with a law; failed steps are counted."""
+        settings = self.experiment.settings_of("identified")
+        material = MaterialSettings.model_validate({"model": LAW, **self.mass, **constants})
+        return build_simulator(settings, material, self.experiment.body, on_failure="count")
+
+    def others(self, simulator: Simulator) -> dict[str, torch.Tensor]:
+        """Returns (1,) identified parameters that are not those of the material."""
+        own = self.experiment.simulator("simulation").materials[""].quantities
+        return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
+
+    def bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:
+        """Returns the ranges of the identified parameters that are not those of the material."""
+        if self.settings.identify is None:
+            return {}
+        return {name: bounds_of(self.settings.identify.parameters[name]) for name in self.others(simulator)}
+
+    def replays(self, simulator: Simulator, names: Sequence[str]) -> Replays:
+        """Returns replays of trials, with the markers where SysID has placed them."""
+        return self.experiment.replays(simulator, names, "sysid" if self.sysid else "simulation")
+
+    def scores(
+        self, laws: Sequence[Mapping[str, float]], names: Sequence[str], others: Mapping[str, float] | None = None
+    ) -> list[float]:
+        """Returns the root mean square error of laws on trials, over the motion's amplitude; infinite if one fails."""
+        union: dict[str, float] = {}
+        for law in laws:
+            union |= {name: value if is_shape(name) else 0.0 for name, value in law.items()}
+        simulator = self.simulator({**union, **laws[0]})
+        values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
+        own = self.others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
+        values |= {name: value.expand(len(laws)) for name, value in own.items()}
+        return self._errors(simulator, values, names, len(laws))
+
+    def _errors(
+        self, simulator: Simulator, values: Mapping[str, torch.Tensor], names: Sequence[str], sets: int
+    ) -> list[float]:
+        total, begin = simulator.tensor(np.zeros(sets)), self.early or 0.0
+        with torch.no_grad():
+            for replay, start in self.replays(simulator, names):
+                own = replay.trials if self.seconds is None else replay.trials.first(self.seconds)
+                late = own.times >= begin
+                replay = Replay(simulator, replay.observe, own)
+                squares = replay.errors(replay(start, values)).square().sum((3, 4)) * late
+                seen = (own.seen.sum(2) * late).sum(1)
+                total += (squares.sum(2) / (seen * own.amplitude.square())).sum(1) / len(names)
+        return [math.sqrt(value) if math.isfinite(value) else math.inf for value in total.tolist()]
+
+    def score_below(self) -> float:
+        """Returns the error of the identified simulator, or of the uncorrected one."""
+        simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
+        return self._errors(simulator, self.experiment.parameters("sysid"), self.checked, 1)[0]
+
+    def _guess(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Returns a neo-Hookean law like the identified material, and its constants of the mass."""
+        material = self.experiment.simulator("simulation").materials[""]
+        known = {name: float(torch.as_tensor(value)) for name, value in material.constants.items()}
+        known |= {name: value for name, value in self.sysid.items() if name in known}
+        tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
+        lame = np.asarray(material.law.LAME).T @ [float(m) for m in material.moduli(tensors)]
+        mu, volume = float(lame[0]), float(lame[1])
+        time = known.get("stiffness_damping", 0.0)
+        guess = {
+            "c10": 0.5 * mu,
+            "bulk_1": 0.5 * volume,
+            **dict(zip(VISCOSITIES, (time * mu, time * volume), strict=True)),
+        }
+        ratios = [(known.get(f"prony_ratio_{k}", 0.0), known.get(f"prony_time_{k}", 0.0)) for k in (1, 2)]
+        relaxing = [(ratio * mu, time) for ratio, time in ratios if ratio > LEAST]
+        guess |= branches_of([modulus for modulus, _ in relaxing], [time for _, time in relaxing])
+        return guess, {name: known[name] for name in _OF_MASS}
+
+    def bounds(self, name: str, value: float) -> Bounds:
+        """Returns the range of a constant of a law, around its first guess."""
+        if name == "bulk_1":
+            mean = max(value, self.shear)
+            return Bounds(0.1 * mean, 10.0 * mean, True, Prior(mean, mean))
+        if name == "c10":
+            return Bounds(0.0, max(4.0 * value, self.shear), prior=self._prior_of_modulus())
+        if name.startswith("prony_time"):
+            return Bounds(value / 4.0, 4.0 * value, True)
+        if name.startswith(("fibre_azimuth", "fibre_elevation")):
+            return Bounds(value - 0.5, value + 0.5)
+        if name.startswith("fibre_slack"):
+            return Bounds(0.0, 0.1)
+        if name.startswith("fibre_toe"):
+            return Bounds(0.002, 0.1, True)
+        if name in VISCOSITIES:
+            return Bounds(0.0, max(4.0 * value, (0.01 if name == "shear_viscosity" else 1.0) * self.shear))
+        return Bounds(0.0, max(4.0 * value, self.shear))
+
+    def _prior_of_modulus(self) -> Prior | None:
+        """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""
+        wanted = None if self.settings.identify is None else self.settings.identify.parameters.get("youngs_modulus")
+        if wanted is None or wanted.prior is None:
+            return None
+        share = self.guess["c10"] / self.sysid["youngs_modulus"]
+        return Prior(share * wanted.prior.mean, share * wanted.prior.deviation)
+
+
+def unit_of(name: str) -> str:
+    """Unit of a constant of a law."""
+    words = {*name.split("_")}
+    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+
+
+def is_shape(name: str) -> bool:
+    """Whether a constant has no coefficient's meaning: a time, a direction, a slack or a toe."""
+    return unit_of(name) != "Pa" and name not in VISCOSITIES
+
+
+def is_refined(name: str) -> bool:
+    """Whether a constant is identified through the simulator."""
+    return not name.startswith(("fibre_stiffening", "fibre_compression"))
+
+
+def strong_names(constants: Mapping[str, float], shear: float) -> dict[str, str]:
+    """Names of constants by their names without terms, branches and families that hardly resist, which are left out.
+
+    Args:
+        constants: of a law.
+        shear: shear modulus of the material [Pa].
+    """
+    weak = {name for name, value in constants.items() if unit_of(name) == "Pa" and value < LEAST * shear}
+    weak |= {name for name in VISCOSITIES if constants.get(name, 1.0) < 1e-6 * shear}
+    kept = {
+        name: name for name in constants if name == "c10" or not (name in weak or name.startswith(("prony", "fibre")))
+    }
+    for leading in ("prony_modulus_", "fibre_tension_"):
+        group = leading.split("_")[0]
+        strong = [name.removeprefix(leading) for name in constants if name.startswith(leading) and name not in weak]
+        for number, old in enumerate(strong, 1):
+            members = [name for name in constants if name.startswith(group) and name.endswith(f"_{old}")]
+            kept |= {f"{name.removesuffix(old)}{number}": name for name in members}
+    return kept
+
+
+def branches_of(moduli: Sequence[float], times: Sequence[float], first: int = 1) -> dict[str, float]:
+    """Constants of branches by their moduli [Pa] and relaxation times [s], numbered from `first`."""
+    pairs = enumerate(zip(moduli, times, strict=True), first)
+    return {key: x for k, (m, t) in pairs for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))}

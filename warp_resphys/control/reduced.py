@@ -148,7 +148,7 @@ class ReducedModel:
     @cached_property
     def response(self) -> InputResponse:
         """Delay and lag of the inputs, and the filters whose outputs the network takes."""
-        return InputResponse(self.time_step, None, self.delay or None, self.rise or None, self.filters)
+        return InputResponse(self.time_step, None, self.delay or None, self.rise or None, filters=self.filters)
 
     def rest(self, inputs: FloatArray | None = None, count: int = 1) -> ReducedState:
         """Returns the state of B models in equilibrium under inputs (n,), zero if omitted.

@@ -1,4 +1,4 @@
-"""Response of an input to its commands: a factor, a delay, a first-order lag, and exponential means.
+"""Response of an input to its commands: a factor, a delay, a first-order lag, a slew rate, and exponential means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -15,6 +15,8 @@ Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
 Number = torch.Tensor | float | None
 
+RESPONSES = ("factor", "delay", "rise", "slew")  # of an input to its commands, in the order in which they act
+_LEAST_SLEW = 1e-12  # s/unit
 _FASTEST = 1e-2  # of a step: shortest time constant; shorter ones count as this one
 
 
@@ -30,6 +32,8 @@ class InputResponse:
         factor: on the commands; a number, or (1 or B,) for commands (T, B, C); None for no factor.
         delay: zero or more [s], not differentiable at whole numbers of steps; None for no delay.
         rise: time constant of the lag [s]; None for no lag.
+        slew: reciprocal of the slew rate [s/unit], the largest change of the input in a second, as of a valve whose
+            flow is choked; a number, or (1 or B,). None or zero for no limit.
         filters: F time constants of the exponential means [s].
     """
 
@@ -39,12 +43,15 @@ class InputResponse:
         factor: Number = None,
         delay: Number = None,
         rise: Number = None,
+        slew: Number = None,
         filters: Sequence[float] = (),
     ) -> None:
         self.filters, self._factor = tuple(filters), factor
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
-        self._kept_lag = None if rise is None else _share_kept(rise, time_step)
+        follows = rise is not None or slew is not None
+        self._kept_lag = _share_kept(0.0 if rise is None else rise, time_step) if follows else None
+        self._reach = None if slew is None else _column(time_step / _at_least(slew, _LEAST_SLEW))
         self._kept_means = [_share_kept(time, time_step) for time in self.filters]
 
     def steady(self, commands: Array) -> dict[str, Array]:
@@ -70,7 +77,7 @@ class InputResponse:
             queue = like.concatenate([memory["queue"], acting])
             acting, later["queue"] = self._delayed(queue, len(acting)), queue[len(acting) :]
         if self._kept_lag is not None:
-            acting = _lagged(memory["behind"], acting, self._kept_lag)
+            acting = _lagged(memory["behind"], acting, self._kept_lag, self._reach)
             later["behind"] = acting[-1]
         if not self.filters:
             return acting, acting[None][:0], later
@@ -98,10 +105,10 @@ class InputResponse:
         return (1.0 - share) * queue[now, rows] + share * queue[now - 1, rows]
 
 
-def response_of(name: str, parameters: Mapping[str, torch.Tensor]) -> tuple[Number, Number, Number]:
-    """Returns the identified factor, delay and rise of an input; None for those that were not identified."""
-    factor, delay, rise = (parameters.get(f"{name}_{word}") for word in ("factor", "delay", "rise"))
-    return factor, delay, rise
+def response_of(name: str, parameters: Mapping[str, torch.Tensor]) -> tuple[Number, Number, Number, Number]:
+    """Returns the identified factor, delay, rise and slew of an input; None for those that were not identified."""
+    factor, delay, rise, slew = (parameters.get(f"{name}_{word}") for word in RESPONSES)
+    return factor, delay, rise, slew
 
 
 def with_means(acting: Array, means: Array) -> Array:
@@ -109,11 +116,21 @@ def with_means(acting: Array, means: Array) -> Array:
     return _library(acting).concatenate([acting, *means], -1)
 
 
-def _lagged(behind: Array, series: Array, kept: Array) -> Array:
-    """First-order lag (T, ..., C) of a series (T, ..., C), from (..., C) on; `kept` is the decay in a step."""
+def _lagged(behind: Array, series: Array, kept: Array, reach: Array = None) -> Array:
+    """First-order lag (T, ..., C) of a series (T, ..., C), from (..., C) on.
+
+    Args:
+        behind: value before the series.
+        series: to follow.
+        kept: decay in a step.
+        reach: largest change in a step; None for no limit.
+    """
     lagged = []
     for now in series:
-        behind = now + kept * (behind - now)
+        change = (1.0 - kept) * (now - behind)
+        if reach is not None:
+            change = _library(series).clip(change, -reach, reach)
+        behind = behind + change
         lagged.append(behind)
     return _library(series).stack(lagged)
 
@@ -123,6 +140,10 @@ def _share_kept(time: torch.Tensor | float, step: float) -> Array:
     if isinstance(time, torch.Tensor):
         return _column(torch.exp(-step / time.clamp_min(_FASTEST * step)))
     return math.exp(-step / max(time, _FASTEST * step))
+
+
+def _at_least(value: torch.Tensor | float, least: float) -> Any:
+    return value.clamp_min(least) if isinstance(value, torch.Tensor) else max(value, least)
 
 
 def _column(values: torch.Tensor | float) -> Array:

@@ -373,7 +373,7 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
     for name, limits in identify.parameters.items():
-        if command_of(simulator, name)[1] in ("delay", "rise") and limits.lower < 0.0:
+        if command_of(simulator, name)[1] in ("delay", "rise", "slew") and limits.lower < 0.0:
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: inputs cannot precede their command, so it "
                 "must be zero or more, in s; data.trials.NAME.onset is the time of a command."

@@ -23,7 +23,8 @@ from .files import IDENTIFICATION
 from .trials import evenly
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
-_LANDSCAPE, _AGAIN = "landscape", "{}_again"
+_LANDSCAPE = "landscape"
+_MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 _AT_ONCE = 4  # points of the landscape per batch
 
 Replays = Sequence[tuple[Replay, Start]]
@@ -49,8 +50,11 @@ def identify(context: StageContext) -> None:
     }
     kinds = {model: MODELS[model][0] for model in ranges}
     released = any(experiment.begins(name) == "released" for name in names)
-    evaluations = len(ranges) * (wanted.starts + released) * wanted.max_evaluations
-    kept = {part: Checkpoint(context, part) for part in (*ranges, *map(_AGAIN.format, ranges), _LANDSCAPE)}
+    evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
+    kept = {
+        part: Checkpoint(context, part)
+        for part in (*ranges, *(again for model in ranges for again in again_of(model)), _LANDSCAPE)
+    }
     done = sum(part.evaluations for part in kept.values())
     identified, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
@@ -61,11 +65,13 @@ def identify(context: StageContext) -> None:
             guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
             guess = {name: guess[name] for name in bounds}
             found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
-            if released:  # The release was estimated with the first guess.
-                values = found["parameters"]
+            for again in again_of(model) if released else ():  # The release was estimated with other parameters.
+                values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
-                found = _search(settings, identifier, values, kept[_AGAIN.format(model)], progress, 1)
+                found = _search(settings, identifier, values, kept[again], progress, 1)
+                if not changes(before, found["loss"]):
+                    break
             identified[model] = found | {"first_guess": guess}
     if wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
@@ -97,6 +103,16 @@ def _placement(experiment: Experiment) -> dict[str, Any]:
     standing = [*markers.reference.values()] or [*markers.tracked.values()]
     accuracy = Accuracy(wanted.markers, wanted.shift, turn)
     return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
+
+
+def again_of(key: str) -> list[str]:
+    """Keys of the searches after a release was estimated again."""
+    return [f"{key}_again_{number}" for number in range(1, _MOST_AGAIN + 1)]
+
+
+def changes(before: float, after: float) -> bool:
+    """Whether a loss still changes from one estimation of a release to the next."""
+    return not _UNCHANGED < after / max(before, 1e-300) < 1.0 / _UNCHANGED
 
 
 class Checkpoint:

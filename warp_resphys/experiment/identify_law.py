@@ -33,7 +33,7 @@ from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.stages import IdentifyLawStage
 from .experiment import Experiment
 from .files import LAW_FILE, LAW_FORMAT, read_law
-from .identify import Checkpoint
+from .identify import Checkpoint, again_of, changes
 from .law_trials import LawTrials, branches_of, is_refined, strong_names, unit_of
 from .trials import evenly
 
@@ -225,9 +225,12 @@ class _LawSearch:
         bounds = {name: self.trials.bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
         key = " ".join([*law.groups, *(["whole"] if whole else [])])
         found = self._search(key, simulator, bounds, guess)
-        if self.released:  # The release was estimated with the first guess.
+        for again in again_of(key) if self.released else ():  # The release was estimated with another law.
             guess |= {name: value for name, value in found.parameters.items() if name in guess}
-            found = self._search(f"{key} again", self.trials.simulator(guess), bounds, guess, found.parameters)
+            before = found.loss
+            found = self._search(again, self.trials.simulator(guess), bounds, guess, found.parameters)
+            if not changes(before, found.loss):
+                break
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         names = strong_names(refined, self.trials.shear)
         kept, after = ({n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others})
@@ -255,7 +258,7 @@ class _LawSearch:
         limits = (
             wanted.seconds,
             self.trials.seconds,
-            None if {*key.split()} & {"whole", "given"} else self.trials.early,
+            None if "whole" in key or key == "given" else self.trials.early,
         )
         seconds = min((limit for limit in limits if limit is not None), default=None)
         identifier = Identifier(self.trials.replays(simulator, self.names), bounds, seconds)

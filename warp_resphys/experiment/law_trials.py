@@ -137,12 +137,16 @@ class LawTrials:
         return guess, {name: known[name] for name in _OF_MASS}
 
     def bounds(self, name: str, value: float) -> Bounds:
-        """Returns the range of a constant of a law, around its first guess."""
+        """Returns the range of a constant of a law, around its first guess, and its prior.
+
+        The priors have the weight of one observation. They hold what the trials do not excite: moduli and viscosities
+        near those of SysID, and further terms near zero.
+        """
         if name == "bulk_1":
             mean = max(value, self.shear)
             return Bounds(0.1 * mean, 10.0 * mean, True, Prior(mean, mean))
         if name == "c10":
-            return Bounds(0.0, max(4.0 * value, self.shear), prior=self._prior_of_modulus())
+            return Bounds(0.0, max(4.0 * value, self.shear), prior=self._prior_of_modulus() or Prior(value, self.shear))
         if name.startswith("prony_time"):
             return Bounds(value / 4.0, 4.0 * value, True)
         if name.startswith(("fibre_azimuth", "fibre_elevation")):
@@ -152,8 +156,11 @@ class LawTrials:
         if name.startswith("fibre_toe"):
             return Bounds(0.002, 0.1, True)
         if name in VISCOSITIES:
-            return Bounds(0.0, max(4.0 * value, (0.01 if name == "shear_viscosity" else 1.0) * self.shear))
-        return Bounds(0.0, max(4.0 * value, self.shear))
+            known = self.guess[name]
+            most = (0.01 if name == "shear_viscosity" else 1.0) * self.shear
+            prior = Prior(known, known) if known > 1e-6 * self.shear else None
+            return Bounds(0.0, max(4.0 * value, 4.0 * known, most), prior=prior)
+        return Bounds(0.0, max(4.0 * value, self.shear), prior=Prior(0.0, self.shear))
 
     def _prior_of_modulus(self) -> Prior | None:
         """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""

@@ -9,6 +9,7 @@ from typing import Final
 
 import torch
 
+from ..data.input_response import RESPONSES
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError
@@ -16,14 +17,13 @@ from ..io.errors import InputError
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 HUNG: Final = ("attached_mass", PAYLOAD.name)
-_RESPONSES: Final = ("factor", "delay", "rise")  # of an input to its commands, in the order in which they act
 
 
 def identifiable_parameters(simulator: Simulator) -> tuple[str, ...]:
     """Names of the parameters of a simulator that can be identified, which are numbers; see `replay.Replay`."""
     numbers = (name for name, quantity in simulator.parameters.items() if name != "gravity" and not quantity.shape)
     constants = (*numbers, *parameters_of_parts(simulator))
-    responses = [f"{name}_{word}" for name in simulator.inputs if name not in HUNG for word in _RESPONSES]
+    responses = [f"{name}_{word}" for name in simulator.inputs if name not in HUNG for word in RESPONSES]
     return (*constants, MASS_FACTOR, *TILTS, *responses)
 
 
@@ -109,9 +109,9 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
 
 
 def command_of(simulator: Simulator, name: str) -> tuple[str, str]:
-    """Input and one of factor, delay and rise in a name such as ``pressure_delay``; else two empty strings."""
+    """Input and the word of `RESPONSES` in a name such as ``pressure_delay``; else two empty strings."""
     driven, _, word = name.rpartition("_")
-    return (driven, word) if driven in simulator.inputs and driven not in HUNG and word in _RESPONSES else ("", "")
+    return (driven, word) if driven in simulator.inputs and driven not in HUNG and word in RESPONSES else ("", "")
 
 
 def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[str, float]:

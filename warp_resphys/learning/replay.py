@@ -78,8 +78,9 @@ class Replay:
         settled: (E R, N, 3) initial equilibria of the last simulation [m]; None if the trials did not begin at rest.
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
-            body; components of gravity's tilt; and for every input a factor on its commands, their delay [s] and the
-            rise time [s] of its response: ``pressure_factor``, ``pressure_delay`` and ``pressure_rise``.
+            body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
+            time [s] of its response and its reciprocal slew rate: ``pressure_factor``, ``pressure_delay``,
+            ``pressure_rise`` and ``pressure_slew``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:

@@ -31,6 +31,7 @@ _COMMANDS: Final[Mapping[str, Wording]] = {
     "factor": ("Factor", "", 1.0),
     "delay": ("Delay", "ms", 1e3),
     "rise": ("Time constant", "ms", 1e3),
+    "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
 }
 _WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.

@@ -34,12 +34,11 @@ from ..settings.stages import IdentifyLawStage
 from .experiment import Experiment
 from .files import LAW_FILE, LAW_FORMAT, read_law
 from .identify import Checkpoint, again_of, changes
-from .law_trials import LawTrials, branches_of, is_refined, strong_names, unit_of
+from .law_trials import LawTrials, Score, branches_of, is_refined, strong_names, unit_of
 from .trials import evenly
 
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
-_CLOSER: Final = 0.95  # ratio of validation errors below which a law, or more terms, are worth while
 
 
 def identify_law(context: StageContext) -> None:
@@ -65,7 +64,7 @@ class _Refined:
     others: dict[str, float]  # identified parameters that are not those of the material
     names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
     found: Identification
-    score: float  # error on the validation trials
+    score: Score  # on the validation trials
 
 
 class _LawSearch:
@@ -93,12 +92,12 @@ class _LawSearch:
             if "classes" not in self.kept.content:
                 self.kept.keep(classes=[asdict(own) for own in self._from_states(library)])
             classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in self.kept.content["classes"]]
-            scores = self.trials.scores([law.constants for law in classes], self.trials.checked)
+            scores = [score.error for score in self.trials.scores([law.constants for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
             refined = self._from_markers(library)
-            classes, scores = [own.law for own in refined], [own.score for own in refined]
+            classes, scores = [own.law for own in refined], [own.score.error for own in refined]
             best = refined[-1]
         if self.trials.early is not None:
             best = replace(self._refine(best.law, whole=True), score=best.score)
@@ -106,7 +105,7 @@ class _LawSearch:
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
-            "accepted": best.score < _CLOSER * below,
+            "accepted": best.score.beats(below),
             "groups": list(best.law.groups),
             "constants": best.law.constants,
             "units": {name: unit_of(name) for name in best.law.constants},
@@ -114,7 +113,7 @@ class _LawSearch:
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
             "at_bounds": [name for name, old in best.names.items() if old in best.found.at_bounds],
             "loss": best.found.loss,
-            "validation": {"trials": list(self.trials.checked), "law": best.score, "below": below},
+            "validation": {"trials": list(self.trials.checked), "law": best.score.error, "below": below.error},
             "classes": tried,
             "stretches": self._stretches(best),
             "data": {"name": self.settings.name, "trials": list(self.names)},
@@ -129,7 +128,7 @@ class _LawSearch:
         if bounds := self.trials.bounds_of_others(simulator):
             found = self._search("given", simulator, bounds, {})
             others = found.parameters
-        score = self.trials.scores([constants], self.trials.checked, others)[0]
+        score = self.trials.scores([constants], others)[0]
         return {
             **content,
             "accepted": True,
@@ -137,7 +136,11 @@ class _LawSearch:
             "parameters": others,
             "deviation": content.get("deviation", {}) | _deviation(found),
             "at_bounds": [*content.get("at_bounds", ()), *(() if found is None else found.at_bounds)],
-            "validation": {"trials": list(self.trials.checked), "law": score, "below": self.trials.score_below()},
+            "validation": {
+                "trials": list(self.trials.checked),
+                "law": score.error,
+                "below": self.trials.score_below().error,
+            },
         }
 
     def _enlarged(self, best: "_Refined", classes: Sequence[LawClass]) -> "_Refined":
@@ -146,7 +149,7 @@ class _LawSearch:
         for law in classes:
             if _refined_groups(law) > _refined_groups(best.law) and law.residual < _BALANCED * residual:
                 larger = self._refine(law)
-                if larger.score * _CLOSE < best.score:
+                if larger.score.error * _CLOSE < best.score.error:
                     best, residual = larger, law.residual
         return best
 
@@ -200,7 +203,7 @@ class _LawSearch:
             if added:
                 law = LawClass((*best.law.groups, name), {**best.law.constants, **added}, math.nan)
                 tried.append(self._refine(law))
-                if tried[-1].score < _CLOSER * best.score:
+                if tried[-1].score.beats(best.score):
                     best = tried[-1]
         return [own for own in tried if own is not best] + [best]
 
@@ -234,7 +237,7 @@ class _LawSearch:
         refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
         names = strong_names(refined, self.trials.shear)
         kept, after = ({n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others})
-        score = self.trials.scores([kept], self.trials.checked, after)[0]
+        score = self.trials.scores([kept], after)[0]
         return _Refined(replace(law, constants=kept), after, {**names, **{n: n for n in others}}, found, score)
 
     def _search(

@@ -2,15 +2,19 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
 from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
 from ..learning.bounds import Bounds, Prior
 from ..learning.law import VISCOSITIES
 from ..learning.replay import Replay, Start
+from ..learning.uncertainty import redundancy
 from ..settings.body import MaterialSettings
 from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
@@ -22,7 +26,31 @@ _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation"
 _OF_MASS: Final = ("density", "mass_damping")
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 
+_SIGNIFICANT: Final = 2.0  # standard errors
+
+FloatArray = NDArray[np.float64]
 Replays = Sequence[tuple[Replay, Start]]
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of a simulator on trials: in each frame the mean square over the squared amplitude of the trial."""
+
+    frames: tuple[FloatArray, ...]  # (T,) of each trial
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the amplitude, over all trials; infinite if one failed."""
+        square = fmean(float(own.mean()) for own in self.frames)
+        return math.sqrt(square) if math.isfinite(square) else math.inf
+
+    def beats(self, other: "Score") -> bool:
+        """Whether the mean square is smaller by more than two standard errors, for frames correlated in time."""
+        if not math.isfinite(self.error) or not math.isfinite(other.error):
+            return self.error < other.error
+        less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
+        variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
+        return fmean(float(d.mean()) for d in less) > _SIGNIFICANT * math.sqrt(sum(variance)) / len(less)
 
 
 class LawTrials:
@@ -85,10 +113,13 @@ class LawTrials:
         """Returns replays of trials, with the markers where SysID has placed them."""
         return self.experiment.replays(simulator, names, "sysid" if self.sysid else "simulation")
 
-    def scores(
-        self, laws: Sequence[Mapping[str, float]], names: Sequence[str], others: Mapping[str, float] | None = None
-    ) -> list[float]:
-        """Returns the root mean square error of laws on trials, over the motion's amplitude; infinite if one fails."""
+    def scores(self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None) -> "list[Score]":
+        """Returns the errors of laws on the trials that they are tested on.
+
+        Args:
+            laws: constants by name.
+            others: values of the other identified parameters, in place of SysID's.
+        """
         union: dict[str, float] = {}
         for law in laws:
             union |= {name: value if is_shape(name) else 0.0 for name, value in law.items()}
@@ -96,26 +127,27 @@ class LawTrials:
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         own = self.others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
         values |= {name: value.expand(len(laws)) for name, value in own.items()}
-        return self._errors(simulator, values, names, len(laws))
+        return self._errors(simulator, values, len(laws))
 
-    def _errors(
-        self, simulator: Simulator, values: Mapping[str, torch.Tensor], names: Sequence[str], sets: int
-    ) -> list[float]:
-        total, begin = simulator.tensor(np.zeros(sets)), self.early or 0.0
+    def _errors(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> "list[Score]":
+        frames: list[list[FloatArray]] = [[] for _ in range(sets)]
+        begin = self.early or 0.0
         with torch.no_grad():
-            for replay, start in self.replays(simulator, names):
+            for replay, start in self.replays(simulator, self.checked):
                 own = replay.trials if self.seconds is None else replay.trials.first(self.seconds)
-                late = own.times >= begin
-                replay = Replay(simulator, replay.observe, own)
-                squares = replay.errors(replay(start, values)).square().sum((3, 4)) * late
-                seen = (own.seen.sum(2) * late).sum(1)
-                total += (squares.sum(2) / (seen * own.amplitude.square())).sum(1) / len(names)
-        return [math.sqrt(value) if math.isfinite(value) else math.inf for value in total.tolist()]
+                squares = Replay(simulator, replay.observe, own)
+                errors = squares.errors(squares(start, values)).square().sum((3, 4))  # (E, R, T)
+                seen = own.seen.sum(2)
+                means = errors / (seen.clamp_min(1) * own.amplitude.square()[:, None])
+                for row, inside in enumerate((own.times >= begin) & (seen > 0)):
+                    for number in range(sets):
+                        frames[number].append(means[number, row, inside].double().cpu().numpy())
+        return [Score(tuple(own)) for own in frames]
 
-    def score_below(self) -> float:
+    def score_below(self) -> "Score":
         """Returns the error of the identified simulator, or of the uncorrected one."""
         simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
-        return self._errors(simulator, self.experiment.parameters("sysid"), self.checked, 1)[0]
+        return self._errors(simulator, self.experiment.parameters("sysid"), 1)[0]
 
     def _guess(self) -> tuple[dict[str, float], dict[str, float]]:
         """Returns a neo-Hookean law like the identified material, and its constants of the mass."""

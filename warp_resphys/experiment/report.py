@@ -237,18 +237,17 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
 
 
 def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | None) -> dict[str, tuple[float, float]]:
-    """Least and largest principal stretch at the centres of the cells, in training and in test trials.
+    """Least and largest principal stretch at the centres of the cells, in the law's training and in all test trials.
 
-    Where markers are observed, it is that of the body of the film, which is simulated.
+    Where markers are observed, the test trials are the body of the film, which is simulated.
     """
-    trained = read_if_there(folder / LAW_FILE).get("data", {}).get("trials", ())
     if trials.labels:
         bodies = {} if film is None else {f"the trial {film.trial}": next(reversed([*film.positions.values()]))}
     else:
-        dataset = read_dataset(common_folder(folder) / DATASET)
-        bodies = {"all trials": dataset.observed[dataset.rows([*trials.names, *trained])]}
-        bodies |= {"the training": dataset.observed[dataset.rows(trained)]} if trained else {}
-    return {name: _stretch_range(mesh, q.reshape(-1, *q.shape[-2:])) for name, q in bodies.items()}
+        bodies = {"all test trials": trials.target}
+    found = {name: _stretch_range(mesh, q.reshape(-1, *q.shape[-2:])) for name, q in bodies.items()}
+    learned = read_if_there(folder / LAW_FILE).get("stretches")
+    return found if learned is None else {**found, "the training": (float(learned[0]), float(learned[1]))}
 
 
 def _stretch_range(mesh: Mesh, positions: FloatArray) -> tuple[float, float]:

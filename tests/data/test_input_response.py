@@ -52,7 +52,7 @@ def test_means_are_exponential_averages_of_the_pressure():
 @pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.001), (0.02, 0.03), (0.025, 0.04), (0.07, 0.05)])
 def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_their_own(delay, rise):
     commands = np.random.default_rng(1).random((20, 3, 2))
-    response = InputResponse(STEP, 0.8, delay, rise, [0.1, 0.5])
+    response = InputResponse(STEP, 0.8, delay, rise, filters=[0.1, 0.5])
     acting, means = response.from_rest(commands)
     memory = response.steady(np.zeros((3, 2)))
     for number, now in enumerate(commands):
@@ -60,7 +60,7 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
         np.testing.assert_allclose(one[0], acting[number], atol=1e-12)
         np.testing.assert_allclose(mean[:, 0], means[:, number], atol=1e-12)
     of_each = [torch.tensor([1.0, value, 0.5 * value], dtype=torch.float64) for value in (0.8, delay, rise)]
-    result, context = InputResponse(STEP, *of_each, [0.1, 0.5]).from_rest(torch.as_tensor(commands))
+    result, context = InputResponse(STEP, *of_each, filters=[0.1, 0.5]).from_rest(torch.as_tensor(commands))
     np.testing.assert_allclose(result[:, 1], acting[:, 1], atol=1e-12)
     np.testing.assert_allclose(context[:, :, 1], means[:, :, 1], atol=1e-12)
     assert float((result[:, 0] - torch.as_tensor(acting[:, 0])).abs().max()) > 1e-3
@@ -68,6 +68,24 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
 
 def test_the_steady_memory_is_that_of_constant_commands():
     commands = np.array([[1.0, 2.0]])
-    response = InputResponse(STEP, 0.8, 0.013, 0.02, [0.3])
+    response = InputResponse(STEP, 0.8, 0.013, 0.02, filters=[0.3])
     acting, means, _ = response(response.steady(commands), commands[None])
     np.testing.assert_allclose(with_means(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))
+
+
+def test_the_slew_rate_limits_the_change_in_a_step():
+    commands = np.concatenate([np.zeros((2, 1)), np.full((10, 1), 5.0), np.full((10, 1), 4.5)])
+    rate = 3.0 / STEP  # of the input a second: three in a step
+    limited, _ = InputResponse(STEP, slew=1.0 / rate).from_rest(commands)
+    np.testing.assert_allclose(limited[:6, 0], [0.0, 0.0, 3.0, 5.0, 5.0, 5.0], atol=1e-12)
+    np.testing.assert_allclose(limited[12:, 0], 4.5, atol=1e-12)
+    plain, _ = InputResponse(STEP, rise=2.0 * STEP).from_rest(commands)
+    lagged, _ = InputResponse(STEP, rise=2.0 * STEP, slew=0.0).from_rest(commands)
+    np.testing.assert_allclose(lagged, plain, atol=1e-12)
+    slewing, _ = InputResponse(STEP, rise=2.0 * STEP, slew=1.0 / (0.2 * rate)).from_rest(commands)
+    assert np.abs(np.diff(slewing[:, 0])).max() <= 0.6 + 1e-12
+    assert float(slewing[11, 0]) == pytest.approx(plain[11, 0], abs=0.3)
+    slews = torch.tensor([0.0, 1.0 / rate], dtype=torch.float64)
+    both, _ = InputResponse(STEP, slew=slews).from_rest(torch.as_tensor(np.stack([commands, commands], 1)))
+    np.testing.assert_allclose(both[:, 1], limited, atol=1e-12)
+    np.testing.assert_allclose(both[:, 0], commands, atol=1e-12)

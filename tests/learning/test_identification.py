@@ -13,7 +13,7 @@ from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.bounds import Bounds
+from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.replay import Replay, Start
@@ -313,3 +313,20 @@ def test_equilibria_are_predicted_from_those_of_nearby_parameters():
     steps = [(miss, move) for miss, move in zip(misses, moves, strict=True) if move > 1e-6]
     assert len(steps) > 2
     assert all(miss < 0.5 * move for miss, move in steps[1:-1])
+
+
+def test_the_linear_misfit_has_the_gradient_of_the_loss():
+    ranges = {**RANGES, "density": replace(Bounds(800.0, 1600.0), prior=Prior(1100.0, 50.0))}
+    misfit = Misfit([replay_of(simulator(), TRUTH, noise=1e-4)], ranges)
+    unit = np.array([0.55, 0.3, 0.6])
+    misfit.update_prior_weight(unit)
+    linear = misfit.linearise(unit)
+    x = torch.tensor(unit)[None].requires_grad_()
+    loss = misfit.losses(x)
+    (gradient,) = torch.autograd.grad(loss.sum(), x)
+    assert linear.loss == pytest.approx(float(loss.detach()), rel=1e-6)
+    np.testing.assert_allclose(linear.gradient, gradient[0], rtol=1e-3, atol=1e-4 * float(gradient.abs().max()))
+    step, matrix = 1e-3 * np.array([1.0, -1.0, 0.5]), linear.gauss_newton
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert step @ matrix @ step > 0.0
+    assert misfit.linearise(unit, derivatives=False).loss == pytest.approx(linear.loss)

@@ -39,6 +39,7 @@ from .files import STATIC, payload_inputs, read_law
 from .identify import ELASTIC
 from .laboratory import input_sequences
 from .reading import standing_enough
+from .shapes import check_shape
 from .target import substeps_of, target_settings, vertices_in
 from .trials import all_trials, folds_of, split_of, trials_of
 
@@ -101,6 +102,9 @@ def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
     """Checks an experiment with simulated trials, in which all vertices are observed."""
     split_of(run)
     _check_target(run, simulator.body)
+    for name, shape in run.shapes.items():
+        with _naming(f"shapes.{name}: "):
+            check_shape(shape)
     make_reconstructor(simulator, **dict(run.reconstruction))
 
 

@@ -20,12 +20,13 @@ from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors, summarise
+from ..mesh.mesh import select_vertices
 from ..settings.body import BodySettings, SimulatorSettings
 from ..settings.shapes import ShapeSettings
 from ..settings.stages import ShapesStage
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .actuators import driving_quantity
+from .actuators import driven_parts, driving_quantity
 from .build import build_body, build_simulator
 from .experiment import LAW, Experiment
 from .files import LAW_FILE, SHAPES
@@ -64,6 +65,29 @@ def try_shapes(context: StageContext) -> None:
                 progress.advance(1, body=name)
     write_json(context.run_dir / SHAPES, results)
     forget_checkpoint(kept.path)
+
+
+def check_shape(shape: ShapeSettings) -> None:
+    """Checks that a shape can be built, held and observed.
+
+    Raises:
+        InputError: inputs do not fit, or a held place that is fixed.
+        MeshError: a mesh that cannot be simulated, has no vertex at a place, or is another body than the target.
+    """
+    body, target = build_body(BodySettings.of(shape)), build_body(shape.target_body)
+    vertices_in(target.mesh, body.mesh)
+    if shape.held is None:
+        quantity, given = driving_quantity(shape), len(shape.inputs or ())
+        if quantity is None:
+            raise InputError(
+                "inputs are given, but it has neither chambers nor tendons nor commanded muscles: leave them out."
+            )
+        if given != driven_parts(shape):
+            raise InputError(f"inputs has {given} values for {driven_parts(shape)} parts: give one for each.")
+    elif shape.held.at is not None:
+        face = select_vertices(target.mesh, **shape.held.at.arguments())
+        if np.isin(face, target.fixed_vertices).all():
+            raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
 
 def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> dict[str, Any]:
@@ -119,10 +143,7 @@ def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     if shape.held is not None:
         return held_alone(simulator, shape.held, shape.held.at or shape.fixed, "held.at")
     quantity = driving_quantity(shape)
-    if quantity is None:
-        raise InputError(
-            "inputs are given, but it has neither chambers nor tendons nor commanded muscles: leave them out."
-        )
+    assert quantity is not None
     return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))
 
 

@@ -76,8 +76,8 @@ def shapes_text(shapes: Mapping[str, Any]) -> str:
     for model in models:
         shares = [share for result in shapes.values() if (share := _removed(result).get(model)) is not None]
         ends = [*dict.fromkeys(share_text(end) for end in (min(shares), max(shares)))] if shares else ["nothing"]
-        lost = f" and diverges on {count - len(shares)}" if len(shares) < count else ""
-        parts.append(f"{_named(model)} removes {' to '.join(ends)}{lost}")
+        lost = f" ({count - len(shares)} diverged)" if len(shares) < count else ""
+        parts.append(f"{_named(model)} removes {' to '.join(ends).replace(' % to', ' to')}{lost}")
     text = f"On {count} other bod{'y' if count == 1 else 'ies'} of the same material, {in_a_row(parts)} of the error"
     text += " of the uncorrected simulation"
     if models == [*_MATERIALS]:

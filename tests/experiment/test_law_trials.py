@@ -28,12 +28,16 @@ class TestScore:
         assert not worse.beats(better)
 
     def test_an_uncertain_gain_does_not(self):
-        less = np.where(np.arange(400) < 200, 0.9, 1.09)  # in one half of the time alone
+        less = np.where(np.arange(400) < 200, 0.9, 1.07)  # in one half of the time alone
         trial = frames(0)
         better = Score(tuple(less * own for own in trial))
         assert better.error < Score(trial).error
         assert not better.beats(Score(trial))
         assert not Score(trial).beats(Score(trial))
+
+    def test_a_large_gain_does(self):
+        few = Score((np.array([1.0, 4.0, 2.0]),))
+        assert Score((0.5 * few.frames[0],)).beats(few)
 
     def test_one_that_fails_loses(self):
         failed = Score((np.array([1.0, np.inf]),))

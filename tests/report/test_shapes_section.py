@@ -16,7 +16,14 @@ def result(simulation, sysid=None, law=None, **more):
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.5, "50 %"), (0.897, "90 %"), (0.9958, "99.58 %"), (0.99976, "99.976 %"), (1.0, "100 %"), (-0.2, "−20 %")],
+    [
+        (0.5, "50 %"),
+        (0.897, "90 %"),
+        (0.9958, "99.58 %"),
+        (0.99976, "99.976 %"),
+        (1.0, "100 %"),
+        (-0.2, "\N{MINUS SIGN}20 %"),
+    ],
 )
 def test_shares_have_digits_for_what_is_left(share, text):
     assert share_text(share) == text

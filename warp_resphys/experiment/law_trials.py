@@ -26,6 +26,7 @@ _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation"
 _OF_MASS: Final = ("density", "mass_damping")
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 
+_CLOSER: Final = 0.95
 _SIGNIFICANT: Final = 2.0  # standard errors
 
 FloatArray = NDArray[np.float64]
@@ -45,8 +46,11 @@ class Score:
         return math.sqrt(square) if math.isfinite(square) else math.inf
 
     def beats(self, other: "Score") -> bool:
-        """Whether the mean square is smaller by more than two standard errors, for frames correlated in time."""
-        if not math.isfinite(self.error) or not math.isfinite(other.error):
+        """Whether the error is smaller by 5 % or more, or its square by two standard errors.
+
+        Frames are correlated in time. The second measure finds small gains in white noise.
+        """
+        if self.error < _CLOSER * other.error or not math.isfinite(self.error):
             return self.error < other.error
         less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
         variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]

@@ -9,6 +9,7 @@ from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Trajectory as Trajectory
 from .energies.base import Energy as Energy
+from .energies.catalogue import make_material as make_material
 from .energies.fibres import Fibres as Fibres
 from .energies.materials import ConvexMaterial as ConvexMaterial
 from .energies.materials import Corotated as Corotated
@@ -18,7 +19,6 @@ from .energies.materials import Gent as Gent
 from .energies.materials import Material as Material
 from .energies.materials import MooneyRivlin as MooneyRivlin
 from .energies.materials import StableNeoHookean as StableNeoHookean
-from .energies.materials import make_material as make_material
 from .energies.medium import Medium as Medium
 from .energies.muscles import Muscle as Muscle
 from .energies.muscles import Muscles as Muscles

@@ -10,8 +10,8 @@ import warp as wp
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.energies.launcher import warp_view
-from warp_resphys.energies.materials import MATERIALS
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.kernels import minimisation as kernels
 from warp_resphys.kernels.lbfgs import lbfgs_kernels

@@ -11,7 +11,7 @@ import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.modes import vibration_modes
-from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS

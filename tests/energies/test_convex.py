@@ -9,7 +9,8 @@ import torch
 
 from warp_resphys import Body, Inputs, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.dynamics.modes import vibration_modes
-from warp_resphys.energies.materials import ConvexMaterial, FibreFamily, make_material
+from warp_resphys.energies.catalogue import make_material
+from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError, MeshError, ResphysError
 from warp_resphys.stepping.inputs import Inputs
 

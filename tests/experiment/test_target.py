@@ -9,7 +9,7 @@ import torch
 from support.configured import check, composed, settings
 from warp_resphys import Body, Simulator, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.data.base_motion import rigid
-from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator

@@ -20,7 +20,7 @@ from warp_resphys import (
     quadratic,
     select_vertices,
 )
-from warp_resphys.energies.materials import MATERIALS
+from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.fem.elements import physical_gradients
 from warp_resphys.stepping.inputs import Inputs
 

@@ -17,7 +17,7 @@ from warp_resphys import (
     box_tetrahedra,
     quadratic,
 )
-from warp_resphys.energies.materials import MATERIALS
+from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.energies.potential import StepTerms
 from warp_resphys.fem.elements import discretise, physical_gradients
 from warp_resphys.io.errors import InputError

@@ -7,7 +7,7 @@ import torch
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.catalogue import make_material
 from warp_resphys.fem.body import Body
 from warp_resphys.linalg import multigrid
 from warp_resphys.linalg.conjugate_gradients import conjugate_gradients

@@ -52,6 +52,7 @@ class Material(ABC):
     differentiable by them.
     """
 
+    model: ClassVar[str] = ""  # name in configurations, if it has one
     law: ClassVar[Any]  # module of ``kernels.materials``, or an object with the same attributes
     # integration of each modulus of the law: ``shape`` or ``volume`` rule, or ``mean`` over the volume of a point
     rules: ClassVar[tuple[str, ...]]
@@ -137,8 +138,8 @@ class Material(ABC):
         for name in values:
             if name not in own:
                 numbered = [f"{q.name}_1" for q in chain.from_iterable(cls.groups.values())]
-                model = next((word for word, kind in MATERIALS.items() if kind is cls), cls.__name__)
-                raise InputError(f"{model} has no constant {name!r}: it has {', '.join((*own, *numbered, '...'))}")
+                known, model = ", ".join((*own, *numbered, "...")), cls.model or cls.__name__
+                raise InputError(f"{model} has no constant {name!r}: it has {known}")
         return {**values, **groups}
 
     @staticmethod
@@ -188,6 +189,7 @@ class Corotated(_Hookean):
     The effective Poisson's ratio is lower than the nominal one: 0.375 for 0.45, 0.497 for 0.499.
     """
 
+    model = "corotated"
     law = corotated
 
 
@@ -195,6 +197,7 @@ class Corotated(_Hookean):
 class StableNeoHookean(_Hookean):
     """A neo-Hookean material, finite for inverted elements, and linear elasticity at small strains."""
 
+    model = "stable_neo_hookean"
     law = stable_neo_hookean
 
 
@@ -202,6 +205,7 @@ class StableNeoHookean(_Hookean):
 class MooneyRivlin(Material):
     """Rubber with two elastic constants and a bulk modulus; at small strains mu is 2 (c10 + c01)."""
 
+    model = "mooney_rivlin"
     law = mooney_rivlin
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
@@ -261,6 +265,7 @@ class Gent(DensityMaterial):
     that iterates of a search may exceed the limit.
     """
 
+    model = "gent"
     energy_density: ClassVar[Any] = gent.energy_density
     volume_energy: ClassVar[Any] = gent.volume_energy
 
@@ -303,6 +308,7 @@ class ConvexMaterial(Material):
     that forces are linear in all coefficients.
     """
 
+    model = "law"
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
         "prony": (Quantity("prony_modulus", "Pa", 0.0, closed=True), _PRONY_TIME),
         "fibres": (
@@ -383,23 +389,3 @@ class ConvexMaterial(Material):
             level = elevation.cos()
             moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *own]
         return tuple(moduli)
-
-
-MATERIALS: dict[str, type[Material]] = {
-    "corotated": Corotated,
-    "stable_neo_hookean": StableNeoHookean,
-    "mooney_rivlin": MooneyRivlin,
-    "gent": Gent,
-    "law": ConvexMaterial,
-}
-
-
-def make_material(model: str = "corotated", **constants: Any) -> Material:
-    """Returns the named material.
-
-    Raises:
-        InputError: an unknown name, a constant that the material does not have, or a value out of range.
-    """
-    if model not in MATERIALS:
-        raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    return MATERIALS[model].from_constants(constants)

@@ -9,6 +9,7 @@ import torch
 from torch.nn.functional import softplus
 from typing_extensions import override
 
+from ..io.errors import InputError
 from ..kernels.materials import neural
 from ..kernels.materials.neural import LENGTH, LENGTH_J, UNITS, WEIGHTS
 from ..stepping.quantity import Parameter, Quantity
@@ -18,6 +19,8 @@ ENERGY = 100e3 * LENGTH  # S [J/m^3]: with weights of one, moduli of the order o
 _UNITS_SHARE = 0.1  # of initial weights: contribution of the units to mu and to viscosity at rest
 _SHAPES = ((UNITS, 4), (UNITS, UNITS), (UNITS, 4), (UNITS,), (2,), (1,), (3, UNITS))
 _SECOND_SHARE = 0.2  # of initial weights: contribution of the second invariant to the remaining mu
+
+_WEIGHT = "weight_"  # of the names of single weights
 
 Parts = tuple[torch.Tensor, ...]
 
@@ -129,6 +132,7 @@ class NeuralMaterial(Material):
     changes is that of Kelvin and Voigt.
     """
 
+    model = "neural_law"
     law = neural
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "shape", "volume", "volume")
     curvature: ClassVar[tuple[float, ...]] = (0.0, 2.0, 1.0, 2.0, 0.0)
@@ -156,6 +160,24 @@ class NeuralMaterial(Material):
         return cls(weights, 0.5 * (lame_lambda - volume), **constants)
 
     @override
+    @classmethod
+    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
+        """Returns the material with some constants by name, the weights as ``weight_1``, ``weight_2``, ...
+
+        Raises:
+            InputError: an unknown constant, some but not all weights, or a value out of range.
+        """
+        names = [f"{_WEIGHT}{k}" for k in range(1, 1 + WEIGHTS)]
+        given = {name: value for name, value in constants.items() if name.startswith(_WEIGHT)}
+        if not given:
+            return super().from_constants(constants)
+        if given.keys() != {*names}:
+            raise InputError(f"neural_law has {len(given)} weights: give weight_1 to weight_{WEIGHTS}, or none.")
+        weights = torch.tensor([float(given[name]) for name in names], dtype=torch.float64)
+        others = {name: value for name, value in constants.items() if name not in given}
+        return cls(**cls._arguments(others), weights=weights)
+
+    @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns S, the contributions of the network to mu and lambda at small strains, g_2 and g_4."""
         mu, volume = (value[..., None] for value in lame(bounded(constants["weights"])))
@@ -169,3 +191,8 @@ class NeuralMaterial(Material):
         v, _, e = parts(values)[-1].unbind(-2)
         dissipated = (0.5 * v * (e + (e.square() + 1.0).sqrt())).sum(-1)
         return torch.cat([values, value[..., None], gradient[..., 2:], dissipated[..., None]], -1)
+
+
+def weight_constants(weights: torch.Tensor) -> dict[str, float]:
+    """Returns weights (W,) as constants by name, for `NeuralMaterial.from_constants`."""
+    return {f"{_WEIGHT}{k}": value for k, value in enumerate(weights.tolist(), 1)}

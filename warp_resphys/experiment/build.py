@@ -19,7 +19,8 @@ from ..data.marker_view import MarkerView
 from ..data.markers import Markers, bind_markers
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.materials import Material, make_material
+from ..energies.catalogue import make_material
+from ..energies.materials import Material
 from ..fem.body import Body
 from ..fem.rigid import Glue, Rigid
 from ..fem.symmetry import SymmetryPlane

@@ -124,7 +124,8 @@ class Experiment:
         if kind == "published":
             return self._published.simulation
         if kind == LAW:
-            return MaterialSettings(model=LAW, **read_json(self.folder / LAW_FILE)["constants"])
+            law = read_json(self.folder / LAW_FILE)
+            return MaterialSettings(model=law["model"], **law["constants"])
         return self._target.material if kind == "target" else self.settings.simulation
 
     @property

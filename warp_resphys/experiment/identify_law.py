@@ -16,11 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 
-from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
-from ..fem.stretches import principal_stretches
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
@@ -31,12 +28,14 @@ from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
 from ..learning.replay import Replay
 from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.stages import IdentifyLawStage
-from .experiment import Experiment
+from .experiment import LAW, Experiment
 from .files import LAW_FILE, LAW_FORMAT, read_law
 from .identify import Checkpoint, again_of, changes
-from .law_trials import LawTrials, Score, branches_of, is_refined, strong_names, unit_of
+from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names, unit_of
+from .neural_law import train_law
 from .trials import evenly
 
+_EVALUATIONS: Final = 10
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
@@ -50,7 +49,11 @@ def identify_law(context: StageContext) -> None:
         DataFileError: the file of the law is missing, damaged or of another version.
     """
     settings: IdentifyLawStage = context.settings
-    search = _LawSearch(context, Experiment(settings, context.run_dir, "count"))
+    experiment = Experiment(settings, context.run_dir, "count")
+    if settings.law.kind == "network" and settings.law.file is None:
+        write_json(context.run_dir / LAW_FILE, train_law(context, experiment))
+        return
+    search = _LawSearch(context, experiment)
     content = search.run() if settings.law.file is None else search.given(settings.law.file)
     write_json(context.run_dir / LAW_FILE, content)
     forget_checkpoint(search.kept.path)
@@ -105,6 +108,7 @@ class _LawSearch:
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
+            "model": LAW,
             "accepted": best.score.beats(below),
             "groups": list(best.law.groups),
             "constants": best.law.constants,
@@ -155,20 +159,9 @@ class _LawSearch:
 
     def _stretches(self, best: "_Refined") -> list[float]:
         """Returns the least and the largest principal stretch in the training trials."""
-        dataset, mesh = self.experiment.dataset, self.experiment.body.mesh
-        if self.trials.states:
-            positions = dataset.observed[dataset.rows(self.names)].reshape(-1, *mesh.vertices.shape)
-            stretches = principal_stretches(mesh, positions)
-        else:
-            simulator = self.trials.simulator(best.law.constants)
-            values = {name: simulator.tensor([value]) for name, value in best.others.items()}
-            with torch.no_grad():
-                bodies = [
-                    Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).flatten(0, 2)
-                    for replay, start in self.trials.replays(simulator, self.names)
-                ]
-            stretches = np.concatenate([principal_stretches(mesh, q.cpu().numpy()) for q in bodies])
-        return [float(np.nanmin(stretches)), float(np.nanmax(stretches))]
+        simulator = self.trials.simulator(best.law.constants)
+        values = {name: simulator.tensor([value]) for name, value in best.others.items()}
+        return stretches_of(self.experiment, self.trials.replays(simulator, self.names), values)
 
     def _from_states(self, library: Library) -> list[LawClass]:
         """Returns the classes of the weak form."""
@@ -265,7 +258,8 @@ class _LawSearch:
         )
         seconds = min((limit for limit in limits if limit is not None), default=None)
         identifier = Identifier(self.trials.replays(simulator, self.names), bounds, seconds)
-        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
+        most = wanted.max_evaluations or _EVALUATIONS
+        with Progress(self.context.name, most, "evaluations at most") as progress:
 
             def report(_: int, loss: float, values: Mapping[str, float]) -> None:
                 name, value = next(iter(values.items()))
@@ -276,7 +270,7 @@ class _LawSearch:
 
             start = {name: {**self.trials.sysid, **(others or {}), **guess}[name] for name in bounds}
             done = finished.get(key, ())
-            return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
+            return identifier.run([start], most, report, done, keep, wanted.tolerance)
 
 
 def _refined_groups(law: LawClass) -> set[str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Final
 
@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
+from ..fem.stretches import principal_stretches
 from ..learning.bounds import Bounds, Prior
 from ..learning.law import VISCOSITIES
 from ..learning.replay import Replay, Start
@@ -131,9 +133,10 @@ class LawTrials:
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         own = self.others(simulator) | {n: simulator.tensor([v]) for n, v in (others or {}).items()}
         values |= {name: value.expand(len(laws)) for name, value in own.items()}
-        return self._errors(simulator, values, len(laws))
+        return self.errors(simulator, values, len(laws))
 
-    def _errors(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> "list[Score]":
+    def errors(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> "list[Score]":
+        """Returns the errors of a simulator with some sets of parameters on the trials that laws are tested on."""
         frames: list[list[FloatArray]] = [[] for _ in range(sets)]
         begin = self.early or 0.0
         with torch.no_grad():
@@ -151,7 +154,7 @@ class LawTrials:
     def score_below(self) -> "Score":
         """Returns the error of the identified simulator, or of the uncorrected one."""
         simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
-        return self._errors(simulator, self.experiment.parameters("sysid"), 1)[0]
+        return self.errors(simulator, self.experiment.parameters("sysid"), 1)[0]
 
     def _guess(self) -> tuple[dict[str, float], dict[str, float]]:
         """Returns a neo-Hookean law like the identified material, and its constants of the mass."""
@@ -205,6 +208,28 @@ class LawTrials:
             return None
         share = self.guess["c10"] / self.sysid["youngs_modulus"]
         return Prior(share * wanted.prior.mean, share * wanted.prior.deviation)
+
+
+def stretches_of(
+    experiment: Experiment, replays: Replays, values: Mapping[str, torch.Tensor] | None = None
+) -> list[float]:
+    """Returns the least and the largest principal stretch in trials, simulated where markers are seen.
+
+    Args:
+        experiment: the experiment.
+        replays: of the trials, with a law's simulator.
+        values: (1,) values of other parameters.
+    """
+    dataset, mesh, parts = experiment.dataset, experiment.body.mesh, []
+    with torch.no_grad():
+        for replay, start in replays:
+            if dataset.bound is None:
+                bodies = dataset.observed[dataset.rows(replay.trials.names)].reshape(-1, *mesh.vertices.shape)
+            else:
+                whole = Replay(replay.simulator, WHOLE_STATE, replay.trials)
+                bodies = whole(replace(start, shift=None), values).flatten(0, 2).cpu().numpy()
+            parts.append(principal_stretches(mesh, bodies))
+    return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
 
 
 def unit_of(name: str) -> str:

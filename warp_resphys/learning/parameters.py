@@ -58,7 +58,8 @@ def constants_of(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -
     Raises:
         InputError: there is no gravity to tilt.
     """
-    constants = {name: value[:, None] for name, value in parameters.items() if name in simulator.parameters}
+    known = {name: value for name, value in parameters.items() if name in simulator.parameters}
+    constants = {name: value[:, None] if value.ndim == 1 else value for name, value in known.items()}
     constants |= _by_part(simulator, parameters)
     if any(name in parameters for name in TILTS):
         constants["gravity"] = tilted_gravity(simulator, *(parameters.get(name) for name in TILTS))

@@ -87,12 +87,13 @@ class Replay:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.settled: torch.Tensor | None = None
         self.parameter_names = identifiable_parameters(simulator)
+        self._shaped = tuple(name for name, q in simulator.parameters.items() if q.shape and name != "gravity")
 
     def prepare(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
         """Returns constants and inputs of E sets of parameters and R trials, as (E R) environments; trials run fastest.
 
         Args:
-            parameters: (E,) values, by any of `parameter_names`.
+            parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W values.
 
         Returns:
             The constants, the inputs of the trials, and those before time zero.
@@ -101,10 +102,10 @@ class Replay:
             InputError: an unknown parameter.
         """
         parameters = {} if parameters is None else parameters
-        check_names(parameters, self.parameter_names)
+        check_names([name for name in parameters if name not in self._shaped], self.parameter_names)
         sim, count = self.simulator, len(self.trials.names)
         sets = _count(parameters)
-        spread = {name: value.repeat_interleave(count) for name, value in parameters.items()}
+        spread = {name: value.repeat_interleave(count, 0) for name, value in parameters.items()}
         constants = constants_of(sim, spread)
         inputs = self.trials.inputs.repeat(sets)
         changed = self._acting(inputs, spread)

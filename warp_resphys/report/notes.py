@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..energies.materials import make_material
+from ..energies.catalogue import make_material
 from ..settings.body import MaterialSettings, TargetSettings
 from ..settings.run import RunSettings
 from .page import number_text
@@ -176,7 +176,7 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
     if material.model == "law":
         return small_strain(material.constants)
     own = make_material(material.model, **material.constants)
-    tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in own.constants.items()}
+    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in own.constants.items()}
     mu, lame = np.asarray(own.law.LAME).T @ [float(modulus) for modulus in own.moduli(tensors)]
     return SmallStrain(float(mu), float(lame))
 

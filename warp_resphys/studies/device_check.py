@@ -13,7 +13,7 @@ import warp as wp
 
 from ..dynamics.nonlinear_solver import SOLVERS, SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.materials import make_material
+from ..energies.catalogue import make_material
 from ..experiment.build import choose_device
 from ..experiment.files import METRICS
 from ..io.errors import ResphysError

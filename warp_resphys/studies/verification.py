@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..dynamics.nonlinear_solver import SolverName, SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.materials import Material, make_material
+from ..energies.catalogue import make_material
+from ..energies.materials import Material
 from ..experiment.build import choose_device
 from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.files import read_arrays

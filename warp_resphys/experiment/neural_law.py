@@ -9,6 +9,7 @@ import torch
 from ..dynamics.simulator import Simulator
 from ..energies.neural import NeuralMaterial, weight_constants
 from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint
 from ..io.stages import StageContext, package_versions
 from ..learning.law import VISCOSITIES
 from ..learning.neural_law import train_weights
@@ -18,6 +19,7 @@ from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
 from .experiment import Experiment
 from .files import LAW_FORMAT
+from .identify import Checkpoint
 from .law_trials import LawTrials, Score, stretches_of
 from .trials import evenly
 
@@ -28,7 +30,7 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
     """Trains a network, and returns the content of law.json.
 
     It begins near the identified material: with its moduli, its viscosity and its creep. Other identified parameters
-    keep SysID's values.
+    keep SysID's values. An interrupted training goes on from its last iteration.
     """
     settings: IdentifyLawStage = context.settings
     trials, wanted = LawTrials(experiment), settings.law
@@ -59,17 +61,21 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
         (Replay(start, r.observe, r.trials if seconds is None else r.trials.first(seconds)), own)
         for r, own in trials.replays(start, names)
     ]
-    most = wanted.max_evaluations or _EVALUATIONS
-    with Progress(context.name, most, "evaluations at most") as progress:
+    kept = Checkpoint(context, "law")
+    used, most = kept.content.get("used", 0), wanted.max_evaluations or _EVALUATIONS
+    with Progress(context.name, most, "evaluations at most", used) as progress:
         found = train_weights(
             replays,
             first,
             trained,
             fixed,
             lambda weights, others: tested(weights, others).error,
-            most,
+            max(most - used, 1),
             lambda loss: progress.advance(1, loss=f"{loss:.3g}"),
+            kept.content.get("reached"),
+            lambda reached: kept.keep(reached=reached, used=progress.done),
         )
+    forget_checkpoint(kept.path)
     score, below = tested(found.weights, found.constants), trials.score_below()
     return {
         "format": LAW_FORMAT,

@@ -42,6 +42,8 @@ def train_weights(
     score: Callable[[torch.Tensor, Mapping[str, float]], float],
     max_evaluations: int,
     report: Callable[[float], None],
+    reached: Sequence[float] | None = None,
+    keep: Callable[[list[float]], None] | None = None,
 ) -> Trained:
     """Returns the weights and constants with the least validation error on the path of L-BFGS.
 
@@ -53,6 +55,8 @@ def train_weights(
         score: validation error of weights and constants.
         max_evaluations: of the loss and its gradient.
         report: called with the loss after every evaluation.
+        reached: where an interrupted call had come to, as it passed it to `keep`.
+        keep: called after every iteration with what a further call can start from.
     """
     count = sum(len(replay.trials.names) for replay, _ in replays)
     like, size, history = replays[0][0].simulator.rest_positions, len(weights), list[dict[str, float]]()
@@ -87,7 +91,7 @@ def train_weights(
         gradient = slope.cpu().numpy() / scale + 2.0 * penalty * change
         return float(loss.detach()) / scale + penalty * float(change @ change), gradient
 
-    def keep(at: FloatArray) -> None:
+    def test(at: FloatArray) -> None:
         nonlocal best
         own, others = split(torch.tensor(at))
         error = score(own, {name: float(value) for name, value in others.items()})
@@ -96,20 +100,22 @@ def train_weights(
         if error < best[0]:
             best = (error, at.copy(), loss)
 
+    def iterated(at: FloatArray) -> None:
+        with torch.no_grad():
+            test(at)
+        if keep is not None:
+            keep(at.tolist())
+
+    start = first if reached is None else np.array(reached)
     with torch.no_grad():
-        keep(first)
+        test(start)
     scipy.optimize.minimize(
         objective,
-        first,
+        start,
         jac=True,
         method="L-BFGS-B",
-        callback=lambda at: _without_gradients(keep, at),
+        callback=iterated,
         options={"maxfun": max_evaluations, "maxiter": max_evaluations, "maxcor": _PAIRS},
     )
     own, others = split(torch.tensor(best[1]))
     return Trained(own, {name: float(value) for name, value in others.items()}, best[2], history)
-
-
-def _without_gradients(keep: Callable[[FloatArray], None], at: FloatArray) -> None:
-    with torch.no_grad():
-        keep(at)

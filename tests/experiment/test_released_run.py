@@ -289,9 +289,9 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
         run_stages([stage], tmp_path)
     assert not (tmp_path / "identification.json").exists()
     run_stages([stage], tmp_path)
-    searches = [("midpoint", 0), ("midpoint", 1), ("midpoint", 1), ("implicit_euler", 0), ("implicit_euler", 1)]
-    assert descents == searches
-    assert len(read(tmp_path / "identification.json")["sysid"]["history"]) == 2
+    own = [(name, number) for name in ("midpoint", "implicit_euler") for number in (0, 1, 0)]  # The release again.
+    assert descents == [*own[:2], *own[1:]]
+    assert len(read(tmp_path / "identification.json")["sysid"]["history"]) == 3
     assert not list(tmp_path.glob("identify_*"))
 
 
@@ -326,13 +326,13 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
     monkeypatch.setattr(identify, "_AT_ONCE", 2)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)
-    once = ["starts", "descent", "descent", "uncertainty"] * 2
+    once = ["starts", "descent", "descent", "uncertainty", "starts", "descent", "uncertainty"] * 2
     assert calls == once
     assert "identify: landscape: 6/10 points" in capsys.readouterr().err
     run_stages([stage], tmp_path)
     assert calls == once
     err = capsys.readouterr().err
-    assert "identify: 4/24 evaluations at most" in err
+    assert "identify: 6/60 evaluations at most" in err
     assert "identify: landscape: 10/10 points" in err
     results = read(tmp_path / "identification.json")
     assert results["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]

@@ -22,6 +22,7 @@ from .energies.materials import StableNeoHookean as StableNeoHookean
 from .energies.medium import Medium as Medium
 from .energies.muscles import Muscle as Muscle
 from .energies.muscles import Muscles as Muscles
+from .energies.neural import NeuralMaterial as NeuralMaterial
 from .energies.pointwise import PointwiseEnergy as PointwiseEnergy
 from .energies.pressure import Pressure as Pressure
 from .energies.strings import Strings as Strings

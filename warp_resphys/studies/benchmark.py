@@ -27,7 +27,7 @@ from ..io.progress import Progress
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Some, Word, parse, setting
 from ..io.stages import package_versions
 from ..linalg.threads import threads_for
-from ..settings.body import SimulationSettings
+from ..settings.body import MaterialSettings, SimulationSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
@@ -39,6 +39,10 @@ from .timing import TimedRollout, median_seconds, now, run_in_new_process, yards
 PAGE = "benchmark.html"
 PARTS: Final = ("local_step", "tangent", "assembly", "factor", "solve")
 ByRefinement = Annotated[dict[Natural, Natural], Field(min_length=1)]
+
+
+_MODULI: Final = ("youngs_modulus", "c10", "bulk_1")  # by the first of which gradients are taken
+_OF_LAWS: Final = "quasi_newton"  # solver with which laws are timed, in the smallest batch
 
 
 class ElasticConstants(Settings):
@@ -76,6 +80,7 @@ class BenchmarkSettings(Settings):
     quick: bool
     solvers: Some[SolverName]
     materials: Some[ElasticConstants]
+    laws: Many[MaterialSettings] = ()
     refinements: Some[Natural]
     batches: Batches
     largest_batch: ByRefinement
@@ -124,24 +129,27 @@ class BenchmarkCase:
     """One row of the benchmark."""
 
     solver: str
-    material: ElasticConstants
+    material: MaterialSettings
     refinement: int  # of the configured box
     batch: int
     timed: TimedRollout
 
     def measure(self) -> None:
-        """Times a roll-out, and its gradient with respect to start, force at every step and Young's modulus."""
-        timed, modulus = self.timed, self.timed.simulator.tensor(self.material.youngs_modulus).reshape(1)
+        """Times a roll-out, and its gradient with respect to start, force at every step and a modulus."""
+        timed, constants = self.timed, self.material.constants
+        name = next(name for name in _MODULI if name in constants)
+        modulus = timed.simulator.tensor(constants[name]).reshape(1)
         forces = timed.start.q.new_zeros(timed.steps, *timed.start.q.shape).requires_grad_(True)
         timed.inputs = timed.inputs.replace(external_force=forces)
-        timed.measure({"youngs_modulus": modulus.requires_grad_(True)})
+        timed.measure({name: modulus.requires_grad_(True)})
 
     def row(self) -> dict[str, Any]:
         """The case as a row of benchmark.json; times are those of one step of the whole batch."""
         (forward, backward), (least_forward, least_backward) = self.timed.a_step(median), self.timed.a_step(min)
         return {
             "solver": self.solver,
-            **self.material.plain(),
+            "model": self.material.model,
+            "poissons_ratio": self.material.constants.get("poissons_ratio"),
             "refinement": self.refinement,
             "unknowns": self.timed.unknowns,
             "batch": self.batch,
@@ -214,13 +222,15 @@ def _cases(settings: BenchmarkRun, refinement: int) -> list[BenchmarkCase]:
     timed, body = settings.benchmark, build_body(settings.changed(mesh=_refined(settings, refinement)))
     tolerances = {"relative_tolerance": timed.relative_tolerance, "max_iterations": timed.max_iterations}
     cases = []
+    configured = settings.simulation
+    materials = [configured.changed(**own.plain()) for own in timed.materials]
     for name in timed.solvers:
         steps = timed.steps_of(name, refinement)
         solved = settings.changed(solver=settings.solver.changed(name=name, **tolerances))
-        for material in timed.materials:
-            constants = settings.simulation.changed(**material.plain())
-            for batch in timed.batches_of(name, refinement, settings.device):
-                simulator = build_simulator(solved, constants, body)
+        for number, material in enumerate((*materials, *(timed.laws if name == _OF_LAWS else ()))):
+            batches = timed.batches_of(name, refinement, settings.device)
+            for batch in batches[: None if number < len(materials) else 1]:
+                simulator = build_simulator(solved, material, body)
                 start, inputs = _start(simulator, timed, batch, steps)
                 simulator.rollout(start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}))
                 rollout = TimedRollout(simulator, start, steps, inputs)
@@ -345,11 +355,16 @@ def benchmark_sheets(result: Mapping[str, Any]) -> list[Sheet]:
     """The tables of a result of `run_benchmark`."""
     yardstick, cold = result["yardstick_ms"], result["cold_start"]
     steps = [
-        {**row, "relative": row["forward_ms"] / yardstick, "steps_s": 1e3 * row["batch"] / row["forward_ms"]}
+        {
+            **row,
+            "relative": row["forward_ms"] / yardstick,
+            "steps_s": 1e3 * row["batch"] / row["forward_ms"],
+            "material": row["poissons_ratio"] or row["model"].removesuffix("_law"),
+        }
         for row in result["steps"]
     ]
     columns = (
-        "solver {solver} | nu {poissons_ratio:g} | unknowns {unknowns} | batch {batch} | forward {forward_ms:.2f} | "
+        "solver {solver} | nu {material} | unknowns {unknowns} | batch {batch} | forward {forward_ms:.2f} | "
         "backward {backward_ms:.2f} | forward / yardstick {relative:.2f} | robots' steps/s {steps_s:.0f} | "
         "iterations {iterations:.1f} | factorisations {factorisations:.2f}"
     )

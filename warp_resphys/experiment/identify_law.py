@@ -77,9 +77,12 @@ class _LawSearch:
         self.context, self.experiment, self.trials = context, experiment, LawTrials(experiment)
         self.kept = Checkpoint(context, "law")
         self.settings: IdentifyLawStage = context.settings
-        train, wanted = self.settings.split.train, self.settings.law
-        self.names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
-        self.released = any(experiment.begins(name) == "released" for name in train)
+        self.released = any(experiment.begins(name) == "released" for name in self.settings.split.train)
+
+    def _names(self, whole: bool) -> tuple[str, ...]:
+        """Names of the trials of a search."""
+        own, most = self.settings.split.train if whole else self.trials.learned, self.settings.law.trials
+        return own if most is None else tuple(evenly(own, most))
 
     def run(self) -> dict[str, Any]:
         """Identifies a law; returns the content of law.json."""
@@ -102,7 +105,7 @@ class _LawSearch:
             refined = self._from_markers(library)
             classes, scores = [own.law for own in refined], [own.score.error for own in refined]
             best = refined[-1]
-        if self.trials.early is not None:
+        if self.trials.holds_out:
             best = replace(self._refine(best.law, whole=True), score=best.score)
         below, deviation = self.trials.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
@@ -120,7 +123,7 @@ class _LawSearch:
             "validation": {"trials": list(self.trials.checked), "law": best.score.error, "below": below.error},
             "classes": tried,
             "stretches": self._stretches(best),
-            "data": {"name": self.settings.name, "trials": list(self.names)},
+            "data": {"name": self.settings.name, "trials": list(self._names(whole=True))},
             "versions": package_versions(),
         }
 
@@ -161,7 +164,7 @@ class _LawSearch:
         """Returns the least and the largest principal stretch in the training trials."""
         simulator = self.trials.simulator(best.law.constants)
         values = {name: simulator.tensor([value]) for name, value in best.others.items()}
-        return stretches_of(self.experiment, self.trials.replays(simulator, self.names), values)
+        return stretches_of(self.experiment, self.trials.replays(simulator, self._names(whole=True)), values)
 
     def _from_states(self, library: Library) -> list[LawClass]:
         """Returns the classes of the weak form."""
@@ -251,13 +254,10 @@ class _LawSearch:
             others: guess of the other ones, in place of SysID's values.
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
-        limits = (
-            wanted.seconds,
-            self.trials.seconds,
-            None if "whole" in key or key == "given" else self.trials.early,
-        )
+        whole = "whole" in key or key == "given"
+        limits = (wanted.seconds, self.trials.seconds, None if whole else self.trials.early)
         seconds = min((limit for limit in limits if limit is not None), default=None)
-        identifier = Identifier(self.trials.replays(simulator, self.names), bounds, seconds)
+        identifier = Identifier(self.trials.replays(simulator, self._names(whole)), bounds, seconds)
         most = wanted.max_evaluations or _EVALUATIONS
         with Progress(self.context.name, most, "evaluations at most") as progress:
 

@@ -26,6 +26,7 @@ from .identify import bounds_of
 LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
 _UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
 _OF_MASS: Final = ("density", "mass_damping")
+_HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 
 _CLOSER: Final = 0.95
@@ -62,14 +63,15 @@ class Score:
 class LawTrials:
     """The trials of an experiment, simulated with laws.
 
-    A law is tested on validation trials. Without any, it is identified from the first part of the training trials, and
-    tested on the rest of them, which SysID has seen.
+    A law is tested on validation trials. Without any, every fourth training trial takes their place until a law is
+    chosen; of three motions or fewer, the last part, of which SysID has seen all.
 
     Args:
         experiment: the experiment.
 
     Attributes:
         checked: names of the trials that laws are tested on.
+        learned: names of the training trials that a law is identified from before it is tested.
         states: whether all vertices are observed.
         sysid: parameters of SysID by name; empty if nothing was identified.
         guess: constants of a law with the moduli, the viscosity and the creep of the identified material.
@@ -81,7 +83,10 @@ class LawTrials:
         settings = experiment.settings
         assert isinstance(settings, IdentifyLawStage)
         self.experiment, self.settings, split = experiment, settings, settings.split
-        self.checked = split.validation or split.train
+        self.checked, self.learned = split.validation or split.train, split.train
+        if not split.validation and len(split.train) >= _HELD_OUT:
+            self.checked = split.train[_HELD_OUT // 2 :: _HELD_OUT]
+            self.learned = tuple(name for name in split.train if name not in self.checked)
         self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
         self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
         self.guess, self.mass = self._guess()
@@ -93,10 +98,14 @@ class LawTrials:
 
     @property
     def early(self) -> float | None:
-        """Duration from which a law is identified before it is tested on the same trials [s]; None with validation."""
-        if self.settings.split.validation:
-            return None
-        return _EARLY * (self.seconds or float(self.experiment.dataset.times.max()))
+        """Duration from which a law is identified before it is tested on the same trials [s]; None with others."""
+        longest = self.seconds or float(self.experiment.dataset.times.max())
+        return _EARLY * longest if self.checked == self.learned and longest > 0.0 else None
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether a chosen law is identified again with what it was tested on."""
+        return not self.settings.split.validation
 
     def simulator(self, constants: Mapping[str, float]) -> Simulator:
         """Returns the simulator of the identified model with a law; failed steps are counted."""

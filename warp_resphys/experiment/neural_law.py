@@ -34,7 +34,7 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
     """
     settings: IdentifyLawStage = context.settings
     trials, wanted = LawTrials(experiment), settings.law
-    names = settings.split.train if wanted.trials is None else tuple(evenly(settings.split.train, wanted.trials))
+    names = trials.learned if wanted.trials is None else tuple(evenly(trials.learned, wanted.trials))
     constants = _first(trials)
     begun = NeuralMaterial.from_lame(trials.shear, 2.0 * trials.guess["bulk_1"])
     first = torch.as_tensor(begun.weights)

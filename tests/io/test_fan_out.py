@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.materials import make_material
+from warp_resphys.energies.catalogue import make_material
 from warp_resphys.fem.body import Body
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import WorkerError, WorkerFaultError, Workers, fan_out

@@ -77,7 +77,7 @@ def swing(simulator, parameters=None, steps=100):
         return simulator.rollout(simulator.rest_state(), steps, parameters=parameters).q[:, 0].numpy()
 
 
-motions = {}
+motions, removed = {}, {}
 for name, (mesh, fixed) in bodies.items():
     real = wr.Simulator(wr.Body(mesh, wr.select_vertices(mesh, **fixed)), truth, time_step=0.01)
     motions[name] = {"true": swing(real)}
@@ -85,11 +85,12 @@ for name, (mesh, fixed) in bodies.items():
         there = robot.on(mesh, fixed=fixed)
         motions[name][model] = swing(there.simulator, there.constants)
     errors = {m: 1e3 * np.linalg.norm(q - motions[name]["true"], axis=-1).mean() for m, q in motions[name].items()}
-    removed = 100.0 * (1.0 - errors["law"] / errors["simulation"])
+    removed[name] = 100.0 * (1.0 - errors["law"] / errors["simulation"])
     print(
         f"{name:15s} uncorrected {errors['simulation']:6.3f} mm, SysID {errors['sysid']:6.3f} mm, "
-        f"law {errors['law']:8.2g} mm: {removed:.3f} % removed"
+        f"law {errors['law']:8.2g} mm: {removed[name]:.3f} % removed"
     )
+assert min(removed.values()) > 99.0, removed
 
 # %%
 figure, axes = plt.subplots(1, len(bodies), figsize=(9.0, 2.8), sharex=True, layout="constrained")

@@ -61,7 +61,7 @@ def test_page_has_the_bodies(tmp_path):
         "Other bodies of the same material",
         "thin <beam>",
         "removes 99.0 %",
-        "225 vertices, moves by 12.500 mm",
+        "225 vertices, moves by 12.5 mm",
     ):
         assert said in page.text
     assert "was learned at, with the share of cells and times: thin <beam> (12 %)." in page.text

@@ -43,7 +43,7 @@ def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
             else Cell(number_text(result["errors_mm"].get(model)) if model in result["errors_mm"] else NONE)
             for model in models
         ]
-        small = f"{result['vertices']} vertices, moves by {number_text(result['moved_mm'])} mm"
+        small = f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"
         rows.append(Row(name, cells, small=small))
     return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
 

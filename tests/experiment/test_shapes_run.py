@@ -8,6 +8,7 @@ import pytest
 from support.configured import check, composed
 from support.main_job import IN_RUN, run_without_report
 from warp_resphys.experiment import shapes
+from warp_resphys.fem.stretches import share_outside
 from warp_resphys.io.errors import InputError
 
 BEAM = "{kind:box_hexahedra,size:[0.08,0.02,0.02],divisions:[4,1,1]}"
@@ -84,7 +85,7 @@ def test_an_interrupted_stage_goes_on(run, monkeypatch):
 
 def test_stretches_outside_of_a_range_are_counted():
     stretches = np.array([[[1.2, 1.0, 0.9], [1.0, 1.0, 1.0]], [[1.05, 1.0, 0.7], [1.1, 1.0, 0.95]]])
-    assert shapes._outside(stretches, 0.8, 1.15) == pytest.approx(0.5)
+    assert share_outside(stretches, 0.8, 1.15) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(

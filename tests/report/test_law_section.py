@@ -15,7 +15,7 @@ from warp_resphys.energies.neural import initial_weights, weight_constants
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.report.conclusions import conclusions, errors_by_load, law_text
 from warp_resphys.report.law_figure import drawn_stretches
-from warp_resphys.report.law_section import not_needed_text, open_text, wording
+from warp_resphys.report.law_section import not_needed_text, open_text, outside_text, wording
 from warp_resphys.report.notes import small_strain_of
 from warp_resphys.report.page import percent_text
 from warp_resphys.report.run_page import range_texts
@@ -211,3 +211,12 @@ def test_a_network_is_shown_without_its_weights(tmp_path):
     assert "weight_1" not in page.text
     assert "Shear modulus [kPa]80.0" in page.text or "Shear modulus [kPa]80" in page.text
     assert not (tmp_path / "figures" / "law.png").is_file()
+
+
+def test_test_trials_beyond_the_stretches_of_the_training_are_said():
+    stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
+    said = outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
+    assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
+    assert "0.90 to 1.10" in said
+    assert outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
+    assert outside_text(SimpleNamespace(outside=None, stretches={})) == ""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
-from ..fem.stretches import principal_stretches
+from ..fem.stretches import principal_stretches, share_outside
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
@@ -87,7 +87,7 @@ def make_report(context: StageContext) -> None:
         notes=error_notes(metrics.get("sideways_mm", {}), truth, metrics.get("mesh_check", {})),
         identification=identification,
         law=law,
-        stretches=read_stretches(folder, mesh, trials, film) if law else {},
+        **(read_stretches(folder, mesh, trials, film) if law else {}),
         start=data_sheet(run, identification),
         truth=truth.get("material", {}),
         training=_histories(folder, False),
@@ -236,24 +236,25 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
     )
 
 
-def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | None) -> dict[str, tuple[float, float]]:
-    """Least and largest principal stretch at the centres of the cells, in the law's training and in all test trials.
+def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | None) -> dict[str, Any]:
+    """Principal stretches at the centres of the cells, for the section on the law.
 
     Where markers are observed, the test trials are the body of the film, which is simulated.
+
+    Returns:
+        ``stretches``: the least and the largest one in the test trials, and in the training of the law.
+        ``outside``: the share of cells and states of the test trials outside of the training; None if it is not known.
     """
-    if trials.labels:
-        bodies = {} if film is None else {f"the trial {film.trial}": next(reversed([*film.positions.values()]))}
-    else:
-        bodies = {"all test trials": trials.target}
-    found = {name: _stretch_range(mesh, q.reshape(-1, *q.shape[-2:])) for name, q in bodies.items()}
     learned = read_if_there(folder / LAW_FILE).get("stretches")
-    return found if learned is None else {**found, "the training": (float(learned[0]), float(learned[1]))}
-
-
-def _stretch_range(mesh: Mesh, positions: FloatArray) -> tuple[float, float]:
-    """Least and largest principal stretch at the centres of the cells of some states (S, N, 3) [m]."""
-    stretches = principal_stretches(mesh, positions)
-    return float(np.nanmin(stretches)), float(np.nanmax(stretches))
+    trained = {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
+    if trials.labels and film is None:
+        return {"stretches": trained, "outside": None}
+    name, bodies = "all test trials", trials.target
+    if trials.labels and film is not None:
+        name, bodies = f"the trial {film.trial}", next(reversed([*film.positions.values()]))
+    values = principal_stretches(mesh, bodies.reshape(-1, *bodies.shape[-2:]))
+    outside = None if learned is None else share_outside(values, *trained["the training"])
+    return {"stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained}, "outside": outside}
 
 
 def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:

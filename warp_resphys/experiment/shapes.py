@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
-from ..fem.stretches import principal_stretches
+from ..fem.stretches import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
@@ -114,7 +114,7 @@ def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSetting
     moved = 1e3 * np.linalg.norm(observed - plain.mesh.vertices, axis=-1)
     found = {"vertices": len(plain.mesh.vertices), "moved_mm": float(moved.max()), "errors_mm": errors}
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
-        found["outside"] = _outside(principal_stretches(plain.mesh, observed), *law["stretches"])
+        found["outside"] = share_outside(principal_stretches(plain.mesh, observed), *law["stretches"])
     return found
 
 
@@ -157,9 +157,3 @@ def _rolled(
             state, _ = simulator.step(state, Inputs(), constants)
         states.append(state)
     return states
-
-
-def _outside(stretches: FloatArray, low: float, high: float) -> float:
-    """Returns the share of cells and states in which a principal stretch lies outside of a range."""
-    beyond = (stretches.min(-1) < low) | (stretches.max(-1) > high)
-    return float(beyond.mean())

@@ -29,3 +29,9 @@ def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[n
     values = np.full(deformation.shape[:-1], np.nan)
     values[finite] = np.linalg.svd(deformation[finite], compute_uv=False)
     return values
+
+
+def share_outside(stretches: NDArray[np.float64], low: float, high: float) -> float:
+    """Returns the share of cells and states (S, C, 3) with a principal stretch outside of a range."""
+    beyond = (stretches.min(-1) < low) | (stretches.max(-1) > high)
+    return float(beyond[np.isfinite(stretches).all(-1)].mean())

@@ -138,6 +138,7 @@ class RunReport:
     identification: Mapping[str, Any] = field(default_factory=dict)  # Content of `identification.json`.
     law: Mapping[str, Any] = field(default_factory=dict)  # Content of `law.json`.
     stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
+    outside: float | None = None  # Share of cells and states of the test trials outside of the law's training.
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
     truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.

@@ -19,6 +19,7 @@ from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_s
 from .verdict import unbroken
 
 NETWORK: Final = "neural_law"  # Model of a material whose law is a network.
+_BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _KPA: Final = ("kPa", 1e-3)
 _STRAIN: Final = ("%", 1e2)
 _ANGLE: Final = ("°", 180.0 / np.pi)
@@ -76,7 +77,8 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     notes += [f"The target is simulated, with the material {data.target}."] if data.target else []
     blocks += [Text(" ".join(notes if law.get("deviation") else notes[1:]), note=True)]
-    blocks += [Text(unbroken(said)) for said in (open_text(law), not_needed_text(law, settings)) if said]
+    said = (open_text(law), not_needed_text(law, settings), outside_text(data))
+    blocks += [Text(unbroken(text)) for text in said if text]
     blocks += [_moduli_table(data, small_strain(constants), constants), *_curve(data, constants, canvas)]
     return Part("Law of the material", [*blocks, *_classes(law)])
 
@@ -140,6 +142,18 @@ def _sentence(names: Sequence[str]) -> str:
 def _lower(words: str) -> str:
     return (
         words if words.startswith(("Young", "Poisson", "Prony", "Mooney", "Ogden")) else words[:1].lower() + words[1:]
+    )
+
+
+def outside_text(data: RunReport) -> str:
+    """Return a sentence on test trials outside of the stretches of the training; empty if they hardly are."""
+    if data.outside is None or data.outside < _BEYOND:
+        return ""
+    low, high = data.stretches["the training"]
+    (where, _), *_ = data.stretches.items()
+    return (
+        f"In {100.0 * data.outside:.0f} % of the cells and times of {where}, a principal stretch lies outside of those "
+        f"that the law was learned at, {low:.2f} to {high:.2f}: there it extrapolates."
     )
 
 

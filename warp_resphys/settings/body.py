@@ -41,10 +41,21 @@ class RegionMaterialSettings(_Constants):
 
 
 class MaterialSettings(_Constants):
-    """A material and its constants, in SI units, which `energies.materials` lists for each model."""
+    """A material and its constants, in SI units, as `energies.materials` lists them; null takes one out."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]}}
+    )
 
     model: Word = setting("corotated", "constitutive model")
     regions: dict[str, RegionMaterialSettings] = setting({}, "materials of regions of the mesh, by name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_null(cls, values: Any) -> Any:
+        return (
+            {key: value for key, value in values.items() if value is not None} if isinstance(values, dict) else values
+        )
 
     @property
     def by_region(self) -> "dict[str, MaterialSettings]":

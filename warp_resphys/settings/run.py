@@ -435,7 +435,7 @@ def filled(values: Any) -> Any:
             direct = {key for key, value in own.items() if key not in keys and not isinstance(value, Mapping)}
             constants = {key: own[key] for key in direct} if group == "target" else {}
             material = _mapping(own.get("material", {}))
-            if material is not None and (constants or "material" in own):
+            if constants and material is not None:
                 own = {key: value for key, value in own.items() if key not in constants}
                 own["material"] = {key: value for key, value in {**constants, **material}.items() if value is not None}
             values[group] = {**common, "material": values.get("simulation"), **own}

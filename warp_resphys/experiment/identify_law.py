@@ -107,6 +107,7 @@ class _LawSearch:
             best = refined[-1]
         if self.trials.holds_out:
             best = replace(self._refine(best.law, whole=True), score=best.score)
+        constants = {**self.trials.mass, **best.law.constants}
         below, deviation = self.trials.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
@@ -114,8 +115,8 @@ class _LawSearch:
             "model": LAW,
             "accepted": best.score.beats(below),
             "groups": list(best.law.groups),
-            "constants": best.law.constants,
-            "units": {name: unit_of(name) for name in best.law.constants},
+            "constants": constants,
+            "units": {name: unit_of(name) for name in constants},
             "parameters": best.others,
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
             "at_bounds": [name for name, old in best.names.items() if old in best.found.at_bounds],

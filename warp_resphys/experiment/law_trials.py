@@ -24,7 +24,16 @@ from .experiment import LAW, Experiment
 from .identify import bounds_of
 
 LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
-_UNITS: Final = {"viscosity": "Pa s", "time": "s", "azimuth": "rad", "elevation": "rad", "slack": "", "toe": ""}
+_UNITS: Final = {
+    "density": "kg/m^3",
+    "damping": "1/s",
+    "viscosity": "Pa s",
+    "time": "s",
+    "azimuth": "rad",
+    "elevation": "rad",
+    "slack": "",
+    "toe": "",
+}
 _OF_MASS: Final = ("density", "mass_damping")
 _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
@@ -114,8 +123,8 @@ class LawTrials:
         return build_simulator(settings, material, self.experiment.body, on_failure="count")
 
     def others(self, simulator: Simulator) -> dict[str, torch.Tensor]:
-        """Returns (1,) identified parameters that are not those of the material."""
-        own = self.experiment.simulator("simulation").materials[""].quantities
+        """Returns (1,) identified parameters beside the law: damping by mass and density, and those of other parts."""
+        own = {*self.experiment.simulator("simulation").materials[""].quantities} - {*_OF_MASS}
         return {name: simulator.tensor([value]) for name, value in self.sysid.items() if name not in own}
 
     def bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:

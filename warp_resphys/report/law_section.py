@@ -19,6 +19,7 @@ from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_s
 from .verdict import unbroken
 
 NETWORK: Final = "neural_law"  # Model of a material whose law is a network.
+_NOT_OF_A_LAW: Final = ("weight_", "density", "mass_damping")  # Of its constants, not shown one by one.
 _BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _KPA: Final = ("kPa", 1e-3)
 _STRAIN: Final = ("%", 1e2)
@@ -65,9 +66,8 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     if not law or settings is None:
         return None
     network = law.get("model") == NETWORK
-    constants = {name: value for name, value in law["constants"].items() if not name.startswith("weight_")}
-    if network:
-        law = {**law, "constants": {n: x for n, x in constants.items() if n not in ("density", "mass_damping")}}
+    constants = {name: value for name, value in law["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
+    law = {**law, "constants": constants}
     blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
     if network:
         blocks.append(Text(unbroken(_network_text(data.law)), note=True))

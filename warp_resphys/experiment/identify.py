@@ -66,11 +66,10 @@ def identify(context: StageContext) -> None:
             guess = {name: guess[name] for name in bounds}
             found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
             for again in again_of(model) if released else ():  # The release was estimated with other parameters.
-                values, before, history = found["parameters"], found["loss"], found["history"]
+                values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
                 found = _search(settings, identifier, values, kept[again], progress, 1)
-                found["history"] = [*history, *found["history"]]
                 if not changes(before, found["loss"]):
                     break
             identified[model] = found | {"first_guess": guess}

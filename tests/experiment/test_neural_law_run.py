@@ -52,6 +52,14 @@ def test_its_material_is_put_on_another_body(run):
     assert len(weights[0]) == 163
 
 
+def test_another_run_takes_it(run, tmp_path):
+    own = [word for word in RUN if not word.startswith("law.")]
+    folder = run_without_report(tmp_path, *own, f"law={run / 'law.json'}")
+    law, given = read(folder, "law.json"), read(run, "law.json")
+    assert (law["model"], law["constants"]) == (given["model"], given["constants"])
+    assert law["validation"]["law"] == pytest.approx(given["validation"]["law"], rel=1e-3)
+
+
 def test_an_interrupted_training_goes_on(run, monkeypatch):
     (run / "stages" / "identify_law.json").unlink()
     reached, train = [], neural_law.train_weights

@@ -34,6 +34,7 @@ def law(**changes):
     """Content of law.json."""
     constants = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
     own = {
+        "model": "law",
         "accepted": True,
         "groups": ["elastic", "branches"],
         "constants": constants,

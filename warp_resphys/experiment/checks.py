@@ -94,8 +94,9 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
             "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
         )
     if law.file is not None:
-        constants = read_law(Path(law.file).expanduser())["constants"]
-        build_material(MaterialSettings.model_validate({"model": LAW, **constants}), f"law: {law.file}")
+        given = read_law(Path(law.file).expanduser())
+        material = MaterialSettings.model_validate({"model": given["model"], **given["constants"]})
+        build_material(material, f"law: {law.file}")
 
 
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
@@ -377,7 +378,13 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
                 instead = f"choose from {', '.join(choice)}" if choice else f"set identify.{group} to null"
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
     for name, limits in identify.parameters.items():
-        if command_of(simulator, name)[1] in ("delay", "rise", "slew") and limits.lower < 0.0:
+        word = command_of(simulator, name)[1]
+        if word == "slew" and limits.lower < 0.0:
+            raise InputError(
+                f"identify.parameters.{name}.lower is {limits.lower:g}: slew rates are positive, so it must be zero "
+                "or more, in s by the unit of the input."
+            )
+        if word in ("delay", "rise") and limits.lower < 0.0:
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: inputs cannot precede their command, so it "
                 "must be zero or more, in s; data.trials.NAME.onset is the time of a command."

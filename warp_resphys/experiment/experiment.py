@@ -125,7 +125,7 @@ class Experiment:
             return self._published.simulation
         if kind == LAW:
             law = read_json(self.folder / LAW_FILE)
-            return MaterialSettings(model=law.get("model", LAW), **law["constants"])
+            return MaterialSettings(model=law["model"], **law["constants"])
         return self._target.material if kind == "target" else self.settings.simulation
 
     @property

@@ -83,13 +83,14 @@ def read_if_there(path: Path) -> dict[str, Any]:
 
 
 def read_law(path: Path) -> dict[str, Any]:
-    """Contents of a law that `identify_law` wrote, with at least its ``constants``.
+    """Contents of a law that `identify_law` wrote, with at least its ``model`` and its ``constants``.
 
     Raises:
         DataFileError: the file is missing, damaged or of another version.
     """
     content: dict[str, Any] = read_json(path)
-    if content.get("format") != LAW_FORMAT or not isinstance(content.get("constants"), dict):
+    whole = isinstance(content.get("constants"), dict) and isinstance(content.get("model"), str)
+    if content.get("format") != LAW_FORMAT or not whole:
         raise DataFileError(
             f"{path} is not a law of this version: give a {LAW_FILE} that a run with the group law has written."
         )

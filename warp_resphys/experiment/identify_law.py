@@ -131,12 +131,13 @@ class _LawSearch:
     def given(self, file: str) -> dict[str, Any]:
         """Identifies the parameters beside a law of another run; returns the content of law.json."""
         content = read_law(Path(file).expanduser())
-        constants: dict[str, float] = content["constants"]
-        simulator, others, found = self.trials.simulator(constants), dict[str, float](), None
+        simulator = self.trials.simulator(content["constants"], content["model"])
+        others, found = dict[str, float](), None
         if bounds := self.trials.bounds_of_others(simulator):
             found = self._search("given", simulator, bounds, {})
             others = found.parameters
-        score = self.trials.scores([constants], others)[0]
+        values = {name: simulator.tensor([value]) for name, value in others.items()}
+        score = self.trials.errors(simulator, values, 1)[0]
         return {
             **content,
             "accepted": True,

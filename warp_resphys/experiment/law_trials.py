@@ -116,10 +116,10 @@ class LawTrials:
         """Whether a chosen law is identified again with what it was tested on."""
         return not self.settings.split.validation
 
-    def simulator(self, constants: Mapping[str, float]) -> Simulator:
-        """Returns the simulator of the identified model with a law; failed steps are counted."""
+    def simulator(self, constants: Mapping[str, float], model: str = LAW) -> Simulator:
+        """Returns the simulator of the identified model with the constants of a law; failed steps are counted."""
         settings = self.experiment.settings_of("identified")
-        material = MaterialSettings.model_validate({"model": LAW, **self.mass, **constants})
+        material = MaterialSettings.model_validate({"model": model, **self.mass, **constants})
         return build_simulator(settings, material, self.experiment.body, on_failure="count")
 
     def others(self, simulator: Simulator) -> dict[str, torch.Tensor]:

@@ -6,7 +6,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..dynamics.simulator import Simulator
 from ..energies.neural import NeuralMaterial, weight_constants
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
@@ -14,9 +13,7 @@ from ..io.stages import StageContext, package_versions
 from ..learning.law import VISCOSITIES
 from ..learning.neural_law import train_weights
 from ..learning.replay import Replay
-from ..settings.body import MaterialSettings
 from ..settings.stages import IdentifyLawStage
-from .build import build_simulator
 from .experiment import Experiment
 from .files import LAW_FORMAT
 from .identify import Checkpoint
@@ -30,7 +27,8 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
     """Trains a network, and returns the content of law.json.
 
     It begins near the identified material: with its moduli, its viscosity and its creep. Other identified parameters
-    keep SysID's values. An interrupted training goes on from its last iteration.
+    keep SysID's values. Training trials that are held out for the test of the network stay so. An interrupted training
+    goes on from its last iteration.
     """
     settings: IdentifyLawStage = context.settings
     trials, wanted = LawTrials(experiment), settings.law
@@ -44,11 +42,7 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
     def law(weights: torch.Tensor, others: Mapping[str, float]) -> dict[str, float]:
         return {**constants, **others, **weight_constants(weights)}
 
-    def simulator(weights: torch.Tensor, others: Mapping[str, float]) -> Simulator:
-        made = MaterialSettings.model_validate({"model": NeuralMaterial.model, **law(weights, others)})
-        return build_simulator(experiment.settings_of("identified"), made, experiment.body, on_failure="count")
-
-    start = simulator(first, trained)
+    start = trials.simulator(law(first, trained), NeuralMaterial.model)
     fixed = trials.others(start)
 
     def tested(weights: torch.Tensor, others: Mapping[str, float]) -> Score:

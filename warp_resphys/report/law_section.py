@@ -65,7 +65,7 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     law, settings = data.law, data.settings.law
     if not law or settings is None:
         return None
-    network = law.get("model") == NETWORK
+    network = law["model"] == NETWORK
     constants = {name: value for name, value in law["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
     law = {**law, "constants": constants}
     blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]

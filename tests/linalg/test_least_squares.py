@@ -35,12 +35,14 @@ def descend(valley, start, max_iterations):
     return point.x[0].numpy(), float(point.value)
 
 
-def test_the_descent_follows_a_bent_valley():
+@pytest.mark.parametrize("start", [[0.05, 0.9], [0.1, 0.0], [0.95, 0.9], [0.3, 0.09]])
+def test_the_descent_follows_a_bent_valley(start):
+    """Without a second step after a rejected one, two of these are not there after a hundred evaluations."""
     valley = Valley()
-    x, value = descend(valley, [0.05, 0.9], 50)
+    x, value = descend(valley, start, 50)
     np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-6)
     assert value < 1e-10
-    assert valley.calls < 60
+    assert valley.calls < 35
 
 
 def test_the_descent_turns_back_from_failures():

@@ -3,7 +3,9 @@
 A `Problem` gives its objective, the minimiser of its damped linearisation, and the distance between two points;
 `minimise` is the loop around it (Nocedal and Wright 2006, section 10.3). It starts undamped (Gauss-Newton). A step that
 increases the objective is rejected and the damping multiplied by ten, to one at least; after an accepted step it is
-divided by ten. The problem defines the unit of the damping.
+divided by ten. The problem defines the unit of the damping. Where a problem follows curved valleys, a rejected step is
+followed by a second one from its end before the damping grows (the watchdog of Nocedal and Wright, section 15.6): along
+the floor of a valley a long step ends on the wall, and the next one at the floor, much further on.
 """
 
 from abc import ABC, abstractmethod
@@ -38,6 +40,8 @@ class Point:
 
 class Problem(ABC):
     """A batch of independent sums of squares."""
+
+    follows_valleys = False  # whether a rejected step is followed by a second one; of a batch of one
 
     @abstractmethod
     def evaluate(self, x: torch.Tensor) -> Point:
@@ -79,7 +83,9 @@ def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: i
     damping, distance = torch.zeros_like(point.value), torch.full_like(point.value, torch.inf)
     done = torch.zeros_like(point.value, dtype=torch.bool)
     accepted = ~done
-    for iteration in range(1, max_iterations + 1):
+    iteration = 0
+    while iteration < max_iterations:
+        iteration += 1
         if bool(accepted.any()):
             step = problem.linearise(point)
         trial = problem.evaluate(_where(done, point.x, step(damping)))
@@ -87,6 +93,11 @@ def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: i
         better = finite & (trial.value <= point.value)
         distance = torch.where(finite, problem.distance(point, trial), torch.inf)
         converged = (distance <= tolerance) & (~better | (damping <= 1.0))
+        if problem.follows_valleys and bool(finite & ~better & ~converged) and iteration < max_iterations:
+            iteration += 1
+            second = problem.evaluate(problem.linearise(trial)(damping))
+            if bool(second.value <= point.value):
+                trial, better = second, ~better
         accepted = better & ~done
         kept = tuple(_where(accepted, new, old) for new, old in zip(trial.kept, point.kept, strict=True))
         point = Point(_where(accepted, trial.x, point.x), _where(accepted, trial.value, point.value), kept)
@@ -94,7 +105,7 @@ def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: i
         done |= converged
         if bool(done.all()):
             return Solution(point, iteration, True, float(distance.max()))
-    return Solution(point, max_iterations, False, float(distance.max()))
+    return Solution(point, iteration, False, float(distance.max()))
 
 
 def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:
@@ -113,6 +124,8 @@ class UnitBox(Problem):
         objective: maps variables (P,) to the value, its gradient (P,) and the Gauss-Newton matrix 2 J^T J (P, P); the
             value is infinite if the evaluation fails.
     """
+
+    follows_valleys = True
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective

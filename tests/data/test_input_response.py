@@ -89,3 +89,33 @@ def test_the_slew_rate_limits_the_change_in_a_step():
     both, _ = InputResponse(STEP, slew=slews).from_rest(torch.as_tensor(np.stack([commands, commands], 1)))
     np.testing.assert_allclose(both[:, 1], limited, atol=1e-12)
     np.testing.assert_allclose(both[:, 0], commands, atol=1e-12)
+
+
+CURVE = {"slope_2": 0.5, "slope_3": 2.0, "slope_5": 0.0}
+
+
+def test_a_characteristic_curve_has_its_slope_in_each_octave_of_the_typical_command():
+    response = InputResponse(STEP, curve=(100.0, CURVE))
+    ends = np.array([0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0])
+    inner = (0.6 * ends[1:-1] + 0.4 * ends[2:])[:, None]
+    slopes = (response.scaled(inner + 1e-4) - response.scaled(inner - 1e-4))[:, 0] / 2e-4
+    np.testing.assert_allclose(slopes, [0.5, 2.0, 1.0, 0.0, 1.0], atol=0.1)
+    expected = np.cumsum(np.diff(ends) * [1.0, 0.5, 2.0, 1.0, 0.0, 1.0])  # with sharp corners
+    np.testing.assert_allclose(response.scaled(ends[1:, None])[:, 0], expected, rtol=0.15)
+    np.testing.assert_array_equal(response.scaled(-ends), -response.scaled(ends))
+    assert response.scaled(np.zeros(1)) == 0.0
+
+
+def test_a_characteristic_curve_of_slope_one_is_none_and_its_slopes_have_derivatives():
+    commands = torch.linspace(-900.0, 900.0, 50, dtype=torch.float64)[:, None, None]
+    ones = {f"slope_{k}": 1.0 for k in range(1, 9)}
+    torch.testing.assert_close(InputResponse(STEP, curve=(100.0, ones)).from_rest(commands)[0], commands)
+    slopes = torch.rand(8, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+
+    def acting(values):
+        curve = {f"slope_{k + 1}": value for k, value in enumerate(values)}
+        return InputResponse(STEP, rise=0.02, curve=(100.0, curve)).from_rest(commands)[0]
+
+    assert torch.autograd.gradcheck(acting, (slopes,), atol=1e-6)
+    steps = torch.diff(InputResponse(STEP, curve=(100.0, CURVE)).scaled(commands[:, 0, 0]))
+    assert bool((steps >= -1e-9).all())

@@ -352,7 +352,10 @@ def test_what_the_pipeline_has_for_others_goes_with_pressures(overrides):
     check(composed("experiment=sopra", *overrides))
 
 
-@pytest.mark.parametrize(("word", "said"), [("rise", "cannot precede their command"), ("slew", "rates are positive")])
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [("rise", "cannot precede their command"), ("slew", "rates are positive"), ("slope_3", "does not fall")],
+)
 def test_a_response_before_its_command_or_backwards_is_refused(word, said):
     wanted = f"+identify.parameters.pressure_{word}={{lower: -0.1, upper: 0.1}}"
     with pytest.raises(InputError, match=rf"identify\.parameters\.pressure_{word}\.lower is -0\.1: .*{said}"):

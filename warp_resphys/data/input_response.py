@@ -1,4 +1,4 @@
-"""Response of an input to its commands: a factor, a delay, a first-order lag, a slew rate, and exponential means.
+"""Response of an input to its commands: factor, characteristic curve, delay, lag, slew rate, and exponential means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -6,16 +6,23 @@ and torch tensors are accepted; tensors are differentiable.
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 
+from ..stepping.quantity import Quantity
+
 Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
 Number = torch.Tensor | float | None
+Curve = tuple[float, Mapping[str, Any]]  # typical command, and slopes by name
 
-RESPONSES = ("factor", "delay", "rise", "slew")  # of an input to its commands, in the order in which they act
+SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
+RESPONSES = ("factor", "delay", "rise", "slew", *SLOPES)  # of an input to its commands
+_FIRST_KNOT = 0.25  # of the typical command, where the second slope begins; the next knots are each twice as large
+_ROUNDED = 0.1  # of a knot: width over which the slope changes
 _LEAST_SLEW = 1e-12  # s/unit
 _FASTEST = 1e-2  # of a step: shortest time constant; shorter ones count as this one
 
@@ -34,6 +41,8 @@ class InputResponse:
         rise: time constant of the lag [s]; None for no lag.
         slew: reciprocal of the slew rate [s/unit], the largest change of the input in a second, as of a valve whose
             flow is choked; a number, or (1 or B,). None or zero for no limit.
+        curve: typical command, and slopes of the characteristic curve by the names in `SLOPES`, numbers or (1 or B,);
+            those left out are one. `_curved` describes it. None for a straight line.
         filters: F time constants of the exponential means [s].
     """
 
@@ -44,9 +53,10 @@ class InputResponse:
         delay: Number = None,
         rise: Number = None,
         slew: Number = None,
+        curve: Curve | None = None,
         filters: Sequence[float] = (),
     ) -> None:
-        self.filters, self._factor = tuple(filters), factor
+        self.filters, self._factor, self._curve = tuple(filters), factor, curve
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         follows = rise is not None or slew is not None
@@ -89,8 +99,9 @@ class InputResponse:
         return self(self.steady(0.0 * commands[0]), commands)[:2]
 
     def scaled(self, commands: Array) -> Array:
-        """Returns commands (..., C) times the factor: the input under constant commands."""
-        return commands if self._factor is None else commands * _column(self._factor)
+        """Returns the input under constant commands (..., C): times the factor, and along the characteristic curve."""
+        scaled = commands if self._factor is None else commands * _column(self._factor)
+        return scaled if self._curve is None else _curved(scaled, *self._curve)
 
     def _delayed(self, queue: Array, count: int) -> Array:
         """Delayed commands (T, ..., C), from a queue (L + T, ..., C)."""
@@ -105,15 +116,43 @@ class InputResponse:
         return (1.0 - share) * queue[now, rows] + share * queue[now - 1, rows]
 
 
-def response_of(name: str, parameters: Mapping[str, torch.Tensor]) -> tuple[Number, Number, Number, Number]:
-    """Returns the identified factor, delay, rise and slew of an input; None for those that were not identified."""
-    factor, delay, rise, slew = (parameters.get(f"{name}_{word}") for word in RESPONSES)
-    return factor, delay, rise, slew
+def response_of(
+    quantity: Quantity, parameters: Mapping[str, torch.Tensor]
+) -> tuple[Number, Number, Number, Number, Curve | None]:
+    """Returns the identified factor, delay, rise, slew and curve of an input; None for those not identified."""
+    own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
+    slopes = {word: own[word] for word in SLOPES if own[word] is not None}
+    curve = (quantity.typical, slopes) if slopes else None
+    return own["factor"], own["delay"], own["rise"], own["slew"], curve
 
 
 def with_means(acting: Array, means: Array) -> Array:
     """Concatenates inputs (..., C) and their means (F, ..., C) to (..., C (1 + F)), as the context of a network."""
     return _library(acting).concatenate([acting, *means], -1)
+
+
+def _curved(commands: Array, typical: float, slopes: Mapping[str, Any]) -> Array:
+    """Returns commands (..., C) along a characteristic curve of an actuator.
+
+    The curve is odd and monotone, with slopes that are constant in octaves of the typical command: it is the derivative
+    of a convex network of one layer and one input, whose units are rounded ramps that begin at the knots. Where all
+    slopes are one, it is the command.
+
+    Args:
+        commands: to convert.
+        typical: typical command.
+        slopes: by the names in `SLOPES`.
+    """
+    like, sizes = _library(commands), abs(commands)
+    result = commands * _column(slopes.get(SLOPES[0], 1.0))
+    for number, (before, word) in enumerate(pairwise(SLOPES)):
+        if before in slopes or word in slopes:
+            knot = typical * _FIRST_KNOT * 2.0**number
+            width = _ROUNDED * knot
+            ramp = width * (like.logaddexp(0.0 * sizes, (sizes - knot) / width) - math.log1p(math.exp(-knot / width)))
+            bend = _column(slopes.get(word, 1.0)) - _column(slopes.get(before, 1.0))
+            result = result + like.sign(commands) * ramp * bend
+    return result
 
 
 def _lagged(behind: Array, series: Array, kept: Array, reach: Array = None) -> Array:

@@ -14,6 +14,7 @@ from typing import cast
 import numpy as np
 import torch
 
+from ..data.input_response import SLOPES
 from ..data.markers import MarkerMap
 from ..data.registration import axes_rotation
 from ..dynamics.simulator import Simulator
@@ -383,6 +384,11 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: slew rates are positive, so it must be zero "
                 "or more, in s by the unit of the input."
+            )
+        if word in SLOPES and limits.lower < 0.0:
+            raise InputError(
+                f"identify.parameters.{name}.lower is {limits.lower:g}: a characteristic curve does not fall, so it "
+                "must be zero or more."
             )
         if word in ("delay", "rise") and limits.lower < 0.0:
             raise InputError(

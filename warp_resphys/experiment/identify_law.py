@@ -2,9 +2,9 @@
 
 Where the trials give the states of all vertices, the weak form fits every class of laws (`learning.law`), and the
 smallest one that is close to the best on the validation trials is refined through the simulator, and larger ones that
-balance the forces clearly better, too. With markers alone, groups of terms are added one after the other, each time
-refined through the simulator, and stay in if the validation trials are closer. The other identified parameters are
-refined with the law.
+balance the forces clearly better, too. With markers alone, the search begins with all groups of terms and takes one
+after the other away, each time refined through the simulator, if the validation trials are as close without it. The
+other identified parameters are refined with the law.
 
 A law of another run stays as it is; the parameters of actuators and of the medium are identified with it.
 """
@@ -37,6 +37,8 @@ from .trials import evenly
 
 _EVALUATIONS: Final = 10
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
+_RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
+_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
 
@@ -189,27 +191,41 @@ class _LawSearch:
         return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
     def _from_markers(self, library: Library) -> list["_Refined"]:
-        """Returns the classes that were tried through the simulator, the best last; groups that help stay in."""
+        """Returns the classes that were tried through the simulator, the best last.
+
+        The search begins with all groups of terms, and takes away those without which validation trials are as close:
+        a class that lacks a group makes up for it with others, from where the group no longer helps.
+        """
+        guess = dict(self.trials.guess)
+        own = {name: value for name, value in guess.items() if name.startswith("prony")}
+        known = [value for name, value in own.items() if name.startswith("prony_time")]
+        shortest, longest = self.settings.law.relaxation_times
+        middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: len(library.times)]
+        times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
         groups = {
             "elastic": dict.fromkeys(library.terms, 0.0),
-            "branches": self._more_branches(library.times),
-            "fibres": _family(0.1 * self.trials.shear) if library.families else {},
+            "branches": branches_of([0.1 * self.trials.shear] * len(times), times, len(known) + 1),
+            "fibres": _family(0.3 * self.trials.shear, self._longest_side()) if library.families else {},
         }
-        best = self._refine(LawClass((), self.trials.guess, math.nan))
+        groups = {name: added for name, added in groups.items() if added}
+        guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.trials.shear)
+        whole = {name: value for added in groups.values() for name, value in added.items()}
+        best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
         tried = [best]
-        for name, added in groups.items():
-            if added:
-                law = LawClass((*best.law.groups, name), {**best.law.constants, **added}, math.nan)
-                tried.append(self._refine(law))
-                if tried[-1].score.beats(best.score):
-                    best = tried[-1]
-        return [own for own in tried if own is not best] + [best]
+        for name in groups:
+            left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, library.terms))}
+            if name == "branches":
+                left |= own
+            smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+            tried.append(self._refine(smaller))
+            if not best.score.beats(tried[-1].score):
+                best = tried[-1]
+        return [one for one in tried if one is not best] + [best]
 
-    def _more_branches(self, times: Sequence[float]) -> dict[str, float]:
-        """Returns branches with the shortest and the longest time, where the guess has none that is close."""
-        known = [value for name, value in self.trials.guess.items() if name.startswith("prony_time")]
-        ends = [t for t in times[:: max(len(times) - 1, 1)] if all(not t / 4.0 < own < 4.0 * t for own in known)]
-        return branches_of([0.1 * self.trials.shear] * len(ends), ends, len(known) + 1)
+    def _longest_side(self) -> tuple[float, float]:
+        """Azimuth and elevation of the longest side of the box around the body [rad]."""
+        side = int(np.ptp(self.experiment.body.mesh.vertices, axis=0).argmax())
+        return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi))[side]
 
     def _refine(self, law: LawClass, whole: bool = False) -> "_Refined":
         """Returns a law that is refined through the simulator, with the other identified parameters.
@@ -285,6 +301,8 @@ def _deviation(found: Identification | None) -> dict[str, float]:
     return {} if found is None or found.uncertainty is None else found.uncertainty.deviation
 
 
-def _family(tension: float) -> dict[str, float]:
-    zero = ("azimuth", "elevation", "slack", "stiffening", "compression")
-    return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **{f"fibre_{name}_1": 0.0 for name in zero}}
+def _family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:
+    """Constants of fibres with a tension [Pa], along an azimuth and an elevation [rad]."""
+    zero = {f"fibre_{name}_1": 0.0 for name in ("slack", "stiffening", "compression")}
+    angles = dict(zip(("fibre_azimuth_1", "fibre_elevation_1"), direction, strict=True))
+    return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **angles, **zero}

@@ -35,6 +35,8 @@ _UNITS: Final = {
     "toe": "",
 }
 _OF_MASS: Final = ("density", "mass_damping")
+_STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
+_TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 
@@ -201,13 +203,13 @@ class LawTrials:
         """
         if name == "bulk_1":
             mean = max(value, self.shear)
-            return Bounds(0.1 * mean, 10.0 * mean, True, Prior(mean, mean))
+            return Bounds(0.1 * mean, max(10.0 * mean, _STIFFEST * self.shear), True, Prior(mean, 3.0 * mean))
         if name == "c10":
             return Bounds(0.0, max(4.0 * value, self.shear), prior=self._prior_of_modulus() or Prior(value, self.shear))
         if name.startswith("prony_time"):
             return Bounds(value / 4.0, 4.0 * value, True)
         if name.startswith(("fibre_azimuth", "fibre_elevation")):
-            return Bounds(value - 0.5, value + 0.5)
+            return Bounds(value - _TURN, value + _TURN)
         if name.startswith("fibre_slack"):
             return Bounds(0.0, 0.1)
         if name.startswith("fibre_toe"):

@@ -5,12 +5,11 @@ and its integrator. It is held or inflated, released, and its state at the relea
 simulated trials of a run (`experiment.simulate`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
 from ..fem.stretches import principal_stretches, share_outside
@@ -34,7 +33,7 @@ from .identify import Checkpoint
 from .simulate import held_alone
 from .target import substeps_of, target_settings, vertices_in
 
-FloatArray = NDArray[np.float64]
+Force = Callable[[State], torch.Tensor]
 
 
 def try_shapes(context: StageContext) -> None:
@@ -90,31 +89,66 @@ def check_shape(shape: ShapeSettings) -> None:
             raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
 
+class ShapeTrial:
+    """A shape that is held or inflated, and released, by its target.
+
+    Args:
+        experiment: whose identified material is put on the shape.
+        settings: of the stage.
+        shape: the shape.
+
+    Attributes:
+        body: of the models.
+        observed: (T + 1, N, 3) its vertices in the target's motion, from the release on [m].
+
+    Raises:
+        ConvergenceError: the target fails.
+    """
+
+    def __init__(self, experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> None:
+        self._experiment, self._settings, self._shape = experiment, settings, shape
+        self.body = build_body(BodySettings.of(shape))
+        target = _target(settings, shape)
+        seen = vertices_in(target.body.mesh, self.body.mesh).to(target.rest_positions)
+        with torch.no_grad():
+            start = _held(target, shape)
+            states = _rolled(target, start, settings.steps, substeps_of(settings.time_step, settings.target, "target"))
+            self.observed = torch.stack([seen(state.q)[0] for state in states]).cpu().numpy()
+            self._begin = State(seen(start.q), seen(start.v))
+
+    def simulator(self, model: str) -> tuple[Simulator, dict[str, torch.Tensor]]:
+        """Returns the simulator of a model on the shape, and the identified values of its material's constants."""
+        kind = self._experiment.sources(model)[0]
+        body = {key: getattr(self._shape, key) for key in BodySettings.model_fields}
+        made_of = self._experiment.settings_of(kind).model_copy(update=body)
+        simulator = build_simulator(made_of, self._experiment.material_of(kind), on_failure="count")
+        known = simulator.materials[""].quantities
+        return simulator, {name: x for name, x in self._experiment.parameters(model).items() if name in known}
+
+    def error(self, model: str, force: Force | None = None) -> float | None:
+        """Returns the mean error over vertices and time [mm], with an added force (1, N, 3); None if it diverges."""
+        simulator, values = self.simulator(model)
+        its_steps = round(self._settings.time_step / simulator.time_step)
+        with torch.no_grad():
+            rolled = _rolled(simulator, self._begin, self._settings.steps, its_steps, values, force)
+        points = torch.stack([state.q[0] for state in rolled]).cpu().numpy()
+        mean: float | None = summarise([marker_errors(points, self.observed)])["mean"]
+        return mean
+
+
 def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> dict[str, Any]:
     """Returns the result of a shape."""
-    target = _target(settings, shape)
-    plain = build_body(BodySettings.of(shape))
-    seen = vertices_in(target.body.mesh, plain.mesh).to(target.rest_positions)
-    with torch.no_grad():
-        start = _held(target, shape)
-        states = _rolled(target, start, settings.steps, substeps_of(settings.time_step, settings.target, "target"))
-        observed = torch.stack([seen(state.q)[0] for state in states]).cpu().numpy()
-        begin = State(seen(start.q), seen(start.v))
-        errors = {}
-        for model in (
-            "simulation",
-            *(("sysid",) if settings.identified else ()),
-            *((LAW,) if experiment.has_law else ()),
-        ):
-            simulator, values = _model(experiment, model, shape)
-            its_steps = round(settings.time_step / simulator.time_step)
-            rolled = _rolled(simulator, begin, settings.steps, its_steps, values)
-            points = torch.stack([state.q[0] for state in rolled]).cpu().numpy()
-            errors[model] = summarise([marker_errors(points, observed)])["mean"]
-    moved = 1e3 * np.linalg.norm(observed - plain.mesh.vertices, axis=-1)
-    found = {"vertices": len(plain.mesh.vertices), "moved_mm": float(moved.max()), "errors_mm": errors}
+    trial = ShapeTrial(experiment, settings, shape)
+    models = ("simulation", *(("sysid",) if settings.identified else ()), *((LAW,) if experiment.has_law else ()))
+    mesh = trial.body.mesh
+    moved = 1e3 * np.linalg.norm(trial.observed - mesh.vertices, axis=-1)
+    found = {
+        "vertices": len(mesh.vertices),
+        "moved_mm": float(moved.max()),
+        "errors_mm": {model: trial.error(model) for model in models},
+    }
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
-        found["outside"] = share_outside(principal_stretches(plain.mesh, observed), *law["stretches"])
+        found["outside"] = share_outside(principal_stretches(mesh, trial.observed), *law["stretches"])
     return found
 
 
@@ -128,16 +162,6 @@ def _target(settings: ShapesStage, shape: ShapeSettings) -> Simulator:
     return build_simulator(made_of, target.material)
 
 
-def _model(experiment: Experiment, model: str, shape: ShapeSettings) -> tuple[Simulator, dict[str, torch.Tensor]]:
-    """Returns the simulator of a model on a shape, and the identified values of its material's constants."""
-    kind = experiment.sources(model)[0]
-    body = {key: getattr(shape, key) for key in BodySettings.model_fields}
-    made_of, material = experiment.settings_of(kind).model_copy(update=body), experiment.material_of(kind)
-    simulator = build_simulator(made_of, material, on_failure="count")
-    known = simulator.materials[""].quantities
-    return simulator, {name: value for name, value in experiment.parameters(model).items() if name in known}
-
-
 def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     """Returns the state before the release."""
     if shape.held is not None:
@@ -148,12 +172,18 @@ def _held(simulator: Simulator, shape: ShapeSettings) -> State:
 
 
 def _rolled(
-    simulator: Simulator, state: State, steps: int, substeps: int, values: Mapping[str, torch.Tensor] | None = None
+    simulator: Simulator,
+    state: State,
+    steps: int,
+    substeps: int,
+    values: Mapping[str, torch.Tensor] | None = None,
+    force: Force | None = None,
 ) -> list[State]:
     """Returns the states from the release on, at the time steps of the run."""
     constants, states = simulator.prepare(values or {}), [state]
     for _ in range(steps):
         for _ in range(substeps):
-            state, _ = simulator.step(state, Inputs(), constants)
+            added = None if force is None else force(state)
+            state, _ = simulator.step(state, Inputs(external_force=added), constants)
         states.append(state)
     return states

@@ -9,7 +9,7 @@ from typing import Final
 
 import torch
 
-from ..data.input_response import RESPONSES
+from ..data.input_response import RESPONSES, SLOPES
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError
@@ -111,12 +111,15 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
 
 def command_of(simulator: Simulator, name: str) -> tuple[str, str]:
     """Input and the word of `RESPONSES` in a name such as ``pressure_delay``; else two empty strings."""
-    driven, _, word = name.rpartition("_")
-    return (driven, word) if driven in simulator.inputs and driven not in HUNG and word in RESPONSES else ("", "")
+    for word in RESPONSES:
+        driven = name.removesuffix(f"_{word}")
+        if driven != name and driven in simulator.inputs and driven not in HUNG:
+            return driven, word
+    return "", ""
 
 
 def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[str, float]:
-    """Configured values of parameters: the simulator's constants, or the value without effect (factor 1, delay 0)."""
+    """Configured values of parameters: the simulator's constants, or the value without effect (factor, slopes: 1)."""
     of_parts = parameters_of_parts(simulator)
 
     def find(name: str) -> float:
@@ -124,6 +127,6 @@ def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[st
         if constant in simulator.parameters:
             value = simulator.tensor(simulator.constants[constant]).flatten()
             return float(value[0 if part is None or len(value) == 1 else part])
-        return 1.0 if name == MASS_FACTOR or command_of(simulator, name)[1] == "factor" else 0.0
+        return 1.0 if name == MASS_FACTOR or command_of(simulator, name)[1] in ("factor", *SLOPES) else 0.0
 
     return {name: find(name) for name in names}

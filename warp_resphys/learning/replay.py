@@ -79,8 +79,8 @@ class Replay:
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
             body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
-            time [s] of its response and its reciprocal slew rate: ``pressure_factor``, ``pressure_delay``,
-            ``pressure_rise`` and ``pressure_slew``.
+            time [s] of its response, its reciprocal slew rate and the slopes of its characteristic curve:
+            ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew`` and ``pressure_slope_1``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:
@@ -122,7 +122,7 @@ class Replay:
         acting = {}
         for name, commands in inputs.actuation.items():
             if name not in HUNG:
-                response = InputResponse(self.simulator.time_step, *response_of(name, spread))
+                response = InputResponse(self.simulator.time_step, *response_of(self.simulator.inputs[name], spread))
                 throughout = commands.ndim == 2
                 acting[name] = response.scaled(commands) if throughout else response.from_rest(commands)[0]
         return acting

@@ -32,7 +32,11 @@ _COMMANDS: Final[Mapping[str, Wording]] = {
     "delay": ("Delay", "ms", 1e3),
     "rise": ("Time constant", "ms", 1e3),
     "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
+    "slope": ("Slope", "", 1.0),
 }
+_COMMAND: Final = re.compile(
+    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|slope)(?:_([1-8]))?"
+)
 _WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
 _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
@@ -128,8 +132,12 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 def parameter_wording(parameter: str) -> Wording:
     """Return name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
-    if command := re.fullmatch(r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise)", parameter):
-        (kind, unit, factor), words = _COMMANDS[command[2]], command[1]
+    if command := re.fullmatch(
+        r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|slope_\d)", parameter
+    ):
+        word, _, octave = command[2].partition("_")
+        (kind, unit, factor), words = _COMMANDS[word], command[1]
+        kind += f" {octave} of the characteristic" if octave else ""
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
         kind, unit, factor = _PARAMETERS[offset[1]]

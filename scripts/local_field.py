@@ -32,6 +32,7 @@ from warp_resphys.settings.run import RunSettings
 WINDOW = 10  # steps through the simulator
 BATCH = 32
 WIDTH = 64
+CELL = 0.01  # m: size of a cell, which scales slopes of the strain
 SIZES = (1.0, 0.1, 10.0)  # of velocity gradients [1/s], velocities [m/s] and accelerations [m/s^2], in features
 SEED = 0
 
@@ -77,31 +78,45 @@ class FieldOn:
 
     def __call__(self, state: wr.State) -> torch.Tensor:
         """Returns nodal forces (B, N, 3) [N] in a state."""
+        return self.forces(*self.features(state))
+
+    def features(self, state: wr.State) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the features (B, C, Q, 27) of the points and the rotations (B, C, Q, 3, 3) of their material."""
         q, v = (x[:, self._cells] for x in (state.q, state.v))
         deformation = torch.einsum("bcki,cqkj->bcqij", q, self._gradients)
         change = torch.einsum("bcki,cqkj->bcqij", v, self._gradients)
         velocity = torch.einsum("bcki,qk->bcqi", v, self._values)
-        with torch.no_grad():  # the frame of the material
-            left, _, right = torch.linalg.svd(deformation)
-            left = torch.cat([left[..., :2], left[..., 2:] * torch.det(left @ right)[..., None, None]], -1)
-            back = (left @ right).mT
+        rotation = nearest_rotation(deformation.detach())
+        back = rotation.mT
         strain = back @ deformation - torch.eye(3, dtype=q.dtype)
         slopes = torch.einsum("bcqij,ckq->bcijk", strain, self._slopes)  # of the strain in the cell [1/m]
-        length = self._masses.mean() ** (1.0 / 3.0) / 10.0  # size of a point, of a silicone [m]
-        uneven = torch.cat([torch.einsum("bcijj->bci", slopes), torch.einsum("bcjji->bci", slopes)], -1)
-        down = back @ torch.tensor([0.0, 0.0, -1.0], dtype=q.dtype)
+        uneven = torch.cat([slopes.diagonal(dim1=-2, dim2=-1).sum(-1), torch.einsum("bcjji->bci", slopes)], -1)
         upper = torch.triu_indices(3, 3)
         features = [
             10.0 * strain[..., upper[0], upper[1]],
             (back @ change).flatten(-2) / SIZES[0],
             (back @ velocity[..., None])[..., 0] / SIZES[1],
-            down,
-            10.0 * length * uneven[:, :, None].expand(*strain.shape[:3], 6),
+            -back[..., 2],  # gravity's direction
+            10.0 * CELL * uneven[:, :, None].expand(*strain.shape[:3], 6),
         ]
-        local = self._field(torch.cat(features, -1))
-        force = self._masses[..., None] * (back.mT @ local[..., None])[..., 0]
+        return torch.cat(features, -1), rotation
+
+    def forces(self, features: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Returns nodal forces (B, N, 3) [N] from `features`."""
+        local = self._field(features)
+        force = self._masses[..., None] * (rotation @ local[..., None])[..., 0]
         nodal = torch.einsum("bcqi,qk->bcki", force, self._values).flatten(1, 2)
-        return torch.zeros_like(state.q).index_add(1, self._cells.flatten(), nodal)
+        return nodal.new_zeros(len(nodal), self._count, 3).index_add(1, self._cells.flatten(), nodal)
+
+
+def nearest_rotation(matrix: torch.Tensor) -> torch.Tensor:
+    """Returns the rotations (..., 3, 3) of the polar decomposition, by Newton's iteration (Higham 1986)."""
+    for _ in range(6):
+        rows = matrix.unbind(-2)
+        crossed = torch.stack([torch.linalg.cross(rows[i - 2], rows[i - 1]) for i in range(3)], -2)
+        volume = (crossed * matrix).sum((-2, -1))[..., None, None] / 3.0
+        matrix = 0.5 * (matrix + crossed / volume)
+    return matrix
 
 
 class Training:
@@ -124,6 +139,11 @@ class Training:
         numbers = {name: float(value) for name, value in parameters.items()}
         self._samples = wr.reconstruct(self._simulator, self._motions, parameters=numbers)
         self._mass = self._constants.mass.double()[0, :, None]
+        parts = [
+            self._on.features(wr.State(*own))
+            for own in zip(self._samples.q.split(100), self._samples.v.split(100), strict=True)
+        ]
+        self._features, self._rotations = (torch.cat(own) for own in zip(*parts, strict=True))
 
     def _motion(self, experiment: Experiment, model: str, names: Sequence[str]) -> wr.ObservedMotion:
         ((replay, start),) = experiment.replays(self._simulator, names, model)
@@ -161,7 +181,7 @@ class Training:
     def _by_force(self, draw: np.random.Generator) -> torch.Tensor:
         """Mean square difference from reconstructed accelerations, by mass."""
         rows = torch.as_tensor(draw.choice(len(self._samples.q), BATCH))
-        force = self._on(wr.State(self._samples.q[rows], self._samples.v[rows]))
+        force = self._on.forces(self._features[rows], self._rotations[rows])
         return ((force - self._samples.outputs[0][rows]).square() / (self._mass * self._mass.mean())).mean()
 
     def _by_motion(self, draw: np.random.Generator) -> torch.Tensor:

@@ -16,6 +16,7 @@ from rich.table import Table
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
+from .energies.law_files import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
@@ -199,7 +200,7 @@ def learning_stages(
         before = IdentifyStage.of(run, **common).model_copy(update={"with_law": False})
         stages.append(Stage("identify", identify, (IDENTIFICATION,), before))
     if run.law is not None:
-        given = {} if run.law.file is None else {run.law.file: digest(run.law.file)}
+        given = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
         of_law = IdentifyLawStage.of(run, **common)
         of_law = of_law.model_copy(update={"files": of_law.files | given})
         add("identify_law", identify_law, (LAW_FILE,), of_law)

@@ -1,11 +1,15 @@
 """Scores of laws on trials, and the constants that a refined law keeps."""
 
 import math
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from warp_resphys.experiment.identify_law import _LawSearch
 from warp_resphys.experiment.law_trials import Score, branches_of, strong_names, unit_of
+from warp_resphys.learning.law import LawClass, Library
 
 SHEAR = 100e3  # Pa
 
@@ -62,3 +66,68 @@ def test_terms_branches_and_families_that_hardly_resist_are_left_out_and_the_oth
 def test_branches_are_numbered_from_a_number():
     assert branches_of([1.0], [0.5], 3) == {"prony_modulus_3": 1.0, "prony_time_3": 0.5}
     assert [unit_of(n) for n in ("c10", "prony_time_3", "bulk_viscosity", "fibre_toe_1")] == ["Pa", "s", "Pa s", ""]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined law of a search whose errors are known."""
+
+    law: LawClass
+    score: Score
+
+
+def search_from_markers(errors, guess=None, lost=()):
+    """Groups of the classes in the order of the search, the best last, and the constants that each began with.
+
+    Args:
+        errors: of the validation trials, by the groups of a class.
+        guess: constants of the identified material.
+        lost: beginnings of the names of constants that a refinement finds to be zero.
+    """
+    began = []
+
+    def refine(law):
+        began.append(dict(law.constants))
+        kept = {name: value for name, value in law.constants.items() if not name.startswith(tuple(lost))}
+        kept["c10"] = 0.0 if "elastic" in law.groups else law.constants["c10"]  # as if other terms took its place
+        return Refined(LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),)))
+
+    search = object.__new__(_LawSearch)
+    search._refine = refine
+    search.settings = SimpleNamespace(law=SimpleNamespace(relaxation_times=(0.01, 1.0)))
+    search.trials = SimpleNamespace(guess={"c10": 50e3, "bulk_1": 60e3, **(guess or {})}, shear=SHEAR)
+    vertices = np.array([[0.0, 0.0, 0.0], [0.01, 0.2, 0.01]])
+    search.experiment = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
+    library = Library(terms=("c01", "ogden_3"), viscous=True, times=(0.01, 0.1, 1.0), families=1)
+    return [own.law.groups for own in search._from_markers(library)], began
+
+
+WHOLE = ("elastic", "branches", "fibres")
+
+
+class TestSearchFromMarkers:
+    def test_it_begins_with_all_groups_and_takes_away_what_does_not_help(self):
+        without = ("branches", "fibres")
+        errors = {WHOLE: 1.0, without: 1.0, ("fibres",): 2.0, ("branches",): 3.0}
+        classes, began = search_from_markers(errors)
+        assert classes == [WHOLE, ("fibres",), ("branches",), without]
+        assert began[0]["bulk_1"] >= 20.0 * SHEAR
+        assert began[0]["fibre_azimuth_1"] == pytest.approx(np.pi / 2.0)  # along the longest side
+        assert all(0.01 < began[0][f"prony_time_{k}"] < 1.0 for k in (1, 2))
+        assert not any(name.startswith(("c01", "ogden")) for name in began[-1])
+        assert began[1]["c10"] == 50e3  # in place of the elastic terms, which had taken its place
+
+    def test_a_group_of_which_nothing_is_left_is_not_tried_without(self):
+        errors = {WHOLE: 1.0, ("branches", "fibres"): 2.0, ("elastic", "fibres"): 2.0}
+        classes, began = search_from_markers(errors, lost=["fibre"])
+        assert len(began) == 3
+        assert classes[-1] == ("elastic", "branches")
+
+    def test_creep_that_was_identified_stays_where_no_branches_do(self):
+        creep = branches_of([2e4], [0.5])
+        errors = {WHOLE: 1.0, ("branches", "fibres"): 1.0, ("fibres",): 1.0, (): 1.0}
+        classes, began = search_from_markers(errors, creep)
+        assert began[0]["prony_time_2"] == pytest.approx(0.01**0.75)  # the longer time is close to the known one
+        assert "prony_time_3" not in began[0]
+        assert classes[-1] == ()
+        assert {name: value for name, value in began[-1].items() if name.startswith("prony")} == creep

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import combinations, product
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -19,6 +18,7 @@ from ..data.markers import MarkerMap
 from ..data.registration import axes_rotation
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
+from ..energies.law_files import read_law
 from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
@@ -36,7 +36,7 @@ from ..settings.trials import MarkerSettings, RecordedData, ReleaseFromLoad, Tri
 from .actuators import Drive, drive_of
 from .build import build_body, build_material, build_simulator, finer, marker_view_of
 from .experiment import LAW
-from .files import STATIC, payload_inputs, read_law
+from .files import STATIC, payload_inputs
 from .identify import ELASTIC
 from .laboratory import input_sequences
 from .reading import standing_enough
@@ -95,7 +95,7 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
             "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
         )
     if law.file is not None:
-        given = read_law(Path(law.file).expanduser())
+        given = read_law(law.file)
         material = MaterialSettings.model_validate({"model": given["model"], **given["constants"]})
         build_material(material, f"law: {law.file}")
 

@@ -14,7 +14,7 @@ from ..data.trials import Trials
 from ..dynamics.frames import rotations
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
-from ..io.errors import DataFileError, InputError
+from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
 from ..settings.mesh import PlaceSettings
@@ -30,7 +30,6 @@ QUALITY: Final = "quality.json"
 REGISTRATION: Final = "registration.json"
 IDENTIFICATION: Final = "identification.json"
 LAW_FILE: Final = "law.json"
-LAW_FORMAT: Final = 1
 SHAPES: Final = "shapes.json"
 RECONSTRUCTION: Final = "reconstruction.json"
 ROLLOUTS: Final = "rollouts.h5"
@@ -79,21 +78,6 @@ def fold_folder(trial: str) -> str:
 def read_if_there(path: Path) -> dict[str, Any]:
     """Contents of a JSON file, or an empty dictionary if the file does not exist."""
     content: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return content
-
-
-def read_law(path: Path) -> dict[str, Any]:
-    """Contents of a law that `identify_law` wrote, with at least its ``model`` and its ``constants``.
-
-    Raises:
-        DataFileError: the file is missing, damaged or of another version.
-    """
-    content: dict[str, Any] = read_json(path)
-    whole = isinstance(content.get("constants"), dict) and isinstance(content.get("model"), str)
-    if content.get("format") != LAW_FORMAT or not whole:
-        raise DataFileError(
-            f"{path} is not a law of this version: give a {LAW_FILE} that a run with the group law has written."
-        )
     return content
 
 

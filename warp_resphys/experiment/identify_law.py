@@ -12,12 +12,12 @@ A law of another run stays as it is; the parameters of actuators and of the medi
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from ..dynamics.simulator import Simulator
+from ..energies.law_files import LAW_FORMAT, read_law
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
@@ -29,7 +29,7 @@ from ..learning.replay import Replay
 from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.stages import IdentifyLawStage
 from .experiment import LAW, Experiment
-from .files import LAW_FILE, LAW_FORMAT, read_law
+from .files import LAW_FILE
 from .identify import Checkpoint, again_of, changes
 from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names, unit_of
 from .neural_law import train_law
@@ -132,7 +132,7 @@ class _LawSearch:
 
     def given(self, file: str) -> dict[str, Any]:
         """Identifies the parameters beside a law of another run; returns the content of law.json."""
-        content = read_law(Path(file).expanduser())
+        content = read_law(file)
         simulator = self.trials.simulator(content["constants"], content["model"])
         others, found = dict[str, float](), None
         if bounds := self.trials.bounds_of_others(simulator):
@@ -216,11 +216,16 @@ class _LawSearch:
             left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, library.terms))}
             if name == "branches":
                 left |= own
+            if name == "elastic":  # They may have been all that resists shear.
+                left["c10"] = max(left["c10"], guess["c10"])
             smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+            if left == best.law.constants:  # The search has left nothing of the group.
+                best = replace(best, law=smaller)
+                continue
             tried.append(self._refine(smaller))
             if not best.score.beats(tried[-1].score):
                 best = tried[-1]
-        return [one for one in tried if one is not best] + [best]
+        return [one for one in tried if one.law.constants != best.law.constants] + [best]
 
     def _longest_side(self) -> tuple[float, float]:
         """Azimuth and elevation of the longest side of the box around the body [rad]."""

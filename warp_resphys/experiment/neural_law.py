@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..energies.law_files import LAW_FORMAT
 from ..energies.neural import NeuralMaterial, weight_constants
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
@@ -15,7 +16,6 @@ from ..learning.neural_law import train_weights
 from ..learning.replay import Replay
 from ..settings.stages import IdentifyLawStage
 from .experiment import Experiment
-from .files import LAW_FORMAT
 from .identify import Checkpoint
 from .law_trials import LawTrials, Score, stretches_of
 from .trials import evenly

@@ -126,7 +126,7 @@ class LawSettings(Settings):
     A path in place of the group, law=FILE, takes the law that another run has written in law.json.
     """
 
-    file: Word | None = setting(None, "law of another run, in place of an identification")
+    file: Word | None = setting(None, "law of another run, or a silicone's name, in place of an identification")
     kind: Literal["terms", "network"] = setting(
         "terms", "a sum of terms, or a convex network of invariants, trained through the simulator"
     )

@@ -1,0 +1,54 @@
+"""Laws by the names of silicones, and from the files of runs."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import warp_resphys as wr
+from warp_resphys.energies.law_files import LAW_FORMAT, law_path, read_law
+
+SHIPPED = sorted(path.stem for path in (Path(wr.__file__).parent / "laws").glob("*.json"))
+
+
+def written(folder, **changes):
+    """A law.json as a run writes it."""
+    constants = {"density": 1100.0, "mass_damping": 3.0, "c10": 40e3, "bulk_1": 5e6, "prony_modulus_1": 8e3}
+    content = {"format": LAW_FORMAT, "model": "law", "constants": constants | {"prony_time_1": 0.1}}
+    path = folder / "law.json"
+    path.write_text(json.dumps(content | changes))
+    return str(path)
+
+
+def test_the_material_of_a_run_has_its_constants_without_the_damping_of_the_robot(tmp_path):
+    material = wr.read_material(written(tmp_path))
+    assert isinstance(material, wr.ConvexMaterial)
+    assert material.constants["c10"] == 40e3
+    assert material.constants["density"] == 1100.0
+    assert material.constants["prony_time_1"] == 0.1
+    assert material.constants["mass_damping"] == 0.0
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_silicone_of_the_package_is_stiff_as_silicones_are_and_says_where_it_comes_from(name):
+    law, material = read_law(name), wr.read_material(name)
+    constants = {key: torch.tensor([[float(x)]], dtype=torch.float64) for key, x in material.constants.items()}
+    shear = float(material.law.LAME[0] @ [float(x) for x in material.moduli(constants)])
+    assert 10e3 < shear < 300e3
+    assert {"deviation", "stretches", "data", "versions", "units"} <= law.keys()
+    assert law["accepted"]
+
+
+def test_there_are_silicones_and_an_unknown_one_is_refused_with_their_names():
+    assert "dragon_skin_10" in SHIPPED
+    with pytest.raises(
+        wr.DataFileError, match=r"no law dragon_skin_99: give the law\.json of a run, or .*dragon_skin_10"
+    ):
+        law_path("dragon_skin_99")
+
+
+@pytest.mark.parametrize("changes", [{"format": 0}, {"constants": None}, {"model": 3}])
+def test_a_file_of_another_version_is_refused(tmp_path, changes):
+    with pytest.raises(wr.DataFileError, match="not a law of this version"):
+        wr.read_material(written(tmp_path, **changes))

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 
 import warp_resphys as wr
 from warp_resphys.energies.law_files import LAW_FORMAT, law_path, read_law
@@ -33,8 +32,8 @@ def test_the_material_of_a_run_has_its_constants_without_the_damping_of_the_robo
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_silicone_of_the_package_is_stiff_as_silicones_are_and_says_where_it_comes_from(name):
     law, material = read_law(name), wr.read_material(name)
-    constants = {key: torch.tensor([[float(x)]], dtype=torch.float64) for key, x in material.constants.items()}
-    shear = float(material.law.LAME[0] @ [float(x) for x in material.moduli(constants)])
+    ogden = [value for key, value in material.constants.items() if key.startswith("ogden_")]
+    shear = 2.0 * (material.constants["c10"] + material.constants["c01"]) + sum(ogden)
     assert 10e3 < shear < 300e3
     assert {"deviation", "stretches", "data", "versions", "units"} <= law.keys()
     assert law["accepted"]
@@ -43,7 +42,7 @@ def test_a_silicone_of_the_package_is_stiff_as_silicones_are_and_says_where_it_c
 def test_there_are_silicones_and_an_unknown_one_is_refused_with_their_names():
     assert "dragon_skin_10" in SHIPPED
     with pytest.raises(
-        wr.DataFileError, match=r"no law dragon_skin_99: give the law\.json of a run, or .*dragon_skin_10"
+        wr.DataFileError, match=r"no law dragon_skin_99: give the law\.json of a run, or one of .*dragon_skin_10"
     ):
         law_path("dragon_skin_99")
 

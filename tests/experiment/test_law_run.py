@@ -190,6 +190,14 @@ def test_what_cannot_work_is_refused_in_a_sentence(overrides, message):
         check(composed("experiment=law_beam", *overrides))
 
 
+def test_a_silicone_is_named_in_place_of_a_file():
+    check(composed("experiment=law_beam", "law=dragon_skin_10"))
+    with pytest.raises(
+        DataFileError, match=r"no law dragon_skin_11: give the law\.json of a run, or one of 'dragon_skin_10'"
+    ):
+        check(composed("experiment=law_beam", "law=dragon_skin_11"))
+
+
 def test_a_trial_of_another_name_is_not_replaced():
     config = composed("experiment=law_beam")
     config["data"]["others"]["120 g"] = {"weight_g": 50.0}

@@ -142,14 +142,14 @@ def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSetting
     models = ("simulation", *(("sysid",) if settings.identified else ()), *((LAW,) if experiment.has_law else ()))
     mesh = trial.body.mesh
     moved = 1e3 * np.linalg.norm(trial.observed - mesh.vertices, axis=-1)
-    found = {
+    result: dict[str, Any] = {
         "vertices": len(mesh.vertices),
         "moved_mm": float(moved.max()),
         "errors_mm": {model: trial.error(model) for model in models},
     }
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
-        found["outside"] = share_outside(principal_stretches(mesh, trial.observed), *law["stretches"])
-    return found
+        result["outside"] = share_outside(principal_stretches(mesh, trial.observed), *law["stretches"])
+    return result
 
 
 def _target(settings: ShapesStage, shape: ShapeSettings) -> Simulator:

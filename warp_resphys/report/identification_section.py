@@ -132,11 +132,9 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 def parameter_wording(parameter: str) -> Wording:
     """Return name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
-    if command := re.fullmatch(
-        r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|slope_\d)", parameter
-    ):
-        word, _, octave = command[2].partition("_")
-        (kind, unit, factor), words = _COMMANDS[word], command[1]
+    if command := _COMMAND.fullmatch(parameter):
+        words, word, octave = command.groups()
+        kind, unit, factor = _COMMANDS[word]
         kind += f" {octave} of the characteristic" if octave else ""
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):

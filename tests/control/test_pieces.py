@@ -1,6 +1,7 @@
 """Paths, polynomials, the response of inputs, quadratic programs, and what control has without a simulator."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,6 +117,14 @@ class TestEvaluator:
         for guard in (None, range_):
             wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))[0]
             np.testing.assert_allclose(Evaluator(network, guard)(inputs.numpy()), wanted.detach().numpy(), atol=1e-12)
+        fading = replace(range_, missed=torch.ones(2, dtype=torch.float64))
+        weight = fading.weight(inputs)
+        assert (weight < 1.0).sum() > 0
+        assert weight.max() > 0.0
+        force = weight[:, None, None] * network.decode(range_.clamp(inputs))[0][0]
+        outputs = Evaluator(network, fading)(inputs.numpy())
+        np.testing.assert_allclose(outputs, network.encode_outputs(force).detach().numpy(), atol=1e-12)
+        np.testing.assert_allclose(outputs, fading.outputs(network, inputs).detach().numpy(), atol=1e-12)
 
 
 def driven_line(steps, random, matrices):

@@ -33,11 +33,12 @@ def model(request):
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
     network = build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
     network = network.double().requires_grad_(False)
+    missed = torch.ones(1, 2, dtype=torch.float64) if request.param == "bdf2" else None  # It then fades out.
     seen = np.zeros((6, 2 * MODES))
     seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
     force = ReducedForce(
         network,
-        Range.of(torch.randn(30, 6 + conditions.shape[1], dtype=torch.float64)),
+        Range.of(torch.randn(30, 6 + conditions.shape[1], dtype=torch.float64), missed),
         polynomial(3, np.zeros(6), 0.1),
         polynomial(2, seen, 0.1),
         0.1 * random.standard_normal(conditions.shape[1]),

@@ -28,7 +28,7 @@ class Evaluator:
 
     Args:
         network: whose weights are final.
-        range_: to which its inputs are clipped; None for no clipping.
+        range_: to which its inputs are clipped, and beyond which its force may fade out; None for no clipping.
     """
 
     def __init__(self, network: StateMap, range_: Range | None) -> None:
@@ -36,17 +36,25 @@ class Evaluator:
         self._blocks = [[_layer(layer) for layer in cast(nn.Sequential, block)] for block in network.network.blocks]
         self._linear, self._remainder = network.linear.numpy(force=True), network.remainder.numpy(force=True)
         self._edges = None if range_ is None else [edge.numpy(force=True) for edge in range_.edges]
+        self._fades = range_ if range_ is not None and range_.missed is not None else None
+        if self._fades is not None:
+            self._nothing = network.encode_outputs(torch.zeros_like(network.rest)[None]).numpy(force=True)
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Standardised outputs (S, c) for standardised inputs (S, i)."""
         held: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
+        leaves = self._fades is not None and (held != inputs).any()
         hidden = held = held.astype(self._linear.dtype)
         for number, layers in enumerate(self._blocks):
             after = hidden
             for layer in layers:
                 after = layer(after)
             hidden = hidden + after if number else after
-        return np.asarray(held @ self._linear + self._remainder * hidden, dtype=np.float64)
+        outputs = held @ self._linear + self._remainder * hidden
+        if self._fades is not None and leaves:
+            weight = self._fades.weight(torch.as_tensor(inputs).to(self._fades.low)).numpy(force=True)
+            outputs = self._nothing + weight[:, None] * (outputs - self._nothing)
+        return np.asarray(outputs, dtype=np.float64)
 
 
 def _layer(module: nn.Module) -> Layer:
@@ -83,7 +91,7 @@ class ReducedForce:
     r"""G(u) (c - c_0(u)), with c the network's outputs for coordinates z, their rates, and inputs u.
 
     The network's inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and clipped to the training
-    range, with m the filtered inputs.
+    range, with m the filtered inputs. Beyond the range a force on an identified law fades out.
 
     Attributes:
         network: predicts a force in reduced modes.
@@ -115,7 +123,8 @@ class ReducedForce:
         """Derivatives (S, r, i) of ``left @ outputs`` with respect to the inputs (S, i), with left (S, r, c)."""
         with torch.enable_grad():
             unheld = torch.as_tensor(inputs).to(self.network.linear).requires_grad_()
-            outputs = self.network.standardised(unheld if self.range_ is None else self.range_.clamp(unheld))[0]
+            range_ = self.range_
+            outputs = self.network.standardised(unheld)[0] if range_ is None else range_.outputs(self.network, unheld)
             weights = torch.as_tensor(left).to(outputs).swapaxes(0, 1)  # (r, S, c)
             (slopes,) = torch.autograd.grad(outputs, unheld, weights, is_grads_batched=True)
         return np.asarray(slopes.swapaxes(0, 1).double().cpu().numpy())

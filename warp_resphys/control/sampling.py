@@ -239,8 +239,9 @@ class Source:
         like = network.rest
         conditions = None if conditions is None or network.actuation is None else conditions.to(like)
         inputs = network.encode(state.q.to(like), state.v.to(like), conditions)
-        held = inputs if self.learned.range_ is None else self.learned.range_.clamp(inputs)
-        return np.asarray(network.standardised(held)[0].double().cpu().numpy())
+        range_ = self.learned.range_
+        outputs = network.standardised(inputs)[0] if range_ is None else range_.outputs(network, inputs)
+        return np.asarray(outputs.double().cpu().numpy())
 
     def equilibria(self, shares: FloatArray) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:
         """Computes equilibria under inputs (B, n); inputs without an equilibrium are left out.

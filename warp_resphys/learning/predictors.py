@@ -41,14 +41,27 @@ class Range:
         """Returns the range of (S, A) standardised inputs and, for a force that fades out, (S, 2) `StateMap.missed`."""
         return cls(inputs.amin(0), inputs.amax(0), None if missed is None else missed.amax(0))
 
-    def weight(self, inputs: torch.Tensor, missed: torch.Tensor) -> torch.Tensor:
-        """Returns the factor (B,) of a force that fades out, from unclamped inputs (B, A) and `StateMap.missed`."""
+    def weight(self, inputs: torch.Tensor, missed: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns the factor (B,) of a force that fades out, from unclamped inputs (B, A) and `StateMap.missed`.
+
+        Without ``missed``, it is that of a state which is made of the network's modes.
+        """
         assert self.missed is not None
         low, high = self.edges
-        beyond = torch.maximum(low - inputs, inputs - high) / (_MARGIN * (self.high - self.low)).clamp_min(_LEAST)
-        ratio = missed / self.missed.clamp_min(1e-12)
-        left = torch.cat([beyond, (ratio - _FADES[0]) / (_FADES[1] - _FADES[0])], 1).amax(1).clamp(0.0, 1.0)
+        left = torch.maximum(low - inputs, inputs - high) / (_MARGIN * (self.high - self.low)).clamp_min(_LEAST)
+        if missed is not None:
+            ratio = missed / self.missed.clamp_min(1e-12)
+            left = torch.cat([left, (ratio - _FADES[0]) / (_FADES[1] - _FADES[0])], 1)
+        left = left.amax(1).clamp(0.0, 1.0)
         return 1.0 - left.square() * (3.0 - 2.0 * left)
+
+    def outputs(self, network: StateMap, inputs: torch.Tensor) -> torch.Tensor:
+        """Returns a network's standardised outputs (B, C) for unclamped inputs (B, A), faded out as by `weight`."""
+        outputs = network.standardised(self.clamp(inputs))[0]
+        if self.missed is None:
+            return outputs
+        nothing = network.encode_outputs(torch.zeros_like(network.rest)[None])
+        return torch.lerp(nothing.to(outputs), outputs, self.weight(inputs)[:, None])
 
     def clamp(self, inputs: torch.Tensor) -> torch.Tensor:
         """Returns standardised inputs (B, A), clamped to the widened box."""

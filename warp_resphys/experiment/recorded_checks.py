@@ -1,0 +1,171 @@
+"""Checks of experiments that observe their bodies through markers, before the first stage."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from ..data.registration import axes_rotation
+from ..fem.body import Body
+from ..io.errors import InputError, listed
+from ..mesh.mesh import select_vertices
+from ..settings.run import RunSettings
+from ..settings.stages import PlayedSettings
+from ..settings.trials import MarkerSettings, RecordedData, Trial
+from .actuators import Drive, drive_of
+from .body_checks import check_target, naming
+from .build import build_material, marker_view_of
+from .files import STATIC, payload_inputs
+from .laboratory import input_sequences
+from .reading import standing_enough
+from .target import substeps_of
+from .trials import all_trials, folds_of, split_of, trials_of
+
+
+def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body) -> None:
+    """Checks an experiment that observes its bodies through markers."""
+    if run.is_laboratory and run.laboratory is not None and not run.laboratory.trials and not data.sequences:
+        raise InputError("laboratory.trials is empty: name the trials, or set data.sequences.")
+    _check_files(data)
+    if folds_of(run) is None:
+        split_of(run)
+    trials = trials_of(run)
+    begins = {trial.begins for trial in trials}
+    _check_markers(run, data, markers, body, begins)
+    _check_view(run, markers, trials)
+    payload_inputs(body, data.payload_at, np.array([trial.payload for trial in trials]))
+    if begins & {"held", "released"} and data.seconds is None:
+        raise InputError("data.seconds is not set: give the time after the release of each trial that is used, in s.")
+    if "rest" in begins and data.steps is None:
+        raise InputError("data.steps is not set: give the number of time steps that are read from each recording.")
+    drive = drive_of(run, body)
+    if drive is not None:
+        _check_inputs(data, drive)
+    if "rest" in begins and data.steps is not None and data.horizons:
+        length = data.steps * run.time_step
+        if data.horizons[-1] > length + 1e-9:
+            raise InputError(
+                f"data.horizons is {list(data.horizons)}: they must rise, up to the {length:g} s of data.steps."
+            )
+    if run.published is not None:
+        build_material(run.published.simulation, "published.simulation")
+    if run.is_laboratory:
+        _check_laboratory(run, data, trials, body, drive)
+    for trial in trials:
+        if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
+            raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
+    if begins & {"held", "released"}:
+        _check_release(run, data)
+
+
+def _check_files(data: RecordedData) -> None:
+    """Refuses a file that is used by two trials."""
+    files: dict[str, str] = {}
+    for name, trial in data.trials.items():
+        if trial.file is not None and (other := files.setdefault(trial.file, name)) != name:
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial.file}: use it once.")
+
+
+def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body, begins: set[str]) -> None:
+    if data.axes is not None:
+        with naming("data.axes: "):
+            axes_rotation(data.axes)
+    count, standing = len(markers.tracked) + len(markers.reference), len(markers.reference)
+    enough = standing_enough(data, run.gravity)
+    if count < enough:
+        raise InputError(
+            f"markers names {count} in total: registration needs at least 3, or 2 with data.up, or 1 with data.axes."
+        )
+    if markers.labels == "assigned" and STATIC in begins and standing < enough:
+        raise InputError(
+            f"markers.labels is assigned, but markers.reference names {standing}: static poses need {enough} "
+            "reference markers" + (", or data.axes and one." if data.axes is None else ".")
+        )
+    if markers.bind_to is not None:
+        select_vertices(body.mesh, **markers.bind_to.arguments())
+
+
+def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Trial]) -> None:
+    """Checks the markers of the trials."""
+    tracked = [*markers.tracked]
+    for trial in trials:
+        if not trial.tracked(tracked):
+            raise InputError(
+                f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
+                f"markers.tracked: {listed(tracked)}."
+            )
+    everywhere = {number for trial in all_trials(run).values() for number in trial.tracked(tracked)}
+    if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
+        raise InputError(
+            f"markers.tracked names {listed(nowhere)}, which no trial has in data.trials.NAME.labels: add it there, "
+            "or leave it out."
+        )
+    if markers.frame == "own":
+        _check_sets(trials, tracked)
+    marker_view_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
+
+
+def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:
+    """Refuses trials that have some but not all markers in common, if markers are seen in their own frame."""
+    has = {trial.name: {tracked[number] for number in trial.tracked(tracked)} for trial in trials}
+    for one, other in combinations(has, 2):
+        common, single = has[one] & has[other], has[one] ^ has[other]
+        if common and single:
+            raise InputError(
+                f"the trials '{one}' and '{other}' both have {listed(sorted(common))}, but only one has "
+                f"{listed(sorted(single))}: with markers.frame own they must have the same markers, or none in common."
+            )
+
+
+def _check_release(run: RunSettings, data: RecordedData) -> None:
+    sideways = run.release.sideways
+    if sideways == 0.0:
+        return
+    if data.rest != "held":
+        raise InputError(
+            f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives the markers on the "
+            "undeformed body: set release.sideways to 0."
+        )
+    if not any(run.gravity):
+        raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
+
+
+def _check_inputs(data: RecordedData, drive: Drive) -> None:
+    count = len(drive.parts)
+    if data.input_limit is None:
+        raise InputError(
+            f"data.input_limit is not set: give the largest input of the {drive.per}s, in {drive.quantity.unit}."
+        )
+    if data.parts is not None and max(data.parts) > count:
+        raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {count}.")
+
+
+def _check_laboratory(
+    run: RunSettings, data: RecordedData, trials: Sequence[Trial], body: Body, drive: Drive | None
+) -> None:
+    laboratory, begins = run.laboratory, {trial.begins for trial in trials}
+    assert laboratory is not None
+    for trial in trials:
+        if trial.pull is not None and data.rest != "file":
+            raise InputError(
+                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so "
+                "that the recordings have the markers on the undeformed body."
+            )
+    if data.rest == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials):
+        raise InputError("data.rest is file, but the simulated bodies are held undeformed: set it to held.")
+    if begins & {"held", "released"}:
+        for key in ("seconds", "held_seconds"):
+            if getattr(laboratory, key) is None:
+                raise InputError(f"laboratory.{key} is missing: released trials need it.")
+        if (laboratory.seconds or 0.0) < (data.seconds or 0.0):
+            raise InputError(
+                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): record at "
+                "least as long as the data are used."
+            )
+    played = PlayedSettings.of(run, files={})
+    if "rest" in begins and data.steps is not None:
+        substeps_of(run.time_step, laboratory, "laboratory")
+        if drive is not None:
+            random = np.random.default_rng(0)
+            input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
+    check_target(run, body)

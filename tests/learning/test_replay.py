@@ -13,8 +13,15 @@ from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import configured_parameters, tilted_gravity
-from warp_resphys.learning.release import ReleaseSettings, estimate_release, hold, sideways_shapes, velocity_shapes
-from warp_resphys.learning.replay import Replay, Start, sample
+from warp_resphys.learning.release import (
+    ReleaseSettings,
+    begin_inputs,
+    estimate_release,
+    hold,
+    sideways_shapes,
+    velocity_shapes,
+)
+from warp_resphys.learning.replay import Replay, Start, later, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
@@ -74,6 +81,15 @@ def test_sampling_is_of_third_order_and_differentiable():
     series = torch.rand(2, 6, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     times = double([[0.013, 0.25], [0.31, 0.487]]).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, t: sample(s, t, 0.1), (series, times))
+
+
+def test_a_delayed_series_holds_its_first_value_and_ends_with_the_record():
+    h, t = 0.1, 0.1 * torch.arange(6, dtype=torch.float64)
+    shown = later((t**2).expand(3, -1)[..., None], double([0.0, 0.13, -0.2]), h)[..., 0]
+    torch.testing.assert_close(shown[0], t**2, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(shown[1, :4], (t[:4] + 0.13) ** 2, rtol=0.0, atol=1e-14)
+    assert bool(shown[1, 4:].isnan().all())
+    torch.testing.assert_close(shown[2], (t - 0.2).clamp_min(0.0) ** 2, rtol=0.0, atol=1e-14)
 
 
 def test_gravity_turns_by_its_components_and_keeps_its_strength():
@@ -295,6 +311,23 @@ def test_releases_within_twice_what_is_expected_are_recovered(seed):
     settings = ReleaseSettings(hold_modes=6, velocity_modes=2, delay=0.01, window=0.1, noise=1e-5)
     result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(result.delay, release.delay, rtol=0.0, atol=5e-4)
+
+
+def test_the_delay_of_inputs_of_a_body_at_rest_is_recovered():
+    sim, count = simulator(), 4
+    force = torch.zeros(40, count, len(MESH.vertices), 3, dtype=torch.float64)
+    force[6:, :, TIP, 1] = 0.02  # N
+    motions = replace(blank(frames=41, masses=(0.0,) * count), inputs=Inputs(force))
+    start, delay = Start.resting(sim.rest_state(count).q), double([0.0, 0.0137, -0.0261, 0.004])
+    seen = Replay(sim, MARKERS, motions)(replace(start, delay=delay))[0]
+    seen[3, 10:20] = torch.nan
+    replay = Replay(sim, MARKERS, replace(motions, observed=seen))
+    result = begin_inputs(replay, start, ReleaseSettings(delay=0.01, window=0.3, noise=1e-5))
+    torch.testing.assert_close(result.delay, delay, rtol=0.0, atol=3e-4)
+    assert float((replay(result)[0] - seen).nan_to_num().abs().max()) < 5e-5
+    near = begin_inputs(replay, start, ReleaseSettings(delay=0.01, window=0.3, noise=1.0))
+    assert float(near.delay.abs().max()) < 1e-3  # Markers as inaccurate as this say nothing.
+    assert begin_inputs(replay, start, ReleaseSettings(delay=0.0)) is start
 
 
 def test_a_sideways_held_body_is_identified_from_its_initial_motion():

@@ -24,8 +24,8 @@ from ..fem.body import Body
 from ..io.errors import ConvergenceError
 from ..io.files import read_json
 from ..learning.placement import PlacedMarkers, Placement
-from ..learning.release import estimate_release
-from ..learning.replay import Replay, Start
+from ..learning.release import begin_inputs, estimate_release
+from ..learning.replay import Replay, Start, later
 from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
 from ..settings.run import PublishedSettings, models_of
 from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, ShapesStage, TestStage, TimeStage
@@ -219,16 +219,17 @@ class Experiment:
             velocity = self.dataset.velocity
             v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
             return Start(State(q, v), q.new_zeros(len(q)))
+        known = self.parameters(model) if parameters is None else _tensors(parameters, simulator)
+        values = {name: value for name, value in known.items() if name in replay.parameter_names} or None
         if begins == "released":
-            known = self.parameters(model) if parameters is None else _tensors(parameters, simulator)
-            values = {name: value for name, value in known.items() if name in replay.parameter_names}
-            return estimate_release(simulator, replay.observe, trials, self.settings.release, values or None)
+            return estimate_release(simulator, replay.observe, trials, self.settings.release, values)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.prepare(self.parameters(model))
                 guess = simulator.static_equilibrium(resting, constants).q
-        return Start.resting(guess)
+            return Start.resting(guess)
+        return begin_inputs(replay, Start.resting(guess), self.settings.release, values)
 
     def replay(self, simulator: Simulator, names: Sequence[str], model: str = "simulation") -> Replay:
         """Replay of trials that begin in the same way, with a model's observation."""
@@ -327,7 +328,8 @@ class Experiment:
         """
         simulator, trials = replay.simulator, replay.trials
         if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
-            targets = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+            smoothed = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+            targets = later(smoothed, start.delay, simulator.time_step)
         elif self.begins(trials.names[0]) in (GIVEN, STATIC):
             targets = trials.observed
         else:

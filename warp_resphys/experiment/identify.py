@@ -49,7 +49,8 @@ def identify(context: StageContext) -> None:
         if search
     }
     kinds = {model: MODELS[model][0] for model in ranges}
-    released = any(experiment.begins(name) == "released" for name in names)
+    estimated = ("released", "rest") if settings.release.delay > 0.0 else ("released",)
+    released = any(experiment.begins(name) in estimated for name in names)
     evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
     kept = {
         part: Checkpoint(context, part)
@@ -65,7 +66,7 @@ def identify(context: StageContext) -> None:
             guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
             guess = {name: guess[name] for name in bounds}
             found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
-            for again in again_of(model) if released else ():  # The release was estimated with other parameters.
+            for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)

@@ -1,10 +1,12 @@
-"""Initial conditions of a motion that starts by releasing a held body.
+"""Initial conditions of a motion that starts by releasing a held body, or at rest by its inputs.
 
 Before the release, the body is at rest under gravity, its weights and a virtual force that brings its markers to their
 held positions (the published method finds such forces by time steps; here it is one static equilibrium). The release
 happens between two frames, may push the body, and the body may have been bent sideways: the delay, a velocity in a few
 slow modes, and a sideways displacement are estimated from the first frames.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,6 +26,7 @@ from .replay import Parameters, Replay, Start
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
 _SIDEWAYS_STRAIN = 1e-3  # of the body's extent: size of the displacement from which its bending shapes are computed
+_FURTHEST, _TRIED = 3.0, 121  # largest delay of inputs, in expected deviations, and number of delays
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts of the search, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
@@ -51,6 +54,38 @@ def estimate_release(
     q = hold(Replay(simulator, markers, motions), settings.hold_modes, parameters)
     release = Start(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
     return _initial_motion(simulator, markers, motions.first(settings.window), release, settings, parameters)
+
+
+def begin_inputs(
+    replay: Replay, start: Start, settings: ReleaseSettings, parameters: Parameters | None = None
+) -> Start:
+    """Returns the start of trials that begin at rest, with the delay of each trial's inputs after their recorded time.
+
+    The clock of the inputs and that of the markers may differ, frames may be lost, and a valve opens when it likes. A
+    delay shifts the whole motion, so one simulation gives the error of any delay in the first frames.
+
+    Args:
+        replay: of the trials.
+        start: from rest; its delay is replaced.
+        settings: the expected delay, the duration of the first frames and their noise; without a delay, the start is
+            returned as it is.
+        parameters: (1,) values that replace the simulator's, by name.
+
+    Raises:
+        ConvergenceError: a step of the simulation fails.
+    """
+    if settings.delay == 0.0:
+        return start
+    first = Replay(replay.simulator, replay.observe, replay.trials.first(settings.window))
+    delays = settings.delay * torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(start.delay)
+    with torch.no_grad():
+        series = first.series(replace(start, delay=delays[:1].expand_as(start.delay)), parameters)
+        costs = []
+        for delay in delays:
+            shown = first.at_frames(series, replace(start, delay=delay.expand_as(start.delay)))
+            squares = (first.errors(shown[None])[0] / settings.noise).square().flatten(1).sum(1)
+            costs.append(squares + (delay / settings.delay).square())
+    return replace(start, delay=delays[torch.stack(costs).argmin(0)])
 
 
 def hold(replay: Replay, modes: int, parameters: Parameters | None = None) -> torch.Tensor:

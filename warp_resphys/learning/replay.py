@@ -29,7 +29,7 @@ class Start:
     """Initial conditions of R trials."""
 
     state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
-    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body [s]
+    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body, or of its inputs [s]
     # (R, M, 3) true less bound marker places, where a body was held bent but registered as undeformed [m]; None for
     # no shift
     shift: torch.Tensor | None = None
@@ -180,15 +180,20 @@ class Replay:
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        sets = _count(parameters)
+        return self.at_frames(self.series(start, parameters, force), start).unflatten(0, (_count(parameters), -1))
+
+    def series(
+        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
+    ) -> torch.Tensor:
+        """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
         constants, inputs, resting = self.prepare(parameters)
-        state = self.initial_state(start, constants, resting, sets, force)
+        state = self.initial_state(start, constants, resting, _count(parameters), force)
         series = [self.observe(state.q)]
         for k in range(self.steps(start)):
             added = None if force is None else force(state, k)
             state, _ = self.simulator.step(state, inputs.at(k).plus(added), constants)
             series.append(self.observe(state.q))
-        return self.at_frames(torch.stack(series, 1), start).unflatten(0, (sets, -1))
+        return torch.stack(series, 1)
 
     @torch.no_grad()
     def varied(self, start: Start, parameters: Parameters) -> torch.Tensor:
@@ -278,3 +283,14 @@ def sample(series: torch.Tensor, times: torch.Tensor, step: float) -> torch.Tens
         + s**2 * (3.0 - 2.0 * s) * b
         + s**2 * (s - 1.0) * db
     )
+
+
+def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
+    """Values (B, K + 1, ...) at the times k h after delays (B,) [s], from those at k h.
+
+    Before the series, its first value holds; after its end, values are NaN.
+    """
+    last = series.shape[1] - 1
+    times = step * torch.arange(last + 1).to(delay) + delay[:, None]
+    over = times > (last + 1e-6) * step
+    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)

@@ -189,6 +189,12 @@ def _what_is_measured(data: RunReport) -> str:
             f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
+    release = data.settings.release
+    if trials is not None and "rest" in trials.begins and release.delay > 0.0:
+        text += (
+            f" When the inputs of a trial act is estimated with each model from the first {release.window:g} s of its "
+            f"markers, within an expected {1e3 * release.delay:g} ms of the detected time; of the test trials as well."
+        )
     reconstructed = data.metrics.get("reconstruction", {})
     learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]
     published = [data.published_note] if data.published else []

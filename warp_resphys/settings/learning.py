@@ -277,7 +277,7 @@ class ActuationSettings(Settings):
 
 
 class ReleaseSettings(Settings):
-    """Estimation of the state at a release from the markers of the held body."""
+    """Estimation of the start of a motion: the state at a release, from the held markers, or the delay of inputs."""
 
     hold_modes: Count = setting(
         6, "vibration modes whose inertial forces hold it; 0 starts from equilibrium under gravity and payload"
@@ -288,7 +288,7 @@ class ReleaseSettings(Settings):
     )
     noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
     delay: NotNegative = setting(
-        0.0, "expected deviation of the release from the detected one; 0 uses the detected one", "s"
+        0.0, "expected deviation of the release, or of a trial's inputs, from the detected time; 0 uses that", "s"
     )
     speed: Positive = setting(0.05, "expected speed of the fastest vertex", "m/s")
     sideways: NotNegative = setting(

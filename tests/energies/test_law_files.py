@@ -47,7 +47,19 @@ def test_there_are_silicones_and_an_unknown_one_is_refused_with_their_names():
         law_path("dragon_skin_99")
 
 
-@pytest.mark.parametrize("changes", [{"format": 0}, {"constants": None}, {"model": 3}])
+def test_coefficients_that_are_not_in_the_file_are_zero(tmp_path):
+    assert wr.read_material(written(tmp_path, constants={"ogden_3": 9e4})).constants["bulk_1"] == 0.0
+
+
+@pytest.mark.parametrize("value", [None, True, "4e4", [4e4, 5e4], float("nan")])
+def test_a_coefficient_that_is_no_number_is_named(tmp_path, value):
+    with pytest.raises(wr.DataFileError, match=r"law\.json: constants\.c10 is .*: a law has a finite number there"):
+        wr.read_material(written(tmp_path, constants={"c10": value, "bulk_1": 1e6}))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"format": 0}, {"format": True}, {"constants": None}, {"constants": {}}, {"model": 3}]
+)
 def test_a_file_of_another_version_is_refused(tmp_path, changes):
     with pytest.raises(wr.DataFileError, match="not a law of this version"):
         wr.read_material(written(tmp_path, **changes))

@@ -140,8 +140,11 @@ class TestALawThatHelps:
 
     def test_another_run_takes_it(self, rubber, tmp_path):
         others = [word for word in RUBBER if not word.startswith("law.")]
-        folder = run_without_report(tmp_path, *others, f"law={rubber / 'law.json'}")
-        law, given = read(folder, "law.json"), read(rubber, "law.json")
+        given = read(rubber, "law.json")
+        of_another_body = given["constants"] | {"mass_damping": 7.0, "density": 400.0}
+        (tmp_path / "other.json").write_text(json.dumps(given | {"constants": of_another_body}))
+        folder = run_without_report(tmp_path, *others, f"law={tmp_path / 'other.json'}")
+        law = read(folder, "law.json")
         assert law["constants"] == given["constants"]
         assert law["accepted"]
         assert by_trial(folder)["twist 90°"]["law"] == pytest.approx(by_trial(rubber)["twist 90°"]["law"], rel=0.01)
@@ -175,7 +178,16 @@ class TestALawThatDoesNotHelp:
             ["regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}", "simulation.regions={root:{},tip:{}}"],
             "^law: the simulator has materials by region, and one law is for one material: leave law out.$",
         ),
-        (["law.terms=[c20,c50]"], r"^law\.terms: law has no constant 'c50': it has c10"),
+        (["law.terms=[c20,c50]"], r"^law\.terms names c50: choose from c20, c30, "),
+        (["law.terms=[c10]"], r"^law\.terms names c10: choose from c20, c30, "),
+        (
+            ["simulation={model:neural_law}", "~simulation.youngs_modulus", "~simulation.poissons_ratio"],
+            r"^law: simulation\.model is neural_law already: ",
+        ),
+        (
+            ["simulation={model:law,bulk_1:1e6}", "~simulation.youngs_modulus", "~simulation.poissons_ratio"],
+            r"^the material resists no change of shape: ",
+        ),
         (["law.terms=[ogden_2]"], r"^law\.terms: ogden has the exponent 2"),
         (["law.term=[c20]"], "unknown key 'law.term'"),
         (["data.others.a={weight_g:50,twist_deg:10}"], r"^data\.others\.a\.weight_g is 50 and twist_deg 10: "),

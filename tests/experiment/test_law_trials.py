@@ -39,6 +39,23 @@ class TestScore:
         assert not better.beats(Score(trial))
         assert not Score(trial).beats(Score(trial))
 
+    def test_of_equally_good_laws_hardly_any_beats_the_other(self):
+        draw, kept, wins = np.random.default_rng(0), 0.8, 0
+        for _ in range(200):
+            noise = draw.standard_normal((2, 150))
+            for t in range(1, 150):  # Errors are correlated over some frames.
+                noise[:, t] = kept * noise[:, t - 1] + np.sqrt(1.0 - kept**2) * noise[:, t]
+            wins += Score((np.exp(noise[0]),)).beats(Score((np.exp(noise[1]),)))
+        assert wins < 20
+
+    def test_of_static_poses_the_trials_are_compared(self):
+        poses = [np.array([x]) for x in (1.0, 2.0, 3.0)]
+        below = Score(tuple(poses))
+        assert Score(tuple(0.9 * pose for pose in poses)).beats(below)
+        assert not Score((0.5 * poses[0], 0.7 * poses[1], 1.2 * poses[2])).beats(below)
+        assert Score((np.array([0.8]),)).beats(Score((np.array([1.0]),)))
+        assert not Score((np.array([0.99]),)).beats(Score((np.array([1.0]),)))
+
     def test_a_large_gain_does(self):
         few = Score((np.array([1.0, 4.0, 2.0]),))
         assert Score((0.5 * few.frames[0],)).beats(few)

@@ -1,12 +1,13 @@
 """Files of identified laws: those that runs write, and those of silicones that come with the package."""
 
+import math
 from pathlib import Path
 from typing import Any, Final
 
 from ..io.errors import DataFileError, listed
 from ..io.files import read_json
 from .catalogue import make_material
-from .materials import Material
+from .materials import ConvexMaterial, Material
 
 LAW_FORMAT: Final = 1
 _LAWS: Final = Path(__file__).parents[1] / "laws"
@@ -37,13 +38,22 @@ def read_law(name: str) -> dict[str, Any]:
         DataFileError: the file is missing, damaged or of another version.
     """
     path = law_path(name)
-    content: dict[str, Any] = read_json(path)
-    whole = isinstance(content.get("constants"), dict) and isinstance(content.get("model"), str)
-    if content.get("format") != LAW_FORMAT or not whole:
+    content = read_json(path)
+    known = content if isinstance(content, dict) else {}
+    constants = known.get("constants")
+    if type(known.get("format")) is not int or known["format"] != LAW_FORMAT or not isinstance(known.get("model"), str):
+        constants = None
+    if not isinstance(constants, dict) or not constants:
         raise DataFileError(
             f"{path} is not a law of this version: give a law.json that a run with the group law has written."
         )
-    return content
+    for key, value in constants.items():
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise DataFileError(
+                f"{path}: constants.{key} is {value!r}: a law has a finite number there; identify it again."
+            )
+    absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
+    return {**known, "constants": absent | constants}
 
 
 def read_material(name: str) -> Material:

@@ -19,6 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
+from numbers import Integral
 from typing import Any, ClassVar, Final, NamedTuple
 
 import torch
@@ -287,16 +288,25 @@ def _modulus(name: str) -> Quantity:
 class FibreFamily(NamedTuple):
     """Fibres along e = (cos beta cos alpha, cos beta sin alpha, sin beta) at rest, of stretch l = |F e|, q = l^2 - 1.
 
-    Numbers, or a value for each element of a curved body. A fibre of a slack pulls beyond the stretch 1 + slack.
+    Numbers, or a value for each element of a curved body. The axes are those of the mesh.
+
+    Attributes:
+        azimuth: alpha [rad].
+        elevation: beta [rad].
+        slack: strain up to which a fibre is wavy; it pulls beyond the stretch 1 + slack.
+        toe: strain beyond the slack over which the fibre tightens.
+        tension: coefficient [Pa] of (l - 1 - slack)^2 / 2.
+        stiffening: coefficient [Pa] of q^3 where q > 0.
+        compression: coefficient [Pa] of q^2 where q < 0; not convex.
     """
 
-    azimuth: Parameter = 0.0  # alpha [rad]
-    elevation: Parameter = 0.0  # beta [rad]
-    slack: Parameter = 0.0  # of the stretch
-    toe: Parameter = 0.02  # strain beyond the slack, over which the fibre tightens
-    tension: Parameter = 0.0  # of (l - 1 - slack)^2 / 2 [Pa]
-    stiffening: Parameter = 0.0  # of q^3 where q > 0 [Pa]
-    compression: Parameter = 0.0  # of q^2 where q < 0 [Pa]
+    azimuth: Parameter = 0.0
+    elevation: Parameter = 0.0
+    slack: Parameter = 0.0
+    toe: Parameter = 0.02
+    tension: Parameter = 0.0
+    stiffening: Parameter = 0.0
+    compression: Parameter = 0.0
 
 
 @dataclass(frozen=True)
@@ -305,7 +315,19 @@ class ConvexMaterial(Material):
 
     With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
     that of Ogden (1972). Viscosities and branches have moduli of their own, independent of the elastic coefficients, so
-    that forces are linear in all coefficients.
+    that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities and branches are quadratic
+    in the strain of Green, and outside of that argument. Coefficients are zero by default, but for `bulk_1`.
+
+    Attributes:
+        c10, c20, c30: coefficients [Pa] of a, a^2 and a^3, with a of `kernels.materials.convex`, near I1 - 3.
+        c01, c02: coefficients [Pa] of b and b^2, near I2 - 3.
+        dilation: coefficient [Pa] of (J - 1)^2 at the points where shape is integrated.
+        bulk_1, bulk_2: coefficients [Pa] of (J - 1)^2 and (J - 1)^4 at the volume points.
+        shear_viscosity, bulk_viscosity: eta and zeta [Pa s] of the stress 2 eta E' + zeta tr(E') I, with the rate E' of
+            Green's strain; the pressure in a pure change of volume is (zeta + 2 eta / 3) tr(E').
+        ogden: shear moduli [Pa] of Ogden's terms at small strains, by exponent, a whole number.
+        fibres: families of fibres, see `FibreFamily`.
+        prony: moduli [Pa] and relaxation times [s] of branches.
     """
 
     model = "law"
@@ -320,17 +342,16 @@ class ConvexMaterial(Material):
         ),
     }
 
-    c10: Parameter = constant(44e3, "c10", "Pa", closed=True)  # of a [Pa]
-    c20: Parameter = constant(0.0, "c20", "Pa", closed=True)  # of a^2 [Pa]
-    c30: Parameter = constant(0.0, "c30", "Pa", closed=True)  # of a^3 [Pa]
-    c01: Parameter = constant(0.0, "c01", "Pa", closed=True)  # of b [Pa]
-    c02: Parameter = constant(0.0, "c02", "Pa", closed=True)  # of b^2 [Pa]
-    dilation: Parameter = constant(0.0, "dilation", "Pa", closed=True)  # of j^2 at shape points [Pa]
-    bulk_1: Parameter = constant(22e6, "bulk_1", "Pa", closed=True)  # of j^2 at volume points [Pa]
-    bulk_2: Parameter = constant(0.0, "bulk_2", "Pa", closed=True)  # of j^4 there [Pa]
-    shear_viscosity: Parameter = constant(0.0, "shear_viscosity", "Pa s", closed=True, per="", common=True)  # [Pa s]
-    bulk_viscosity: Parameter = constant(0.0, "bulk_viscosity", "Pa s", closed=True, per="", common=True)  # [Pa s]
-    # modulus mu that a term of Ogden has at small strains [Pa], by its exponent, a whole number
+    c10: Parameter = constant(0.0, "c10", "Pa", closed=True)
+    c20: Parameter = constant(0.0, "c20", "Pa", closed=True)
+    c30: Parameter = constant(0.0, "c30", "Pa", closed=True)
+    c01: Parameter = constant(0.0, "c01", "Pa", closed=True)
+    c02: Parameter = constant(0.0, "c02", "Pa", closed=True)
+    dilation: Parameter = constant(0.0, "dilation", "Pa", closed=True)
+    bulk_1: Parameter = constant(22e6, "bulk_1", "Pa", closed=True)
+    bulk_2: Parameter = constant(0.0, "bulk_2", "Pa", closed=True)
+    shear_viscosity: Parameter = constant(0.0, "shear_viscosity", "Pa s", closed=True, per="", common=True)
+    bulk_viscosity: Parameter = constant(0.0, "bulk_viscosity", "Pa s", closed=True, per="", common=True)
     ogden: Mapping[int, Parameter] = field(default_factory=dict, kw_only=True)
     fibres: Sequence[FibreFamily] = field(default=(), kw_only=True)
     stiffness_damping: Parameter = field(default=0.0, init=False, repr=False)  # replaced by the viscosities
@@ -342,9 +363,9 @@ class ConvexMaterial(Material):
             InputError: a coefficient is negative or not finite, or an exponent is not a whole number of at least 3
                 in size.
         """
-        wrong = [n for n in self.ogden if not isinstance(n, int) or -3 < n < 3]
+        wrong = [n for n in self.ogden if not isinstance(n, Integral) or -3 < n < 3]
         if wrong:
-            raise InputError(f"ogden has the exponent {wrong[0]!r}: give whole numbers from 3 up or from -3 down.")
+            raise InputError(f"ogden has the exponent {wrong[0]}: give whole numbers from 3 up or from -3 down.")
         terms, families = len(self.ogden), len(self.fibres)
         law = {
             "law": convex_law(tuple(self.ogden), families),

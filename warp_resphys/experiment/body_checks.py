@@ -73,6 +73,8 @@ def check_size(body: Body, material: Material, gravity: Sequence[float]) -> None
     shear = 0.5 * sum(float(modulus.mean()) * factor for modulus, factor, rule in terms if rule == "shape")
     density = float(constants["density"].mean())
     stiffness = float(constants["youngs_modulus"].mean()) if "youngs_modulus" in constants else 3.0 * shear
+    if stiffness <= 0.0:
+        raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
     if strain > _LARGEST_STRAIN:
         raise InputError(

@@ -4,6 +4,7 @@ The values of settings and their relations are checked when settings are made, s
 """
 
 import math
+import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import product
@@ -18,6 +19,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.law_files import read_law
 from ..energies.materials import ConvexMaterial
+from ..energies.neural import NeuralMaterial
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -39,6 +41,7 @@ from .recorded_checks import check_recorded
 from .shapes import check_shape
 from .trials import split_of, trials_of
 
+_TERMS = ("c20", "c30", "c01", "c02", "dilation", "bulk_2")  # elastic terms besides c10, bulk_1 and Ogden's
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
 _SHARE_OF_MEMORY = 0.8
 
@@ -82,11 +85,17 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
     """Checks the identification of a law, or that a law of another run can be used."""
     if run.simulation.regions:
         raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
+    for name in law.terms:
+        if name not in _TERMS and not re.fullmatch(r"ogden_m?[1-9]\d*", name):
+            raise InputError(
+                f"law.terms names {name}: choose from {', '.join(_TERMS)}, and ogden_3, ogden_m3 and so on."
+            )
     with naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
-    if run.simulation.model == LAW and law.file is None:
+    if run.simulation.model in (LAW, NeuralMaterial.model) and law.file is None:
         raise InputError(
-            "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
+            f"law: simulation.model is {run.simulation.model} already: identify its constants in identify.parameters, "
+            "or take another one."
         )
     if law.file is not None:
         given = read_law(law.file)

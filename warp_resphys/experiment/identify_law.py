@@ -39,6 +39,7 @@ _EVALUATIONS: Final = 10
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
+_OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
 
@@ -108,8 +109,10 @@ class _LawSearch:
             classes, scores = [own.law for own in refined], [own.score.error for own in refined]
             best = refined[-1]
         if self.trials.holds_out:
-            best = replace(self._refine(best.law, whole=True), score=best.score)
-        constants = {**self.trials.mass, **best.law.constants}
+            again = self._refine(best.law, whole=True)
+            best = best if best.score.beats(again.score) else replace(again, score=best.score)
+        mass = {name: best.others.get(name, value) for name, value in self.trials.mass.items()}
+        constants = mass | best.law.constants
         below, deviation = self.trials.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
@@ -123,7 +126,7 @@ class _LawSearch:
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
             "at_bounds": [name for name, old in best.names.items() if old in best.found.at_bounds],
             "loss": best.found.loss,
-            "validation": {"trials": list(self.trials.checked), "law": best.score.error, "below": below.error},
+            "validation": self.trials.validation(best.score, below),
             "classes": tried,
             "stretches": self._stretches(best),
             "data": {"name": self.settings.name, "trials": list(self._names(whole=True))},
@@ -133,6 +136,7 @@ class _LawSearch:
     def given(self, file: str) -> dict[str, Any]:
         """Identifies the parameters beside a law of another run; returns the content of law.json."""
         content = read_law(file)
+        content["constants"] |= self.trials.mass  # density and damping by mass are those of this body
         simulator = self.trials.simulator(content["constants"], content["model"])
         others, found = dict[str, float](), None
         if bounds := self.trials.bounds_of_others(simulator):
@@ -147,11 +151,7 @@ class _LawSearch:
             "parameters": others,
             "deviation": content.get("deviation", {}) | _deviation(found),
             "at_bounds": [*content.get("at_bounds", ()), *(() if found is None else found.at_bounds)],
-            "validation": {
-                "trials": list(self.trials.checked),
-                "law": score.error,
-                "below": self.trials.score_below().error,
-            },
+            "validation": self.trials.validation(score, self.trials.score_below()),
         }
 
     def _enlarged(self, best: "_Refined", classes: Sequence[LawClass]) -> "_Refined":
@@ -230,7 +230,7 @@ class _LawSearch:
     def _longest_side(self) -> tuple[float, float]:
         """Azimuth and elevation of the longest side of the box around the body [rad]."""
         side = int(np.ptp(self.experiment.body.mesh.vertices, axis=0).argmax())
-        return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi))[side]
+        return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi - _OFF_THE_POLE))[side]
 
     def _refine(self, law: LawClass, whole: bool = False) -> "_Refined":
         """Returns a law that is refined through the simulator, with the other identified parameters.
@@ -277,10 +277,12 @@ class _LawSearch:
             others: guess of the other ones, in place of SysID's values.
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
-        whole = "whole" in key or key == "given"
-        limits = (wanted.seconds, self.trials.seconds, None if whole else self.trials.early)
+        whole, given = "whole" in key, key == "given"
+        limits = [self.trials.seconds]
+        limits += [] if whole else [wanted.seconds]
+        limits += [] if whole or given else [self.trials.early]
         seconds = min((limit for limit in limits if limit is not None), default=None)
-        identifier = Identifier(self.trials.replays(simulator, self._names(whole)), bounds, seconds)
+        identifier = Identifier(self.trials.replays(simulator, self._names(whole or given)), bounds, seconds)
         most = wanted.max_evaluations or _EVALUATIONS
         with Progress(self.context.name, most, "evaluations at most") as progress:
 

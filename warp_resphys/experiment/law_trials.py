@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -56,19 +56,29 @@ class Score:
     @property
     def error(self) -> float:
         """Root mean square over the amplitude, over all trials; infinite if one failed."""
+        if not self.frames:
+            return math.inf
         square = fmean(float(own.mean()) for own in self.frames)
         return math.sqrt(square) if math.isfinite(square) else math.inf
 
     def beats(self, other: "Score") -> bool:
-        """Whether the error is smaller by 5 % or more, or its square by two standard errors.
+        """Whether the mean square error is smaller by two standard errors.
 
-        Frames are correlated in time. The second measure finds small gains in white noise.
+        Frames are correlated in time. Of static poses the standard error is that of the trials' mean; one pose has
+        none, and its error must be smaller by 5 %.
         """
-        if self.error < _CLOSER * other.error or not math.isfinite(self.error):
+        if not math.isfinite(self.error) or not math.isfinite(other.error):
             return self.error < other.error
         less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
-        variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
-        return fmean(float(d.mean()) for d in less) > _SIGNIFICANT * math.sqrt(sum(variance)) / len(less)
+        means = np.array([d.mean() for d in less])
+        if max(len(d) for d in less) > 1:
+            variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
+            doubt = math.sqrt(sum(variance)) / len(less)
+        elif len(less) > 1:
+            doubt = float(means.std(ddof=1)) / math.sqrt(len(less))
+        else:
+            return self.error < _CLOSER * other.error
+        return float(means.mean()) > _SIGNIFICANT * doubt
 
 
 class LawTrials:
@@ -167,7 +177,7 @@ class LawTrials:
                 seen = own.seen.sum(2)
                 means = errors / (seen.clamp_min(1) * own.amplitude.square()[:, None])
                 for row, inside in enumerate((own.times >= begin) & (seen > 0)):
-                    for number in range(sets):
+                    for number in range(sets) if bool(inside.any()) else ():
                         frames[number].append(means[number, row, inside].double().cpu().numpy())
         return [Score(tuple(own)) for own in frames]
 
@@ -176,6 +186,11 @@ class LawTrials:
         simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
         return self.errors(simulator, self.experiment.parameters("sysid"), 1)[0]
 
+    def validation(self, law: Score, below: Score) -> dict[str, Any]:
+        """Returns the errors of a law and of the simulator below it on the trials that laws are tested on."""
+        split = "training" if self.holds_out else "validation"
+        return {"trials": list(self.checked), "split": split, "law": law.error, "below": below.error}
+
     def _guess(self) -> tuple[dict[str, float], dict[str, float]]:
         """Returns a neo-Hookean law like the identified material, and its constants of the mass."""
         material = self.experiment.simulator("simulation").materials[""]
@@ -183,14 +198,15 @@ class LawTrials:
         known |= {name: value for name, value in self.sysid.items() if name in known}
         tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
         lame = np.asarray(material.law.LAME).T @ [float(m) for m in material.moduli(tensors)]
-        mu, volume = float(lame[0]), float(lame[1])
+        mu, volume = float(lame[0]), max(float(lame[1]), LEAST * float(lame[0]))
         time = known.get("stiffness_damping", 0.0)
         guess = {
             "c10": 0.5 * mu,
             "bulk_1": 0.5 * volume,
             **dict(zip(VISCOSITIES, (time * mu, time * volume), strict=True)),
         }
-        ratios = [(known.get(f"prony_ratio_{k}", 0.0), known.get(f"prony_time_{k}", 0.0)) for k in (1, 2)]
+        times = {name: value for name, value in known.items() if name.startswith("prony_time_")}
+        ratios = [(known[name.replace("time", "ratio")], value) for name, value in times.items()]
         relaxing = [(ratio * mu, time) for ratio, time in ratios if ratio > LEAST]
         guess |= branches_of([modulus for modulus, _ in relaxing], [time for _, time in relaxing])
         return guess, {name: known[name] for name in _OF_MASS}
@@ -278,7 +294,9 @@ def strong_names(constants: Mapping[str, float], shear: float) -> dict[str, str]
     weak = {name for name, value in constants.items() if unit_of(name) == "Pa" and value < LEAST * shear}
     weak |= {name for name in VISCOSITIES if constants.get(name, 1.0) < 1e-6 * shear}
     kept = {
-        name: name for name in constants if name == "c10" or not (name in weak or name.startswith(("prony", "fibre")))
+        name: name
+        for name in constants
+        if name in ("c10", "bulk_1") or not (name in weak or name.startswith(("prony", "fibre")))
     }
     for leading in ("prony_modulus_", "fibre_tension_"):
         group = leading.split("_")[0]

@@ -81,7 +81,7 @@ def train_law(context: StageContext, experiment: Experiment) -> dict[str, Any]:
         "parameters": {name: float(value) for name, value in fixed.items()},
         "loss": found.loss,
         "history": found.history,
-        "validation": {"trials": list(trials.checked), "law": score.error, "below": below.error},
+        "validation": trials.validation(score, below),
         "stretches": stretches_of(experiment, replays),
         "data": {"name": settings.name, "trials": list(names)},
         "versions": package_versions(),

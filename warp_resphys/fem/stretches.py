@@ -23,7 +23,7 @@ def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[n
     element = BY_NODES[mesh.cells.shape[1]]
     centre = element.shape.nodes[: element.nodes - len(element.parents)].mean(axis=0)
     gradients, _ = physical_gradients(mesh.vertices, mesh.cells, element.shape(centre[None])[1])
-    chosen = positions[:: max(1, len(positions) // _MOST_STATES)]
+    chosen = positions[:: max(1, -(-len(positions) // _MOST_STATES))]
     deformation = np.einsum("scki,ckj->scij", chosen[:, mesh.cells], gradients[:, 0])
     finite = np.isfinite(deformation).all((-2, -1))
     values = np.full(deformation.shape[:-1], np.nan)

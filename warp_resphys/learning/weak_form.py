@@ -115,7 +115,7 @@ class WeakForm:
             for name, own in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
         }
         constants = simulator.prepare(spread)
-        carries = any(name.startswith("prony") and any(own) for name, own in values.items())
+        carries = any(name.startswith("prony_modulus") and any(own) for name, own in values.items())
         memory: Mapping[str, torch.Tensor] = {}
         rows = []
         for number, start in enumerate(states):

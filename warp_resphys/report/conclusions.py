@@ -82,7 +82,7 @@ def law_text(law: Mapping[str, Any]) -> str:
     """
     checked = law["validation"]
     trials = checked["trials"]
-    kind = "training" if set(trials) <= set(law.get("data", {}).get("trials", ())) else "validation"
+    kind = checked.get("split", "validation")
     where = f"{kind} trial{'s' if len(trials) > 1 else ''} {in_a_row(trials)}"
     base = _BASES[law.get("against", "simulation")]
     own, below = (_of_amplitude(checked[key]) for key in ("law", "below"))

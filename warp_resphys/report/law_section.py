@@ -117,18 +117,20 @@ def open_text(law: Mapping[str, Any]) -> str:
     """Return sentences on constants that the trials do not determine; empty if they determine all of them."""
     constants, deviation, units = law["constants"], law.get("deviation", {}), law.get("units", {})
     zero = [name for name in law.get("at_bounds", ()) if constants.get(name) == 0.0]
-    unsure = [name for name in law.get("at_bounds", ()) if name in constants and name not in zero]
+    bound = [name for name in law.get("at_bounds", ()) if name in constants and name not in zero]
+    unsure: list[str] = []
     for name, value in constants.items():
         limit = _OPEN_BY_UNIT.get(units.get(name, ""), _OPEN * abs(value)) if name in units else _OPEN * abs(value)
-        if name not in (*unsure, *zero) and deviation.get(name, 0.0) >= limit > 0.0:
+        if name not in (*bound, *zero) and deviation.get(name, 0.0) >= limit > 0.0:
             unsure.append(name)
     sentences = []
     if unsure:
         verb = "is" if len(unsure) == 1 else "are"
         guesses = "its first guess" if len(unsure) == 1 else "their first guesses"
-        sentences.append(
-            f"{_sentence(unsure)} {verb} not determined by these trials, and {verb} held near {guesses} or at a bound."
-        )
+        sentences.append(f"{_sentence(unsure)} {verb} not determined by these trials, and {verb} held near {guesses}.")
+    if bound:
+        its = "its range" if len(bound) == 1 else "their ranges"
+        sentences.append(f"{_sentence(bound)} ended at a bound of {its}: another value may suit the trials better.")
     if zero:
         sentences.append(f"{_sentence(zero)} ended at zero: the trials show none of it.")
     return " ".join(sentences)

@@ -173,9 +173,9 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
     """Return the moduli of a material at small strains; None for one with regions."""
     if material.regions:
         return None
-    if material.model == "law":
-        return small_strain(material.constants)
     own = make_material(material.model, **material.constants)
+    if material.model == "law":
+        return small_strain({name: float(torch.as_tensor(value)) for name, value in own.constants.items()})
     tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in own.constants.items()}
     mu, lame = np.asarray(own.law.LAME).T @ [float(modulus) for modulus in own.moduli(tensors)]
     return SmallStrain(float(mu), float(lame))

@@ -40,7 +40,7 @@ _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 
-_CLOSER: Final = 0.95
+_CLEARLY, _CLOSER = 0.5, 0.95
 _SIGNIFICANT: Final = 2.0  # standard errors
 
 FloatArray = NDArray[np.float64]
@@ -62,12 +62,12 @@ class Score:
         return math.sqrt(square) if math.isfinite(square) else math.inf
 
     def beats(self, other: "Score") -> bool:
-        """Whether the mean square error is smaller by two standard errors.
+        """Whether the error is at most half, or its mean square smaller by two standard errors.
 
-        Frames are correlated in time. Of static poses the standard error is that of the trials' mean; one pose has
-        none, and its error must be smaller by 5 %.
+        Frames are correlated in time, so that a short trial may show no less than a large gain. Of static poses the
+        standard error is that of the trials' mean; one pose has none, and its error must be smaller by 5 %.
         """
-        if not math.isfinite(self.error) or not math.isfinite(other.error):
+        if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
             return self.error < other.error
         less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
         means = np.array([d.mean() for d in less])

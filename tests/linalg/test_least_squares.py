@@ -45,6 +45,18 @@ def test_the_descent_follows_a_bent_valley(start):
     assert valley.calls < 35
 
 
+def test_the_descent_does_not_walk_to_and_fro():
+    """Full steps go from one side of the minimum to the other and back, each as long as the trust box allows."""
+
+    def objective(x):
+        t = 40.0 * (x[0] - 0.5)
+        r, j = np.array([np.arctan(t), 0.3 * (x[1] - 0.4)]), np.diag([40.0 / (1.0 + t * t), 0.3])
+        return float(r @ r), 2.0 * j.T @ r, 2.0 * j.T @ j
+
+    x, _ = descend(objective, [0.38, 0.9], 30)
+    np.testing.assert_allclose(x, [0.5, 0.4], atol=1e-5)
+
+
 def test_the_descent_turns_back_from_failures():
     x, _ = descend(Valley(wall=0.6), [0.99, 0.2], 50)
     np.testing.assert_allclose(x, [0.7, 0.49], atol=1e-5)

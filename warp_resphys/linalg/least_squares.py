@@ -3,9 +3,10 @@
 A `Problem` gives its objective, the minimiser of its damped linearisation, and the distance between two points;
 `minimise` is the loop around it (Nocedal and Wright 2006, section 10.3). It starts undamped (Gauss-Newton). A step that
 increases the objective is rejected and the damping multiplied by ten, to one at least; after an accepted step it is
-divided by ten. The problem defines the unit of the damping. Where a problem follows curved valleys, a rejected step is
-followed by a second one from its end before the damping grows (the watchdog of Nocedal and Wright, section 15.6): along
-the floor of a valley a long step ends on the wall, and the next one at the floor, much further on.
+divided by ten. The problem defines the unit of the damping. Where a problem follows curved valleys, the first rejected
+step from a point is followed by a second one from its end before the damping grows (the watchdog of Nocedal and Wright,
+section 15.6): along the floor of a valley a long step ends on the wall, and the next one at the floor, much further on.
+Both are rejected if they decrease the objective by less than 5 %, as full steps may go to and fro across a minimum.
 """
 
 from abc import ABC, abstractmethod
@@ -27,6 +28,7 @@ _MARQUARDT = 1e-2  # a damping of one adds this fraction of a diagonal entry to 
 _RIDGE = 1e-10  # fraction of the trace added to the diagonal, against motion in directions without influence
 _LARGEST_STEP = 0.25  # fraction of the range of a variable
 _SMALL = 1e-4
+_WORTH = 0.05  # least relative decrease by two steps
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Point:
 class Problem(ABC):
     """A batch of independent sums of squares."""
 
-    follows_valleys = False  # whether a rejected step is followed by a second one; of a batch of one
+    follows_valleys = False  # whether a rejected step may be followed by a second one; of a batch of one
 
     @abstractmethod
     def evaluate(self, x: torch.Tensor) -> Point:
@@ -86,17 +88,19 @@ def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: i
     iteration = 0
     while iteration < max_iterations:
         iteration += 1
-        if bool(accepted.any()):
+        fresh = bool(accepted.any())
+        if fresh:
             step = problem.linearise(point)
         trial = problem.evaluate(_where(done, point.x, step(damping)))
         finite = torch.isfinite(trial.value)
         better = finite & (trial.value <= point.value)
         distance = torch.where(finite, problem.distance(point, trial), torch.inf)
         converged = (distance <= tolerance) & (~better | (damping <= 1.0))
-        if problem.follows_valleys and bool(finite & ~better & ~converged) and iteration < max_iterations:
+        follows = problem.follows_valleys and fresh and iteration < max_iterations
+        if follows and bool(finite & ~better & ~converged):
             iteration += 1
             second = problem.evaluate(problem.linearise(trial)(damping))
-            if bool(second.value <= point.value):
+            if bool(second.value < (1.0 - _WORTH) * point.value):
                 trial, better = second, ~better
         accepted = better & ~done
         kept = tuple(_where(accepted, new, old) for new, old in zip(trial.kept, point.kept, strict=True))

@@ -12,15 +12,16 @@ from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
 
 LAW = {"c10": 30e3, "ogden_3": 20e3, "bulk_1": 4e6, "prony_modulus_1": 1e4, "prony_time_1": 0.05, "density": 1000.0}
+OF_THE_ROBOT = {"mass_damping": 9.0}
 LONG = box_hexahedra((0.15, 0.02, 0.02), (6, 1, 1))
 
 
 @pytest.fixture(scope="module")
 def robot():
     run = settings("mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,1,1]}")
-    material = MaterialSettings.model_validate({"model": "law", **LAW})
+    material = MaterialSettings.model_validate({"model": "law", **LAW, **OF_THE_ROBOT})
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
-    described = Description("beam", "law", SimulatorSettings.of(run), material, mesh, {"c10": 44e3})
+    described = Description("beam", "law", SimulatorSettings.of(run), material, mesh, {"c10": 44e3, **OF_THE_ROBOT})
     return Robot(described)
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 from ..io.errors import DataFileError, listed
 from ..io.files import read_json
 from .catalogue import make_material
-from .materials import ConvexMaterial, Material
+from .materials import MASS_DAMPING, ConvexMaterial, Material
 
 LAW_FORMAT: Final = 1
 _LAWS: Final = Path(__file__).parents[1] / "laws"
@@ -70,4 +70,4 @@ def read_material(name: str) -> Material:
         InputError: a constant that the material does not have, or a value out of range.
     """
     law = read_law(name)
-    return make_material(law["model"], **{key: x for key, x in law["constants"].items() if key != "mass_damping"})
+    return make_material(law["model"], **{key: x for key, x in law["constants"].items() if key != MASS_DAMPING})

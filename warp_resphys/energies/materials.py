@@ -39,6 +39,7 @@ def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: A
     return field(default=default, kw_only=common, metadata={"quantity": quantity})
 
 
+MASS_DAMPING: Final = "mass_damping"
 # constants of viscosity, whose names end so if they are those of a region
 VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 _PRONY_TIME = Quantity("prony_time", "s", 0.0)
@@ -66,7 +67,7 @@ class Material(ABC):
 
     density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
     # alpha [1/s] of the force -alpha M v
-    mass_damping: Parameter = constant(0.0, "mass_damping", "1/s", closed=True, per="", common=True)
+    mass_damping: Parameter = constant(0.0, MASS_DAMPING, "1/s", closed=True, per="", common=True)
     # Kelvin-Voigt retardation time beta [s]; at small strains the force -beta K v
     stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
     # generalised Maxwell (Prony) branches: ratio of the shear modulus to the long-term modulus mu, and relaxation time

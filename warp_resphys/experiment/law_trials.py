@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
+from ..energies.materials import MASS_DAMPING
 from ..fem.stretches import principal_stretches
 from ..learning.bounds import Bounds, Prior
 from ..learning.law import VISCOSITIES
@@ -34,7 +35,7 @@ _UNITS: Final = {
     "slack": "",
     "toe": "",
 }
-_OF_MASS: Final = ("density", "mass_damping")
+_OF_MASS: Final = ("density", MASS_DAMPING)
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
 _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 _HELD_OUT: Final = 4  # every fourth training trial

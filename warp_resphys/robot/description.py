@@ -10,6 +10,7 @@ import torch
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
 from ..dynamics.simulator import Simulator
+from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
 from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.files import ERRORS, fold_folder, read_if_there
@@ -102,7 +103,7 @@ class Description:
         return build_simulator(settings, self.material, body, on_failure=on_failure)
 
     def on(self, mesh: Mesh, parameters: Mapping[str, float], body: Mapping[str, Any]) -> "Description":
-        """Returns the description of a simulator with this material on another body.
+        """Returns the description of a simulator with this material, without damping by mass, on another body.
 
         Args:
             mesh: rest shape.
@@ -114,7 +115,8 @@ class Description:
         """
         given = {key: value.plain() if isinstance(value, Settings) else value for key, value in body.items()}
         settings = parse(SimulatorSettings, {**self.settings.plain(), **given})
-        return Description(self.name, self.model, settings, self.material, mesh, parameters)
+        material = MaterialSettings.model_validate({**self.material.plain(), MASS_DAMPING: None})
+        return Description(self.name, self.model, settings, material, mesh, parameters)
 
     def observe(self) -> Markers | None:
         """Returns the map from vertices to markers, in float64 on the CPU; None if every vertex is observed."""

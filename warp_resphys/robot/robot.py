@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
 from ..dynamics.frames import BaseFrame, VertexFrames
+from ..energies.materials import MASS_DAMPING
 from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError
@@ -105,7 +106,9 @@ class Robot:
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
         """Returns a robot with the material of this one on another body, without learned force and markers.
 
-        A learned force belongs to its mesh; the material does not. Identified parameters of actuators stay behind.
+        A learned force belongs to its mesh; the material does not. Identified parameters of actuators stay behind, and
+        so does damping by mass, as it stands for what slows this robot down beside its material. Directions of fibres
+        are in the axes of the new mesh.
 
         Args:
             mesh: rest shape.
@@ -121,7 +124,7 @@ class Robot:
             raise InputError(
                 f"{self.description.model} has no simulator, only a network for its mesh: load another model."
             )
-        names = {name for name in self.parameters if self._is_material(name)}
+        names = {name for name in self.parameters if self._is_material(name) and name != MASS_DAMPING}
         parameters = {name: float(self.parameters[name][0]) for name in names}
         return Robot(self.description.on(mesh, parameters, body), self.simulator.device)
 

@@ -134,11 +134,11 @@ class LawSettings(Settings):
         ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
     viscous: bool = setting(True, "whether it may have a viscosity")
-    branches: Count = setting(13, "relaxation times that are tried; 0: none")
+    branches: Count = setting(13, "relaxation times that are tried, with markers at most two; 0: none")
     relaxation_times: Annotated[Pair[Positive], AfterValidator(rising)] = setting(
         (0.01, 1.0), "shortest and longest", "s"
     )
-    families: Count = setting(1, "largest number of families of fibres")
+    families: Count = setting(1, "largest number of families of fibres; with markers at most one")
     stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
     seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from support.configured import check, composed, settings
-from support.main_job import IN_RUN, run
+from support.main_job import IN_RUN, run, run_without_report
 from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
+from warp_resphys.report.uniaxial import small_strain
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
 from warp_resphys.stepping.inputs import Inputs
@@ -104,6 +105,16 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
     assert {"simfree", "resphys"} <= errors.keys()
     check_of_the_mesh()
     check_robots("run")
+
+
+def test_a_law_is_identified_from_poses(poses, tmp_path):
+    write(tmp_path / "recordings", poses)
+    law = "law={terms:[c01],branches:0,families:0,viscous:false,max_evaluations:3}"
+    folder = run_without_report(tmp_path, *TINY, *TRIALS, law, "mesh_check=null")
+    found = json.loads((folder / "law.json").read_text())
+    assert found["validation"]["trials"] == ["other"]
+    assert found["validation"]["law"] < 0.1
+    assert small_strain(found["constants"]).youngs_modulus == pytest.approx(MODULUS, rel=0.1)
 
 
 def check_of_the_mesh():

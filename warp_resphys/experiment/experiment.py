@@ -226,7 +226,7 @@ class Experiment:
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins == STATIC:  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
-                constants, _, resting = replay.prepare(self.parameters(model))
+                constants, _, resting = replay.prepare(values)
                 guess = simulator.static_equilibrium(resting, constants).q
             return Start.resting(guess)
         return begin_inputs(replay, Start.resting(guess), self.settings.release, values)

@@ -291,7 +291,7 @@ class FibreFamily(NamedTuple):
 
     Numbers, or a value for each element of a curved body. The axes are those of the mesh.
 
-    Attributes:
+    Args:
         azimuth: alpha [rad].
         elevation: beta [rad].
         slack: strain up to which a fibre is wavy; it pulls beyond the stretch 1 + slack.

@@ -43,7 +43,7 @@ class Evaluator:
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Standardised outputs (S, c) for standardised inputs (S, i)."""
         held: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
-        leaves = self._fades is not None and (held != inputs).any()
+        fades = self._fades if (held != inputs).any() else None
         hidden = held = held.astype(self._linear.dtype)
         for number, layers in enumerate(self._blocks):
             after = hidden
@@ -51,8 +51,8 @@ class Evaluator:
                 after = layer(after)
             hidden = hidden + after if number else after
         outputs = held @ self._linear + self._remainder * hidden
-        if self._fades is not None and leaves:
-            weight = self._fades.weight(torch.as_tensor(inputs).to(self._fades.low)).numpy(force=True)
+        if fades is not None:
+            weight = fades.weight(torch.as_tensor(inputs).to(fades.low)).numpy(force=True)
             outputs = self._nothing + weight[:, None] * (outputs - self._nothing)
         return np.asarray(outputs, dtype=np.float64)
 

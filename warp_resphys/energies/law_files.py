@@ -40,10 +40,8 @@ def read_law(name: str) -> dict[str, Any]:
     path = law_path(name)
     content = read_json(path)
     known = content if isinstance(content, dict) else {}
-    constants = known.get("constants")
-    if type(known.get("format")) is not int or known["format"] != LAW_FORMAT or not isinstance(known.get("model"), str):
-        constants = None
-    if not isinstance(constants, dict) or not constants:
+    constants, of_today = known.get("constants"), known.get("format") == LAW_FORMAT and known["format"] is not True
+    if not (of_today and isinstance(known.get("model"), str) and isinstance(constants, dict) and constants):
         raise DataFileError(
             f"{path} is not a law of this version: give a law.json that a run with the group law has written."
         )

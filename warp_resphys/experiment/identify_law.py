@@ -278,9 +278,11 @@ class _LawSearch:
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
         whole, given = "whole" in key, key == "given"
-        limits = [self.trials.seconds]
-        limits += [] if whole else [wanted.seconds]
-        limits += [] if whole or given else [self.trials.early]
+        limits = (
+            self.trials.seconds,
+            None if whole else wanted.seconds,
+            None if whole or given else self.trials.early,
+        )
         seconds = min((limit for limit in limits if limit is not None), default=None)
         identifier = Identifier(self.trials.replays(simulator, self._names(whole or given)), bounds, seconds)
         most = wanted.max_evaluations or _EVALUATIONS

@@ -193,8 +193,8 @@ def _what_is_measured(data: RunReport) -> str:
     if trials is not None and "rest" in trials.begins and release.delay > 0.0:
         text += (
             " The instant at which the inputs of a trial act is estimated with each model, from the markers of its "
-            f"first {release.window:g} s and within an expected {1e3 * release.delay:g} ms of the detected one, also in "
-            "test trials."
+            f"first {release.window:g} s and within an expected {1e3 * release.delay:g} ms of the detected one, also "
+            "in test trials."
         )
     reconstructed = data.metrics.get("reconstruction", {})
     learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]

@@ -12,6 +12,7 @@ from .energies.base import Energy as Energy
 from .energies.catalogue import make_material as make_material
 from .energies.fibres import Fibres as Fibres
 from .energies.law_files import read_material as read_material
+from .energies.law_files import share_outside_law as share_outside_law
 from .energies.materials import ConvexMaterial as ConvexMaterial
 from .energies.materials import Corotated as Corotated
 from .energies.materials import DensityMaterial as DensityMaterial

@@ -1,8 +1,10 @@
 """Laws by the names of silicones, and from the files of runs."""
 
 import json
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import warp_resphys as wr
@@ -55,6 +57,28 @@ def test_coefficients_that_are_not_in_the_file_are_zero(tmp_path):
 def test_a_coefficient_that_is_no_number_is_named(tmp_path, value):
     with pytest.raises(wr.DataFileError, match=r"law\.json: constants\.c10 is .*: a law has a finite number there"):
         wr.read_material(written(tmp_path, constants={"c10": value, "bulk_1": 1e6}))
+
+
+def test_a_constant_in_another_unit_is_refused(tmp_path):
+    with pytest.raises(wr.DataFileError, match=r"law\.json: units\.c10 is 'kPa': a law has 'Pa' there"):
+        wr.read_material(written(tmp_path, units={"c10": "kPa"}))
+
+
+@pytest.mark.parametrize("value", [None, [1.1, 0.9], [0.0, 1.1], [0.9, math.inf], [0.9], 1.1])
+def test_stretches_that_are_no_range_are_refused(tmp_path, value):
+    with pytest.raises(wr.DataFileError, match=r"law\.json: stretches is .*: give the least and the largest stretch"):
+        wr.read_material(written(tmp_path, stretches=value))
+
+
+def test_cells_that_are_stretched_further_than_in_the_recordings_are_counted(tmp_path):
+    mesh = wr.box_hexahedra((0.2, 0.1, 0.1), (2, 1, 1))
+    half = mesh.vertices.copy()
+    half[:, 0] += np.clip(half[:, 0] - 0.1, 0.0, None)  # The second of two cells is twice as long.
+    states = np.stack([mesh.vertices, half])
+    assert wr.share_outside_law("dragon_skin_10", mesh, states) == 0.25
+    assert wr.share_outside_law(written(tmp_path, stretches=[0.5, 2.1]), mesh, states) == 0.0
+    with pytest.raises(wr.DataFileError, match=r"law\.json has no stretches: identify the law again"):
+        wr.share_outside_law(written(tmp_path), mesh, states)
 
 
 @pytest.mark.parametrize(

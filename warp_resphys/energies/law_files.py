@@ -4,13 +4,30 @@ import math
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fem.stretches import principal_stretches, share_outside
 from ..io.errors import DataFileError, listed
 from ..io.files import read_json
+from ..mesh.mesh import Mesh
 from .catalogue import make_material
 from .materials import MASS_DAMPING, ConvexMaterial, Material
 
 LAW_FORMAT: Final = 1
 _LAWS: Final = Path(__file__).parents[1] / "laws"
+_UNITS: Final = {
+    "density": "kg/m^3",
+    "mass": "1/s",
+    "damping": "s",
+    "viscosity": "Pa s",
+    "time": "s",
+    "azimuth": "rad",
+    "elevation": "rad",
+    "ratio": "",
+    "slack": "",
+    "toe": "",
+}
 
 
 def law_path(name: str) -> Path:
@@ -50,8 +67,45 @@ def read_law(name: str) -> dict[str, Any]:
             raise DataFileError(
                 f"{path}: constants.{key} is {value!r}: a law has a finite number there; identify it again."
             )
+        if known.get("units", {}).get(key, unit_of(key)) != unit_of(key):
+            raise DataFileError(f"{path}: units.{key} is {known['units'][key]!r}: a law has {unit_of(key)!r} there.")
+    if "stretches" in known and not _is_range(known["stretches"]):
+        raise DataFileError(
+            f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
+        )
     absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
     return {**known, "constants": absent | constants}
+
+
+def unit_of(name: str) -> str:
+    """Unit of a constant of a law."""
+    words = {*name.split("_")}
+    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+
+
+def _is_range(values: object) -> bool:
+    """Whether these are two stretches in order."""
+    match values:
+        case [float() | int() as low, float() | int() as high]:
+            return 0.0 < low <= high < math.inf
+    return False
+
+
+def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:
+    """The share of cells and states in which a law extrapolates: with stretches that it was not learned at.
+
+    Args:
+        name: as for `law_path`.
+        mesh: undeformed mesh.
+        positions: (S, N, 3) vertices of some states [m], of which at most 400 are looked at, evenly chosen.
+
+    Raises:
+        DataFileError: as for `read_law`, or the file does not have the stretches.
+    """
+    law = read_law(name)
+    if "stretches" not in law:
+        raise DataFileError(f"{law_path(name)} has no stretches: identify the law again, which writes them.")
+    return share_outside(principal_stretches(mesh, positions), *law["stretches"])
 
 
 def read_material(name: str) -> Material:

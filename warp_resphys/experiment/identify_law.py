@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..dynamics.simulator import Simulator
-from ..energies.law_files import LAW_FORMAT, read_law
+from ..energies.law_files import LAW_FORMAT, read_law, unit_of
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint
@@ -31,7 +31,7 @@ from ..settings.stages import IdentifyLawStage
 from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, again_of, changes
-from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names, unit_of
+from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names
 from .neural_law import train_law
 from .trials import evenly
 
@@ -147,6 +147,7 @@ class _LawSearch:
         return {
             **content,
             "accepted": True,
+            "accepted_there": content.get("accepted", True),
             "file": file,
             "parameters": others,
             "deviation": content.get("deviation", {}) | _deviation(found),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
+from ..energies.law_files import unit_of
 from ..energies.materials import MASS_DAMPING
 from ..fem.stretches import principal_stretches
 from ..learning.bounds import Bounds, Prior
@@ -25,16 +26,6 @@ from .experiment import LAW, Experiment
 from .identify import bounds_of
 
 LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
-_UNITS: Final = {
-    "density": "kg/m^3",
-    "damping": "1/s",
-    "viscosity": "Pa s",
-    "time": "s",
-    "azimuth": "rad",
-    "elevation": "rad",
-    "slack": "",
-    "toe": "",
-}
 _OF_MASS: Final = ("density", MASS_DAMPING)
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
 _FURTHER: Final = 0.2  # standard deviation of the priors of further terms, over the shear modulus
@@ -269,12 +260,6 @@ def stretches_of(
                 bodies = whole(replace(start, shift=None), values).flatten(0, 2).cpu().numpy()
             parts.append(principal_stretches(mesh, bodies))
     return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
-
-
-def unit_of(name: str) -> str:
-    """Unit of a constant of a law."""
-    words = {*name.split("_")}
-    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
 
 
 def is_shape(name: str) -> bool:

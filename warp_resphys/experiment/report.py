@@ -160,7 +160,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     if law:
-        kept = ("accepted", "groups", "constants", "validation", "data", "file")
+        kept = ("accepted", "groups", "constants", "validation", "data", "file", "accepted_there")
         law = {key: law[key] for key in kept if key in law}
         law["against"] = "sysid" if "sysid" in identified else "simulation"
     more = {

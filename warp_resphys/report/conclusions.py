@@ -91,7 +91,12 @@ def law_text(law: Mapping[str, Any]) -> str:
     if law.get("file"):
         head = f"The law of {law['file']} is used as it was given"
         closer = checked["below"] is None or (checked["law"] is not None and checked["law"] < checked["below"])
-        tail = "" if closer else " It does not help here: leave law out."
+        tail = (
+            ""
+            if law.get("accepted_there", True)
+            else " The run that identified it did not use it: it was no closer there."
+        )
+        tail += "" if closer else " It does not help here: leave law out."
     return (
         f"{head}: on the {where}, its root mean square error is {own} of the motion's amplitude, and that of {base} is "
         f"{below}.{tail}"

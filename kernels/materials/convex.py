@@ -30,8 +30,8 @@ import warp as wp
 from ..laws.muscle import pull
 from ..matrices import cofactor, polar_rotation, signed_svd
 from ..modules import named_module
-from ..spectral import spectral_blocks
-from . import mooney_rivlin
+from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
+from . import corotated, mooney_rivlin
 from .density import Law
 
 POWERS_OF_A, POWERS_OF_B = 3, 2
@@ -42,43 +42,49 @@ _OGDEN = ISOTROPIC + 2  # index of the first of Ogden's moduli
 PER_FIBRE = 8  # e_f, slack, toe, k_f, k_3 and k_c
 ZERO, ONE, TWO, FOUR = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0), wp.float64(4.0)
 THREE, SIX, TWELVE = wp.float64(3.0), wp.float64(6.0), wp.float64(12.0)
-FIVE, HALF = wp.float64(5.0), wp.float64(0.5)
+HALF = wp.float64(0.5)
+IDENTITY = wp.mat33d(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 SMALLEST = wp.float64(1.0e-12)  # lower bound of a squared length in a denominator
-CLOSE = wp.float64(1.0e-3)  # relative difference of stretches below which a quotient is a series
 
 
 @wp.func
-def odd_power(x: wp.float64, exponent: wp.float64) -> wp.float64:
-    """Returns the odd function |x|^exponent sgn x."""
-    return wp.sign(x) * wp.pow(wp.abs(x), exponent)
+def whole_power(x: wp.float64, n: int) -> wp.float64:
+    """Returns x^n for n >= 0."""
+    result = ONE
+    for _ in range(n):
+        result *= x
+    return result
 
 
 @wp.func
-def quotient(x: wp.float64, y: wp.float64, n: wp.float64) -> wp.float64:
-    """Returns the difference of `odd_power` between x and y over x - y, also where they are equal."""
-    larger, smaller = x, y
-    if wp.abs(y) > wp.abs(x):
-        larger, smaller = y, x
-    r = ZERO
-    if larger != ZERO:
-        r = smaller / larger - ONE
-    ratio = n * (
-        ONE
-        + (n - ONE)
-        / TWO
-        * r
-        * (ONE + (n - TWO) / THREE * r * (ONE + (n - THREE) / FOUR * r * (ONE + (n - FOUR) / FIVE * r)))
-    )
-    if wp.abs(r) > CLOSE:
-        ratio = (odd_power(ONE + r, n) - ONE) / r
-    return wp.pow(wp.abs(larger), n - ONE) * ratio
+def odd_power(x: wp.float64, n: int) -> wp.float64:
+    """Returns the odd function |x|^n sgn x for n >= 0."""
+    return wp.sign(x) * whole_power(wp.abs(x), n)
+
+
+@wp.func
+def quotient(x: wp.float64, y: wp.float64, n: int) -> wp.float64:
+    """Returns the difference of `odd_power` between x and y over x - y, also where they are equal, for n >= 1."""
+    if n % 2 == 0 and x * y <= ZERO:
+        apart = x - y
+        if apart == ZERO:
+            return ZERO
+        return (odd_power(x, n) - odd_power(y, n)) / apart
+    total = ONE
+    other = ONE
+    for _ in range(1, n):
+        other *= y
+        total = total * x + other
+    if n % 2 == 0 and x < ZERO:
+        return -total
+    return total
 
 
 @wp.func
 def matrix_power(a: wp.mat33d, n: int) -> wp.mat33d:
-    """Returns A^n for n >= 1."""
-    result = a
-    for _ in range(1, n):
+    """Returns A^n for n >= 0."""
+    result = IDENTITY
+    for _ in range(n):
         result = result * a
     return result
 
@@ -102,7 +108,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
     Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, unit_shear, unit_bulk, mu_n of each of Ogden's terms, and
     e_f (3 components), slack, toe, k_f, k_3 and k_c of each family.
     """
-    terms = len(ogden)
+    terms, inverse = len(ogden), min(ogden, default=1) < 0
     exponents = wp.types.vector(max(terms, 1), wp.int32)(*(ogden or (0,)))
     first_fibre = _OGDEN + terms
     count = first_fibre + PER_FIBRE * fibres
@@ -166,24 +172,25 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
         change = wp.trace(lower)
         crossed = lower * u
         slope = crossed + wp.transpose(crossed) - change * u - wp.trace(u) * lower
-        slope += wp.diag(wp.vec3d(ONE, ONE, ONE)) * (change * wp.trace(u) - wp.trace(crossed))
+        slope += IDENTITY * (change * wp.trace(u) - wp.trace(crossed))
         return TWO / (size * size) * (wp.ddot(lower, cof) - THREE), TWO / size * slope
 
     @wp.func(module=module)
     def add_by_stretches(s: wp.vec3d, m: moduli, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d):
         """Returns normal, flip and twist of `spectral_blocks` with those of Ogden's terms."""
         for term in range(terms):
-            n = wp.float64(wp.abs(exponents[term])) - ONE
-            scale = TWO * m[_OGDEN + term] / (n + ONE)
+            n = wp.abs(exponents[term]) - 1
+            scale = TWO * m[_OGDEN + term] / wp.float64(n + 1)
+            bent = scale * wp.float64(n)
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
                 if exponents[term] > 0:
-                    normal[i, i] += scale * n * wp.pow(wp.abs(s[i]), n - ONE)
+                    normal[i, i] += bent * whole_power(wp.abs(s[i]), n - 1)
                     flip[i] += scale * quotient(s[j], s[k], n)
                     twist[i] += scale * quotient(s[j], -s[k], n)
                 else:
                     x, slope = s[j] * s[k], scale * odd_power(s[j] * s[k], n)
-                    curvature = scale * n * wp.pow(wp.abs(x), n - ONE)
+                    curvature = bent * whole_power(wp.abs(x), n - 1)
                     normal[j, j] += curvature * s[k] * s[k]
                     normal[k, k] += curvature * s[j] * s[j]
                     normal[j, k] += curvature * x + slope
@@ -312,6 +319,44 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
                 out[(r * (r + 1)) / 2 + n] += by_a[2] * wp.outer(a[r], a[n]) + by_b[2] * wp.outer(b[r], b[n])
 
     @wp.func(module=module)
+    def add_by_rotation(f: wp.mat33d, m: moduli, out: wp.array[wp.mat33d]):
+        """Adds those of Ogden's terms of positive exponents, for det F > 0.
+
+        Their stress, without terms in j, is 2 mu_n / n R U^(n - 1): L C^k with C = F^T F, k = (n - 1) // 2, and L = R
+        for odd n, F for even ones.
+        """
+        r = polar_rotation(f)
+        back = wp.transpose(f)
+        c = back * f
+        turn = corotated.turning(f, r)
+        for term in range(terms):
+            n = exponents[term]
+            scale = TWO * m[_OGDEN + term] / wp.float64(n)
+            k = (n - 1) / 2
+            power = matrix_power(c, k)
+            left = f
+            if n % 2 == 1:
+                left = r
+                moved, axes = wp.transpose(r * power), wp.transpose(r)
+                for i in range(3):
+                    turned = scale * wp.skew(moved[i]) * turn
+                    for j in range(i + 1):
+                        out[(i * (i + 1)) / 2 + j] -= turned * wp.skew(axes[j])
+            else:
+                for i in range(3):
+                    for j in range(i + 1):
+                        out[(i * (i + 1)) / 2 + j] += scale * power[i, j] * IDENTITY
+            for a in range(k):  # of dC^k, the sum of C^a (dF^T F + F^T dF) C^(k - 1 - a)
+                right = matrix_power(c, k - 1 - a)
+                columns, carried = wp.transpose(left), wp.transpose(f * right)
+                across = left * back
+                for i in range(3):
+                    for j in range(i + 1):
+                        block = wp.outer(columns[j], carried[i]) + right[i, j] * across
+                        out[(i * (i + 1)) / 2 + j] += scale * block
+                left = left * c
+
+    @wp.func(module=module)
     def write_principal(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
         """Writes these blocks, and those of Ogden's terms, in the principal frame."""
         u, s, v = signed_svd(f)
@@ -329,10 +374,12 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
 
     @wp.func(module=module)
     def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-        if clamp or terms > 0:
+        if clamp or inverse or (terms > 0 and wp.determinant(f) < SMALLEST_STRETCH_SUM):
             write_principal(f, m, clamp, out)
         else:
             write_isotropic(f, m, out)
+            if terms > 0:
+                add_by_rotation(f, m, out)
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e

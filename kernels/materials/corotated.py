@@ -67,13 +67,18 @@ def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.f
 # of dF R^T - R dF^T. A change x of column n of F has a = (R e_n) x x, so that block (k, n) of dR is
 # -[R e_k]_x A^-1 [R e_n]_x.
 @wp.func
+def turning(f: wp.mat33d, r: wp.mat33d) -> wp.mat33d:
+    """Returns A^-1."""
+    stretch = f * wp.transpose(r)
+    t = wp.trace(stretch)
+    return wp.inverse(wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t) - HALF * (stretch + wp.transpose(stretch)))
+
+
+@wp.func
 def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
     """Writes the blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
     r = polar_rotation(f)
-    stretch = f * wp.transpose(r)
-    t = wp.trace(stretch)
-    a = wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t) - HALF * (stretch + wp.transpose(stretch))
-    scaled = TWO * shape * wp.inverse(a)
+    scaled = TWO * shape * turning(f, r)
     columns = wp.transpose(r)
     for k in range(3):
         turned = wp.skew(columns[k]) * scaled

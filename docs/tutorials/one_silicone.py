@@ -89,7 +89,7 @@ for name, (mesh, fixed) in bodies.items():
     beyond = wr.share_outside_law("runs/beam/law.json", mesh, motions[name]["law"])
     print(
         f"{name:15s} uncorrected {errors['simulation']:6.3f} mm, SysID {errors['sysid']:6.3f} mm, "
-        f"law {errors['law']:8.2g} mm: {removed[name]:.3f} % removed; it extrapolates in {100.0 * beyond:.1f} % of cells"
+        f"law {errors['law']:8.2g} mm: {removed[name]:.3f} % removed, extrapolates in {100.0 * beyond:.1f} % of cells"
     )
 assert min(removed.values()) > 99.0, removed
 

@@ -162,18 +162,27 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
         return k[2], powers(k[0], m, 0, _B), powers(k[1], m, _B, _J), by_volume(k[2], m)
 
     @wp.func(module=module)
-    def by_stretches(u: wp.mat33d, cof: wp.mat33d, n: int):
-        """Returns 2 / n^2 S_n without its terms in j, and its derivative by the stretches U, with cof U."""
+    def by_stretches(f: wp.mat33d, turn: wp.mat33d, u: wp.mat33d, n: int):
+        """Returns 2 / n^2 S_n without its terms in j, and its derivative by F = R U.
+
+        For n > 0, R U^(n - 1) is R or F times a power of F^T F.
+        """
         size = wp.float64(wp.abs(n))
         if n > 0:
-            lower = matrix_power(u, n - 1)
-            return TWO / (size * size) * (wp.ddot(lower, u) - THREE), TWO / size * lower
+            c = wp.transpose(f) * f
+            slope = f
+            if n % 2 == 1:
+                slope = turn
+            for _ in range((n - 1) / 2):
+                slope = slope * c
+            return TWO / (size * size) * (wp.ddot(slope, f) - THREE), TWO / size * slope
+        cof = cofactor(u)
         lower = matrix_power(cof, -n - 1)
         change = wp.trace(lower)
         crossed = lower * u
         slope = crossed + wp.transpose(crossed) - change * u - wp.trace(u) * lower
         slope += IDENTITY * (change * wp.trace(u) - wp.trace(crossed))
-        return TWO / (size * size) * (wp.ddot(lower, cof) - THREE), TWO / size * slope
+        return TWO / (size * size) * (wp.ddot(lower, cof) - THREE), TWO / size * (turn * slope)
 
     @wp.func(module=module)
     def add_by_stretches(s: wp.vec3d, m: moduli, normal: wp.mat33d, flip: wp.vec3d, twist: wp.vec3d):
@@ -228,13 +237,10 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
         stress += (TWO * by_a[1] * (j - ONE) - FOUR * by_b[1] + by_j[1]) * cof
         if terms > 0:
             turn, u = unsigned_polar(f)
-            cof_u = cofactor(u)
-            slope = wp.mat33d()
             for k in range(terms):
-                stretched, by_u = by_stretches(u, cof_u, exponents[k])
+                stretched, by_f = by_stretches(f, turn, u, exponents[k])
                 energy += m[_OGDEN + k] * stretched
-                slope += m[_OGDEN + k] * by_u
-            stress += turn * slope
+                stress += m[_OGDEN + k] * by_f
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e
@@ -265,15 +271,13 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
         result[_G4] = FOUR * invariant[2] * invariant[2] * invariant[2] * change_j
         if terms > 0:
             turn, u = unsigned_polar(f)
-            cof_u = cofactor(u)
-            turned = wp.transpose(turn) * df
             for k in range(terms):
-                _energy, by_u = by_stretches(u, cof_u, exponents[k])
+                _energy, by_f = by_stretches(f, turn, u, exponents[k])
                 share = TWO / wp.float64(exponents[k])
                 by_j = TWO * share
                 if exponents[k] > 0:
                     by_j = share * (invariant[2] - ONE)
-                result[_OGDEN + k] = wp.ddot(by_u, turned) + by_j * change_j
+                result[_OGDEN + k] = wp.ddot(by_f, df) + by_j * change_j
         for fibre in range(fibres):
             e = direction(m, fibre)
             c = f * e

@@ -28,7 +28,7 @@ from .identify import bounds_of
 LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
 _OF_MASS: Final = ("density", MASS_DAMPING)
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
-_FURTHER: Final = 0.2  # standard deviation of the priors of further terms, over the shear modulus
+_FURTHER: Final = 0.2  # standard deviation of the priors of further terms from markers, over the shear modulus
 _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
@@ -208,8 +208,8 @@ class LawTrials:
         """Returns the range of a constant of a law, around its first guess, and its prior.
 
         The priors have the weight of one observation. They hold what the trials do not excite: moduli and viscosities
-        near those of SysID, and further terms near zero. Small strains do not tell c10 from these, and the neo-Hookean
-        law extrapolates best from there.
+        near those of SysID, and further terms near zero. At small strains, markers do not tell c10 from these, and the
+        neo-Hookean law extrapolates best from there.
         """
         if name == "bulk_1":
             mean = max(value, self.shear)
@@ -229,7 +229,8 @@ class LawTrials:
             most = (0.01 if name == "shear_viscosity" else 1.0) * self.shear
             prior = Prior(known, known) if known > 1e-6 * self.shear else None
             return Bounds(0.0, max(4.0 * value, 4.0 * known, most), prior=prior)
-        return Bounds(0.0, max(4.0 * value, self.shear), prior=Prior(0.0, _FURTHER * self.shear))
+        deviation = (1.0 if self.states else _FURTHER) * self.shear
+        return Bounds(0.0, max(4.0 * value, self.shear), prior=Prior(0.0, deviation))
 
     def _prior_of_modulus(self) -> Prior | None:
         """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""

@@ -1,0 +1,109 @@
+"""Predictions without physics of the trials of an experiment."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from warp_resphys.experiment.experiment import Experiment
+from warp_resphys.experiment.files import Dataset
+from warp_resphys.experiment.without_physics import without_physics
+
+FRAMES, STEP = 40, 0.01
+TIMES = 2.0 * STEP * np.arange(FRAMES)  # of every second step
+SHAPE = np.array([[1.0, 0.0, 0.5], [0.2, 0.0, 0.1]])  # of two markers
+
+
+def experiment(levels, begins, learned, **changes):
+    """Trials of two markers; a pressed body follows a step of the pressure, a pose its last value."""
+    rows = len(levels)
+    held = np.arange(6.0).reshape(2, 3) + 0.1 * np.arange(rows)[:, None, None]
+    rise = 1.0 - np.exp(-TIMES / 0.1)
+    pressure = np.broadcast_to(1e3 * np.asarray(levels)[:, None, None], (rows, 2 * FRAMES, 1)).copy()
+    given = {
+        "names": tuple("abcdef"[:rows]),
+        "labels": ("m1", "m2"),
+        "begins": begins,
+        "times": np.broadcast_to(TIMES, (rows, FRAMES)),
+        "observed": held[:, None] + (np.asarray(levels)[:, None] * rise)[..., None, None] * SHAPE,
+        "held": held,
+        "payload": np.zeros(rows),
+        "gravity": np.zeros(3),
+        "time_step": STEP,
+        "bound": held[0],
+        "inputs": {"pressure": pressure},
+    }
+    dataset = Dataset(**given | changes)
+    fake = SimpleNamespace(dataset=dataset, settings=SimpleNamespace(split=SimpleNamespace(train=learned)))
+    fake.begins = lambda name: dataset.begins[dataset.names.index(name)]
+    fake.learned_steps = lambda steps: steps
+    fake.batches = lambda names: Experiment.batches(fake, names)
+    return fake
+
+
+def test_trials_are_predicted_from_training_trials_that_begin_in_the_same_way():
+    fake = experiment([1.0, 2.0, 3.0, 1.5, 2.5], ("rest",) * 3 + ("released", "rest"), ["a", "b", "c"])
+    values, settings = without_physics(fake, ["e", "d"])
+    assert values.keys() == settings.keys() == {"rest", "interpolation", "regression", "linear"}
+    truth = fake.dataset.observed[[4, 3]]
+    for model in ("interpolation", "regression", "linear"):
+        np.testing.assert_allclose(values[model][0], truth[0], atol=1e-2)
+        assert np.isnan(values[model][1]).all()
+    np.testing.assert_array_equal(values["rest"][0], np.broadcast_to(fake.dataset.held[4], (FRAMES, 2, 3)))
+
+
+def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
+    fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
+    fake.learned_steps = lambda steps: steps // 2
+    fake.dataset.observed[:2, FRAMES // 2 + 1 :] = 1e6
+    values, _ = without_physics(fake, ["c"])
+    assert np.isnan(values["interpolation"][0, FRAMES // 2 + 1 :]).all()
+    assert np.nanmax(np.abs(values["linear"])) < 10.0
+    assert fake.dataset.observed.max() == 1e6  # The data are as they were.
+
+
+def test_a_pose_is_interpolated_in_its_last_input():
+    fake = experiment([1.0, 2.0, 1.5], ("static",) * 3, ["a", "b"])
+    fake.dataset.inputs["pressure"][:, :-1] = 7.0
+    one = {name: getattr(fake.dataset, name)[:, -1:] for name in ("times", "observed")}
+    fake = experiment([1.0, 2.0, 1.5], ("static",) * 3, ["a", "b"], inputs=fake.dataset.inputs, **one)
+    values, _ = without_physics(fake, ["c"])
+    np.testing.assert_allclose(values["interpolation"][0], fake.dataset.observed[2], atol=1e-6)
+
+
+def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart_by_where_they_were_held():
+    ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -0.5]])
+    decay = np.exp(-TIMES / 0.02)[:, None, None]
+    held = np.array([0.5, 1.0, 0.8])[:, None, None] * SHAPE
+    fake = experiment(
+        [1.0, 2.0, 1.5],
+        ("released",) * 3,
+        ["a", "b"],
+        inputs={},
+        held=ends + held,
+        observed=ends + held[:, None] * decay,
+    )
+    values, _ = without_physics(fake, ["c"])
+    np.testing.assert_allclose(values["rest"][0, 0], ends, atol=1e-6)
+    np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
+
+
+def test_the_motion_of_a_base_is_an_input():
+    base = np.zeros((4, 2 * FRAMES + 1, 6))
+    base[:, :, 0] = np.array([1.0, 2.0, 3.0, 1.5])[:, None]
+    fake = experiment([1.0, 2.0, 3.0, 1.5], ("rest",) * 4, ["a", "b", "c"], inputs={}, base=base)
+    values, _ = without_physics(fake, ["d"])
+    np.testing.assert_allclose(values["interpolation"][0], fake.dataset.observed[3], atol=1e-6)
+
+
+def test_there_is_nothing_to_say_without_training_trials_of_the_kind():
+    fake = experiment([1.0, 2.0], ("rest", "released"), ["a"])
+    assert without_physics(fake, ["b"]) == ({}, {})
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.05])
+def test_a_payload_distinguishes_trials(payload):
+    fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"], payload=payload * np.array([1.0, 2.0, 1.5]))
+    fake.dataset.inputs["pressure"][:] = 1.0
+    values, _ = without_physics(fake, ["c"])
+    assert ("interpolation" in values) == (payload > 0.0)

@@ -1,0 +1,131 @@
+"""Predictions without physics, on motions whose law each of them contains."""
+
+import numpy as np
+import pytest
+
+from warp_resphys.learning.baselines import PlainTrials, predictions, regression
+
+FRAMES = 60
+TIMES = 0.02 * np.arange(FRAMES)
+
+
+def motions(values, inputs=None, *, first=None, origin=None, known=None):
+    """PlainTrials (R, T, P) that begin at the origin and are driven by inputs (R, T, C)."""
+    rows, frames, points = values.shape
+    zero = np.zeros((rows, points))
+    return PlainTrials(
+        values,
+        zero if origin is None else origin,
+        zero if first is None else first,
+        np.zeros((rows, frames, 0)) if inputs is None else inputs,
+        np.zeros((rows, 0)) if known is None else known,
+    )
+
+
+def steps(levels, response):
+    """PlainTrials that follow steps of an input: a curve of the level times a response over time."""
+    levels = np.asarray(levels)
+    shape = np.array([1.0, 0.5, -0.2]) * (1.0 - np.exp(-TIMES / 0.2))[:, None]
+    return motions(
+        response(levels)[:, None, None] * shape, np.broadcast_to(levels[:, None, None], (len(levels), FRAMES, 1))
+    )
+
+
+def error(model, trials, asked):
+    return np.abs(predictions(trials, asked)[model].values - asked.values).max()
+
+
+def test_a_body_at_rest_does_not_move_from_its_own_origin():
+    asked = motions(np.ones((2, 5, 3)), origin=np.arange(6.0).reshape(2, 3))
+    values = predictions(motions(np.ones((1, 5, 3))), asked)["rest"].values
+    np.testing.assert_array_equal(values, np.broadcast_to(asked.origin[:, None], (2, 5, 3)))
+
+
+def test_between_two_levels_interpolation_is_a_straight_line_and_below_them_one_to_the_origin():
+    trials = steps([1.0, 2.0, 4.0], np.square)
+    assert error("interpolation", trials, steps([1.0, 2.0, 4.0], np.square)) < 1e-6
+    lines = lambda x: np.interp(x, [0.0, 1.0, 2.0, 4.0], [0.0, 1.0, 4.0, 16.0])  # noqa: E731
+    assert error("interpolation", trials, steps([0.5, 1.3, 3.0], lines)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("kind", "response"), [("linear, ridge", lambda x: 0.7 * x), ("quadratic, ridge", lambda x: 0.3 * x + 0.2 * x**2)]
+)
+def test_regression_finds_the_form_by_leaving_trials_out_and_extrapolates_with_it(kind, response):
+    trials, asked = steps([0.5, 0.8, 1.0, 1.5, 2.0], response), steps([3.0], response)
+    predicted = regression(trials, asked)
+    assert predicted.settings.startswith(kind)
+    assert np.abs(predicted.values - asked.values).max() < 1e-4
+    assert error("interpolation", trials, asked) > 0.05 * (kind[0] == "q")
+
+
+def test_the_error_of_a_trial_that_is_left_out_chooses_a_broad_kernel_for_noise():
+    random = np.random.default_rng(0)
+    noise = 0.3 * random.normal(size=(12, FRAMES, 3))
+    levels = np.linspace(0.5, 2.0, 12)
+    clean = steps(levels, lambda x: 0.7 * x)
+    noisy = motions(clean.values + noise, clean.inputs)
+    asked = steps(levels + 0.03, lambda x: 0.7 * x)
+    assert error("regression", noisy, asked) < 0.5 * error("interpolation", noisy, asked)
+
+
+def test_a_coordinate_that_some_trials_do_not_show_is_predicted_from_the_others():
+    trials = steps([1.0, 2.0, 3.0], lambda x: 0.7 * x)
+    trials.values[1, 10:20, 0] = np.nan
+    trials.values[:, :, 2] = np.nan
+    predicted = predictions(trials, steps([1.5], lambda x: 0.7 * x))
+    wanted = steps([1.5], lambda x: 0.7 * x).values
+    for model in ("interpolation", "regression"):
+        np.testing.assert_allclose(predicted[model].values[..., :2], wanted[..., :2], atol=1e-3)
+        assert np.isnan(predicted[model].values[..., 2]).all()
+
+
+def driven(seed, count=4, frames=200):
+    """Two damped oscillators, seen by three coordinates and driven by two inputs that change all the time."""
+    random = np.random.default_rng(seed)
+    inputs = np.cumsum(0.2 * random.normal(size=(count, frames, 2)), axis=1)
+    turn = lambda a, r: r * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])  # noqa: E731
+    matrix = np.zeros((4, 4))
+    matrix[:2, :2], matrix[2:, 2:] = turn(0.3, 0.95), turn(0.8, 0.9)
+    push = np.array([[0.0, 1.0, 0.0, 0.5], [0.3, 0.0, 0.0, 1.0]])
+    seen = np.array([[1.0, 0.0, 0.3], [0.0, 0.0, 0.0], [0.0, 1.0, 0.4], [0.0, 0.0, 0.0]])
+    states = [np.zeros((count, 4))]
+    for t in range(1, frames):
+        states.append(states[-1] @ matrix.T + inputs[:, t] @ push)
+    return motions(np.stack(states, 1) @ seen, inputs)
+
+
+def test_a_linear_model_predicts_a_linear_system_from_its_inputs():
+    trials, asked = driven(1), driven(2)
+    assert error("linear", trials, asked) < 0.02 * np.abs(asked.values).max()
+    assert error("linear", trials, asked) < 0.1 * error("regression", trials, asked)
+
+
+def test_a_linear_model_begins_where_the_body_was_held():
+    """A released oscillator; the trials differ by where they begin and by nothing else."""
+    decay = (np.exp(-TIMES) * np.cos(9.0 * TIMES))[:, None] * np.array([1.0, 0.4])
+
+    def released(starts):
+        starts = np.asarray(starts)[:, None, None]
+        values = 0.2 + starts * decay
+        return motions(values, first=values[:, 0], origin=np.full((len(starts), 2), 0.2))
+
+    trials, asked = released([1.0, 1.5]), released([-2.0])
+    predicted = predictions(trials, asked)
+    np.testing.assert_allclose(predicted["linear"].values[:, 0], asked.values[:, 0], atol=1e-12)
+    assert error("linear", trials, asked) < 0.4  # The first step has no velocity, of which it is not told.
+    assert error("rest", trials, asked) > 1.9
+
+
+def test_gaps_and_ends_of_trials_do_not_disturb_a_linear_model():
+    trials, asked = driven(1), driven(2)
+    trials.values[0, 150:] = np.nan
+    trials.values[2, 40:43, 1] = np.nan
+    assert error("linear", trials, asked) < 0.05 * np.abs(asked.values).max()
+
+
+def test_poses_and_trials_that_nothing_distinguishes_have_fewer_baselines():
+    pose = motions(np.ones((4, 1, 3)), np.arange(4.0).reshape(4, 1, 1))
+    assert [*predictions(pose, pose)] == ["rest", "interpolation", "regression"]
+    alike = motions(np.random.default_rng(0).normal(size=(2, 9, 3)))
+    assert [*predictions(alike, alike)] == ["rest", "linear"]

@@ -1,0 +1,91 @@
+"""Predictions without physics of the trials of an experiment."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..learning.baselines import PlainTrials, predictions
+from .experiment import Experiment
+from .files import STATIC
+
+FloatArray = NDArray[np.float64]
+
+_SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
+
+
+def without_physics(experiment: Experiment, names: Sequence[str]) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
+
+    Args:
+        experiment: the experiment.
+        names: names of the R trials.
+
+    Returns:
+        By model: the observed points (R, T, M, 3) [m], NaN in trials for which there are no training trials, and the
+        settings in words.
+    """
+    shape = experiment.dataset.observed.shape[1:]
+    values: dict[str, FloatArray] = {}
+    settings: dict[str, str] = {}
+    for batch in experiment.batches(names):
+        begins = experiment.begins(batch[0])
+        learned = [name for name in experiment.settings.split.train if experiment.begins(name) == begins]
+        if not learned:
+            continue
+        trials, asked = _motions(experiment, learned, batch)
+        rows = [names.index(name) for name in batch]
+        for model, own in predictions(trials, asked).items():
+            values.setdefault(model, np.full((len(names), *shape), np.nan))[rows] = own.values.reshape(-1, *shape)
+            settings[model] = own.settings
+    return {model: own for model, own in values.items() if np.isfinite(own).any()}, settings
+
+
+def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str]) -> tuple[PlainTrials, PlainTrials]:
+    """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
+    trials, others = (_observed(experiment, names) for names in (learned, asked))
+    trials.values[:, experiment.learned_steps(trials.values.shape[1] - 1) + 1 :] = np.nan
+    driving = [_driving(experiment, names) for names in (learned, asked)]
+    known = [experiment.dataset.payload[experiment.dataset.rows(names)][:, None] for names in (learned, asked)]
+    if not driving[0] and experiment.begins(asked[0]) != STATIC:  # let go: at rest where the training ends
+        last = trials.values[:, -max(round(_SETTLED * trials.values.shape[1]), 1) :]
+        at_rest = np.where(np.isfinite(last), last, 0.0).sum((0, 1)) / np.maximum(np.isfinite(last).sum((0, 1)), 1)
+        trials, others = (replace(own, origin=np.broadcast_to(at_rest, own.first.shape)) for own in (trials, others))
+    sizes = {name: _size(values) for name, values in driving[0].items()}
+    made = []
+    for motions, inputs, loads in zip((trials, others), driving, known, strict=True):
+        frames = [values / sizes[name] for name, values in inputs.items()]
+        empty = np.zeros((*motions.values.shape[:2], 0))
+        made.append(replace(motions, inputs=np.concatenate([empty, *frames], 2), known=loads / _size(known[0])))
+    return made[0], made[1]
+
+
+def _size(values: FloatArray) -> float:
+    """The root of the mean over trials and frames of the squared norm, or one if all are zero."""
+    return float(np.sqrt(np.square(values).sum(-1).mean())) or 1.0
+
+
+def _observed(experiment: Experiment, names: Sequence[str]) -> PlainTrials:
+    dataset = experiment.dataset
+    rows = dataset.rows(names)
+    values, first = (
+        own[rows].reshape(len(rows), *own.shape[1:-2], -1).copy() for own in (dataset.observed, dataset.held)
+    )
+    return PlainTrials(values, first, first, np.zeros((*values.shape[:2], 0)), np.zeros((len(rows), 0)))
+
+
+def _driving(experiment: Experiment, names: Sequence[str]) -> Mapping[str, FloatArray]:
+    """(R, T, C) what acts during each frame, by input; a pose has the last values."""
+    dataset = experiment.dataset
+    rows = dataset.rows(names)
+    series = {name: values[rows] for name, values in dataset.inputs.items()}
+    series |= {} if dataset.base is None else {"base": dataset.base[rows]}
+    steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
+    if experiment.begins(names[0]) == STATIC:
+        steps = np.full_like(steps, np.iinfo(np.int64).max)
+    return {
+        name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)
+        for name, values in series.items()
+    }

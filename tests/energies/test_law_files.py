@@ -64,7 +64,13 @@ def test_a_constant_in_another_unit_is_refused(tmp_path):
         wr.read_material(written(tmp_path, units={"c10": "kPa"}))
 
 
-@pytest.mark.parametrize("value", [None, [1.1, 0.9], [0.0, 1.1], [0.9, math.inf], [0.9], 1.1])
+@pytest.mark.parametrize("value", [None, [], "Pa"])
+def test_units_that_are_no_table_are_refused(tmp_path, value):
+    with pytest.raises(wr.DataFileError, match=r"law\.json: units is .*: give the unit of each constant"):
+        wr.read_material(written(tmp_path, units=value))
+
+
+@pytest.mark.parametrize("value", [None, [True, 2.0], [1.1, 0.9], [0.0, 1.1], [0.9, math.inf], [0.9], 1.1])
 def test_stretches_that_are_no_range_are_refused(tmp_path, value):
     with pytest.raises(wr.DataFileError, match=r"law\.json: stretches is .*: give the least and the largest stretch"):
         wr.read_material(written(tmp_path, stretches=value))
@@ -79,6 +85,8 @@ def test_cells_that_are_stretched_further_than_in_the_recordings_are_counted(tmp
     assert wr.share_outside_law(written(tmp_path, stretches=[0.5, 2.1]), mesh, states) == 0.0
     with pytest.raises(wr.DataFileError, match=r"law\.json has no stretches: identify the law again"):
         wr.share_outside_law(written(tmp_path), mesh, states)
+    with pytest.raises(wr.InputError, match="no finite state"):
+        wr.share_outside_law("dragon_skin_10", mesh, np.full_like(states, np.nan))
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,19 @@ def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart
     np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
 
 
+@pytest.mark.parametrize("inputs", [{}, {"pressure": np.zeros((3, 2 * FRAMES, 1))}])
+def test_a_released_body_is_at_rest_at_the_end_of_what_was_learned(inputs):
+    decay, far = np.exp(-TIMES / 0.02)[:, None, None], np.array([5.0, 0.0, -1.0])
+    held = np.array([0.5, 1.0, 0.8])[:, None, None] * SHAPE
+    more = {"held": far + held, "observed": far + held[:, None] * decay}
+    fake = experiment([1.0, 2.0, 1.5], ("released",) * 3, ["a", "b"], inputs=inputs, **more)
+    fake.learned_steps = lambda steps: steps // 2
+    fake.dataset.observed[:2, 5:10, 0] = np.nan
+    values, _ = without_physics(fake, ["c"])
+    np.testing.assert_allclose(values["rest"][0, 0], np.broadcast_to(far, (2, 3)), atol=1e-3)
+    np.testing.assert_allclose(values["interpolation"][0, :5], fake.dataset.observed[2, :5], atol=1e-3)
+
+
 def test_the_motion_of_a_base_is_an_input():
     base = np.zeros((4, 2 * FRAMES + 1, 6))
     base[:, :, 0] = np.array([1.0, 2.0, 3.0, 1.5])[:, None]

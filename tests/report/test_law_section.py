@@ -119,7 +119,7 @@ def test_a_law_that_is_not_used_is_said_first(tmp_path):
 def test_a_law_by_file_that_its_own_run_did_not_use_is_said_to_be_so():
     given = law(file="other.json", validation={"trials": ["80 g"], "law": 0.1, "below": 0.2})
     assert "did not use it" not in law_text({**given, "accepted_there": True})
-    assert law_text({**given, "accepted_there": False}).endswith("did not use it: it was no closer there.")
+    assert law_text({**given, "accepted_there": False}).endswith("did not use it: it was not clearly closer there.")
 
 
 def test_constants_that_the_trials_leave_open_are_named():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..fem.stretches import principal_stretches, share_outside
-from ..io.errors import DataFileError, listed
+from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_json
 from ..mesh.mesh import Mesh
 from .catalogue import make_material
@@ -62,13 +62,16 @@ def read_law(name: str) -> dict[str, Any]:
         raise DataFileError(
             f"{path} is not a law of this version: give a law.json that a run with the group law has written."
         )
+    units = known.get("units", {})
+    if not isinstance(units, dict):
+        raise DataFileError(f"{path}: units is {units!r}: give the unit of each constant, or leave it out.")
     for key, value in constants.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise DataFileError(
                 f"{path}: constants.{key} is {value!r}: a law has a finite number there; identify it again."
             )
-        if known.get("units", {}).get(key, unit_of(key)) != unit_of(key):
-            raise DataFileError(f"{path}: units.{key} is {known['units'][key]!r}: a law has {unit_of(key)!r} there.")
+        if (unit := units.get(key, unit_of(key))) != unit_of(key):
+            raise DataFileError(f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there.")
     if "stretches" in known and not _is_range(known["stretches"]):
         raise DataFileError(
             f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
@@ -87,12 +90,12 @@ def _is_range(values: object) -> bool:
     """Whether these are two stretches in order."""
     match values:
         case [float() | int() as low, float() | int() as high]:
-            return 0.0 < low <= high < math.inf
+            return bool not in (type(low), type(high)) and 0.0 < low <= high < math.inf
     return False
 
 
 def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:
-    """The share of cells and states in which a law extrapolates: with stretches that it was not learned at.
+    """The share of cells and states in which a law extrapolates, by the stretches at the centres of cells.
 
     Args:
         name: as for `law_path`.
@@ -101,11 +104,15 @@ def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> 
 
     Raises:
         DataFileError: as for `read_law`, or the file does not have the stretches.
+        InputError: no state is finite.
     """
     law = read_law(name)
     if "stretches" not in law:
         raise DataFileError(f"{law_path(name)} has no stretches: identify the law again, which writes them.")
-    return share_outside(principal_stretches(mesh, positions), *law["stretches"])
+    stretches = principal_stretches(mesh, positions)
+    if not np.isfinite(stretches).any():
+        raise InputError("positions has no finite state, so that there are no stretches: give states of a motion.")
+    return share_outside(stretches, *law["stretches"])
 
 
 def read_material(name: str) -> Material:

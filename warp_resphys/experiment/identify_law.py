@@ -147,7 +147,7 @@ class _LawSearch:
         return {
             **content,
             "accepted": True,
-            "accepted_there": content.get("accepted", True),
+            "accepted_there": content.get("accepted_there", content.get("accepted", True)),
             "file": file,
             "parameters": others,
             "deviation": content.get("deviation", {}) | _deviation(found),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..learning.baselines import PlainTrials, predictions
 from .experiment import Experiment
-from .files import STATIC
+from .files import GIVEN, STATIC
 
 FloatArray = NDArray[np.float64]
 
@@ -36,11 +36,15 @@ def without_physics(experiment: Experiment, names: Sequence[str]) -> tuple[dict[
         if not learned:
             continue
         trials, asked = _motions(experiment, learned, batch)
+        trials = trials.select(np.asarray(np.isfinite(trials.values).any((1, 2))))
+        if not len(trials.values):
+            continue
         rows = [names.index(name) for name in batch]
         for model, own in predictions(trials, asked).items():
             values.setdefault(model, np.full((len(names), *shape), np.nan))[rows] = own.values.reshape(-1, *shape)
-            settings[model] = own.settings
-    return {model: own for model, own in values.items() if np.isfinite(own).any()}, settings
+            settings[model] = "; ".join(filter(None, (settings.get(model), own.settings)))
+    values = {model: own for model, own in values.items() if np.isfinite(own).any()}
+    return values, {model: settings[model] for model in values}
 
 
 def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str]) -> tuple[PlainTrials, PlainTrials]:
@@ -49,9 +53,14 @@ def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str
     trials.values[:, experiment.learned_steps(trials.values.shape[1] - 1) + 1 :] = np.nan
     driving = [_driving(experiment, names) for names in (learned, asked)]
     known = [experiment.dataset.payload[experiment.dataset.rows(names)][:, None] for names in (learned, asked)]
-    if not driving[0] and experiment.begins(asked[0]) != STATIC:  # let go: at rest where the training ends
-        last = trials.values[:, -max(round(_SETTLED * trials.values.shape[1]), 1) :]
-        at_rest = np.where(np.isfinite(last), last, 0.0).sum((0, 1)) / np.maximum(np.isfinite(last).sum((0, 1)), 1)
+    if experiment.begins(asked[0]) in ("released", GIVEN):  # at rest where the training ends
+        ends = [_end(own) for own in trials.values]
+        at_rest = np.array(
+            [
+                column[np.isfinite(column)].mean() if np.isfinite(column).any() else np.nan
+                for column in np.transpose(ends)
+            ]
+        )
         trials, others = (replace(own, origin=np.broadcast_to(at_rest, own.first.shape)) for own in (trials, others))
     sizes = {name: _size(values) for name, values in driving[0].items()}
     made = []
@@ -60,6 +69,12 @@ def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str
         empty = np.zeros((*motions.values.shape[:2], 0))
         made.append(replace(motions, inputs=np.concatenate([empty, *frames], 2), known=loads / _size(known[0])))
     return made[0], made[1]
+
+
+def _end(values: FloatArray) -> FloatArray:
+    """(P,) means of the last part of the frames (T, P) in which a coordinate was seen; NaN where it never was."""
+    seen = (column[np.isfinite(column)] for column in values.T)
+    return np.array([own[-max(round(_SETTLED * len(own)), 1) :].mean() if len(own) else np.nan for own in seen])
 
 
 def _size(values: FloatArray) -> float:

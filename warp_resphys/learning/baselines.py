@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 FloatArray = NDArray[np.float64]
 Kernel = Callable[[FloatArray, FloatArray], FloatArray]
@@ -22,7 +23,9 @@ _EXACT: Final = 1e-8  # ridge of an interpolation
 _MODES: Final = (2, 4, 8, 16)
 _LINEAR_RIDGES: Final = (1e-9, 1e-6, 1e-4, 1e-2)
 _FOLDS: Final = 4
-_LARGEST: Final = 1e3  # of a coordinate of a linear model, over the root mean square in its training
+_LARGEST: Final = (
+    1e3  # of a coordinate of a linear model, over the root mean square of the displacements in its training
+)
 
 
 @dataclass(frozen=True)
@@ -95,14 +98,9 @@ def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction
     return result
 
 
-def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
-    squares = np.square(a).sum(1)[:, None] + np.square(b).sum(1)[None] - 2.0 * a @ b.T
-    return np.sqrt(np.maximum(squares, 0.0))
-
-
 def _spline(a: FloatArray, b: FloatArray) -> FloatArray:
     """The covariance of Brownian motion, which in one dimension interpolates by straight lines from zero on."""
-    return np.linalg.norm(a, axis=1)[:, None] + np.linalg.norm(b, axis=1)[None] - _distances(a, b)
+    return np.linalg.norm(a, axis=1)[:, None] + np.linalg.norm(b, axis=1)[None] - cdist(a, b)
 
 
 def _quadratic(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -112,10 +110,10 @@ def _quadratic(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _kernels(features: FloatArray) -> dict[str, Kernel]:
     def gaussian(size: float) -> Kernel:
-        return lambda a, b: np.exp(-0.5 * np.square(_distances(a, b) / size))
+        return lambda a, b: np.exp(-0.5 * np.square(cdist(a, b) / size))
 
-    apart = _distances(features, features)
-    typical = float(np.median(apart[apart > 0.0]))
+    apart = cdist(features, features)
+    typical = float(np.median(apart[apart > 1e-6 * apart.max()]))
     kernels: dict[str, Kernel] = {"linear": lambda a, b: a @ b.T, "quadratic": _quadratic, "straight lines": _spline}
     return kernels | {f"Gaussian, {w:g} of the distance between trials": gaussian(w * typical) for w in _WIDTHS}
 
@@ -172,16 +170,26 @@ def _predicted(trials: PlainTrials, asked: PlainTrials, kernel: Kernel, ridge: f
 def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     """Predicts motions by a linear model of the displacements in two frames and the inputs, in principal components.
 
-    The number of components and the ridge are those of the least error of roll-outs of trials that are left out.
+    The number of components and the ridge are those of the least error of roll-outs of trials that are left out, or of
+    the only training trial. Coordinates that a trial never shows are not predicted.
     """
-    moved = [_without_gaps(own) for own in trials.moved]
+    shown = np.isfinite(trials.moved).any(1).all(0)
+    if trials.displaced.any():  # then a coordinate is told, too
+        shown &= np.isfinite(trials.first).all(0) & np.isfinite(asked.first).all(0)
+    values = np.full(asked.values.shape, np.nan)
+    if not shown.any():
+        return Prediction(values)
+    moved = [_without_gaps(own) for own in trials.moved[..., shown]]
     everything = np.concatenate(moved)
-    size = float(np.sqrt(np.square(everything).mean())) or 1.0
+    size = float(np.sqrt(np.square(everything).sum(1).mean())) or 1.0
     count = everything.shape[1]
-    largest = [max(count - _MODES[-1], 0), count - 1]
-    _, vectors = scipy.linalg.eigh(everything.T @ everything, subset_by_index=largest)
-    basis = vectors[:, ::-1] / size
-    starts, driving = trials.displaced @ basis, _driving(trials)
+    if len(everything) < count:
+        vectors = np.linalg.svd(everything, full_matrices=False)[2][: _MODES[-1]].T
+    else:
+        largest = [max(count - _MODES[-1], 0), count - 1]
+        vectors = scipy.linalg.eigh(everything.T @ everything, subset_by_index=largest)[1][:, ::-1]
+    basis = vectors / size
+    starts, driving = trials.displaced[:, shown] @ basis, _driving(trials)
     z = [np.concatenate([start[None], own @ basis]) for start, own in zip(starts, moved, strict=True)]
     squares = [np.square(own / size).sum() for own in moved]
     folds, best, chosen = min(_FOLDS, len(moved)), np.inf, (1, _LINEAR_RIDGES[-1])
@@ -200,9 +208,10 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
             best, chosen = error, (modes, ridge)
     modes, ridge = chosen
     matrix = _fitted([own[:, :modes] for own in z], driving, ridge)
-    rolled = _rolled(matrix, (asked.displaced @ basis)[:, :modes], _driving(asked))
+    rolled = _rolled(matrix, (asked.displaced[:, shown] @ basis)[:, :modes], _driving(asked))
     settings = f"{modes} component{'s' if modes > 1 else ''}, ridge {ridge:g}"
-    return Prediction(asked.origin[:, None] + rolled @ basis[:, :modes].T * size**2, settings)
+    values[..., shown] = asked.origin[:, None, shown] + rolled @ basis[:, :modes].T * size**2
+    return Prediction(values, settings)
 
 
 def _without_gaps(moved: FloatArray) -> FloatArray:

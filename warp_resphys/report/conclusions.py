@@ -94,7 +94,7 @@ def law_text(law: Mapping[str, Any]) -> str:
         tail = (
             ""
             if law.get("accepted_there", True)
-            else " The run that identified it did not use it: it was no closer there."
+            else " The run that identified it did not use it: it was not clearly closer there."
         )
         tail += "" if closer else " It does not help here: leave law out."
     return (

@@ -108,7 +108,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
     Its moduli are c_1 to c_3, d_1, d_2, e, g_2, g_4, unit_shear, unit_bulk, mu_n of each of Ogden's terms, and
     e_f (3 components), slack, toe, k_f, k_3 and k_c of each family.
     """
-    terms, inverse = len(ogden), min(ogden, default=1) < 0
+    terms, has_negative = len(ogden), min(ogden, default=1) < 0
     exponents = wp.types.vector(max(terms, 1), wp.int32)(*(ogden or (0,)))
     first_fibre = _OGDEN + terms
     count = first_fibre + PER_FIBRE * fibres
@@ -378,7 +378,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
 
     @wp.func(module=module)
     def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
-        if clamp or inverse or (terms > 0 and wp.determinant(f) < SMALLEST_STRETCH_SUM):
+        if clamp or has_negative or (terms > 0 and wp.determinant(f) < SMALLEST_STRETCH_SUM):
             write_principal(f, m, clamp, out)
         else:
             write_isotropic(f, m, out)

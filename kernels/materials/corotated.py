@@ -68,7 +68,7 @@ def second_derivatives(s: wp.vec3d, d: wp.vec3d, shape: wp.float64, volume: wp.f
 # -[R e_k]_x A^-1 [R e_n]_x.
 @wp.func
 def turning(f: wp.mat33d, r: wp.mat33d) -> wp.mat33d:
-    """Returns A^-1."""
+    """Returns A^-1, which makes the rotation w of dR = [w]_x R of the axial vector of dF R^T - R dF^T."""
     stretch = f * wp.transpose(r)
     t = wp.trace(stretch)
     return wp.inverse(wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t) - HALF * (stretch + wp.transpose(stretch)))

@@ -54,13 +54,8 @@ def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str
     driving = [_driving(experiment, names) for names in (learned, asked)]
     known = [experiment.dataset.payload[experiment.dataset.rows(names)][:, None] for names in (learned, asked)]
     if experiment.begins(asked[0]) in ("released", GIVEN):  # at rest where the training ends
-        ends = [_end(own) for own in trials.values]
-        at_rest = np.array(
-            [
-                column[np.isfinite(column)].mean() if np.isfinite(column).any() else np.nan
-                for column in np.transpose(ends)
-            ]
-        )
+        ends = np.array([_end(own) for own in trials.values])
+        at_rest = np.array([_mean(column) for column in ends.T])
         trials, others = (replace(own, origin=np.broadcast_to(at_rest, own.first.shape)) for own in (trials, others))
     sizes = {name: _size(values) for name, values in driving[0].items()}
     made = []
@@ -74,7 +69,13 @@ def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str
 def _end(values: FloatArray) -> FloatArray:
     """(P,) means of the last part of the frames (T, P) in which a coordinate was seen; NaN where it never was."""
     seen = (column[np.isfinite(column)] for column in values.T)
-    return np.array([own[-max(round(_SETTLED * len(own)), 1) :].mean() if len(own) else np.nan for own in seen])
+    return np.array([_mean(own[-max(round(_SETTLED * len(own)), 1) :]) for own in seen])
+
+
+def _mean(values: FloatArray) -> float:
+    """The mean of the finite values; NaN if there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan
 
 
 def _size(values: FloatArray) -> float:

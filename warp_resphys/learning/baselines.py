@@ -1,7 +1,7 @@
 """Predictions without physics: a body at rest, interpolation and regression over trials, a linear model in time.
 
-They are told what simulators are told, the inputs of a trial and the points before time zero, and learn from the same
-trials. Their settings are chosen by leaving training trials out.
+They have what simulators have, the inputs of a trial and the points before time zero, and learn from the same trials.
+Their settings are chosen by leaving training trials out.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,9 +23,7 @@ _EXACT: Final = 1e-8  # ridge of an interpolation
 _MODES: Final = (2, 4, 8, 16)
 _LINEAR_RIDGES: Final = (1e-9, 1e-6, 1e-4, 1e-2)
 _FOLDS: Final = 4
-_LARGEST: Final = (
-    1e3  # of a coordinate of a linear model, over the root mean square of the displacements in its training
-)
+_LARGEST: Final = 1e3  # coordinate of a linear model, over the root mean square displacement in its training
 
 
 @dataclass(frozen=True)
@@ -56,9 +54,10 @@ class PlainTrials:
         return self.values - self.origin[:, None]
 
     def features(self, like: "PlainTrials") -> FloatArray:
-        """(R, F) inputs over the frames, what else is known, and displacements before time zero, over those of others.
+        """(R, T C + F + P) what distinguishes trials: inputs at all frames, loads, and displacements before time zero.
 
-        Products of the parts are means over frames, and over the displacements of the others.
+        Args:
+            like: the training trials, whose mean displacement before time zero is the unit of displacements.
         """
         frames = self.inputs.shape[1]
         parts = [self.inputs.reshape(len(self.inputs), -1) / np.sqrt(frames), self.known]
@@ -80,13 +79,17 @@ class Prediction:
 
 
 def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction]:
-    """Predicts trials without physics, from training trials.
+    """Predicts trials without physics.
+
+    Args:
+        trials: training trials.
+        asked: trials to predict; their values are not used.
 
     Returns:
-        ``rest``: nothing moves. ``interpolation``: straight lines between trials, frame by frame, if inputs or loads
-        distinguish them. ``regression``: kernel ridge regression in their place, with three trials or more. ``linear``:
-        a linear state-space model with inputs (Proctor, Brunton and Kutz, SIAM Journal on Applied Dynamical Systems
-        15(1), 2016), for motions.
+        ``rest``: nothing moves. ``interpolation``: straight lines from zero inputs through the trials, frame by frame,
+        constant beyond the outermost, if inputs or loads distinguish them. ``regression``: kernel ridge regression in
+        their place, with three trials or more. ``linear``: a linear state-space model with inputs (Proctor, Brunton and
+        Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for motions.
     """
     result = {"rest": Prediction(np.broadcast_to(asked.origin[:, None], asked.values.shape).copy())}
     if np.ptp(trials.features(trials), axis=0).any():
@@ -99,13 +102,13 @@ def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction
 
 
 def _spline(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The covariance of Brownian motion, which in one dimension interpolates by straight lines from zero on."""
+    """The covariance of Brownian motion: in one dimension straight lines from zero to the outermost trial."""
     return np.linalg.norm(a, axis=1)[:, None] + np.linalg.norm(b, axis=1)[None] - cdist(a, b)
 
 
 def _quadratic(a: FloatArray, b: FloatArray) -> FloatArray:
-    product_ = a @ b.T
-    return np.asarray(product_ + product_**2)
+    products = a @ b.T
+    return np.asarray(products + products**2)
 
 
 def _kernels(features: FloatArray) -> dict[str, Kernel]:
@@ -132,7 +135,7 @@ def regression(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     best, chosen = np.inf, ("straight lines", 0.0, _EXACT)
     kernels = _kernels(features)
     for (name, kernel), constant, ridge in product(kernels.items(), (0.0, 1.0), _RIDGES):
-        inverse = np.linalg.inv(_gram(kernel, features, constant) + ridge * np.eye(len(features)))
+        inverse = np.linalg.inv(_scaled(kernel, features, constant)(features, features) + ridge * np.eye(len(features)))
         left_out = np.einsum("ij,jk,ik->i", inverse, products, inverse) / np.diag(inverse) ** 2
         error = float(np.sqrt(np.maximum(left_out, 0.0)).mean())
         if error < best * (1.0 - 1e-9):
@@ -142,16 +145,16 @@ def regression(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     return Prediction(predicted.values, f"{name}{' with a constant' if constant else ''}, ridge {ridge:g}")
 
 
-def _gram(kernel: Kernel, features: FloatArray, constant: float) -> FloatArray:
-    gram = kernel(features, features)
-    return np.asarray(gram / max(float(np.trace(gram)) / len(gram), 1e-12) + constant)
+def _scaled(kernel: Kernel, features: FloatArray, constant: float) -> Kernel:
+    """The kernel over the mean of its diagonal at the training features, plus a constant."""
+    scale = max(float(np.trace(kernel(features, features))) / len(features), 1e-12)
+    return lambda a, b: kernel(a, b) / scale + constant
 
 
 def _predicted(trials: PlainTrials, asked: PlainTrials, kernel: Kernel, ridge: float, constant: float) -> Prediction:
     features, moved = trials.features(trials), trials.moved
-    gram = kernel(features, features)
-    across = kernel(asked.features(trials), features) / max(float(np.trace(gram)) / len(gram), 1e-12) + constant
-    gram = _gram(kernel, features, constant) + ridge * np.eye(len(features))
+    scaled = _scaled(kernel, features, constant)
+    gram, across = scaled(features, features) + ridge * np.eye(len(features)), scaled(asked.features(trials), features)
     flat = moved.reshape(len(moved), -1)
     seen = np.isfinite(flat)
     whole = seen.all(0)
@@ -174,7 +177,7 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     the only training trial. Coordinates that a trial never shows are not predicted.
     """
     shown = np.isfinite(trials.moved).any(1).all(0)
-    if trials.displaced.any():  # then a coordinate is told, too
+    if trials.displaced.any():  # then the start of a coordinate must be known
         shown &= np.isfinite(trials.first).all(0) & np.isfinite(asked.first).all(0)
     values = np.full(asked.values.shape, np.nan)
     if not shown.any():

@@ -63,7 +63,7 @@ from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
 from .learning.metrics import summarise_folds
-from .report.conclusions import conclusions, errors_by_load
+from .report.conclusions import conclusions, errors_by_load, headline
 from .report.control_section import controller_name
 from .report.data import other_trials
 from .report.page import number_text
@@ -394,7 +394,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     if metrics.get("shapes"):
         console.print(_of_shapes(metrics["shapes"]))
         console.print(shapes_text(metrics["shapes"]), soft_wrap=True)
-    for sentence in conclusions(metrics, run):
+    for sentence in (*headline(metrics, run), *conclusions(metrics, run)):
         console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 

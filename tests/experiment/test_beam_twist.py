@@ -12,6 +12,7 @@ from support.configured import settings
 from warp_resphys import box_hexahedra, cli
 from warp_resphys.experiment.trials import split_of, trials_of
 from warp_resphys.io.files import read_hdf5
+from warp_resphys.learning.baselines import BASELINES
 
 ANGLES = {"train": (40, 80, 120, 160), "validation": (100,), "test": (60, 140)}  # degrees
 TINY = [
@@ -40,7 +41,7 @@ def finished(tmp_path_factory):
 def test_files_and_metrics(finished):
     results = json.loads((finished / "metrics.json").read_text())
     assert [trial["name"] for trial in results["per_trajectory"]] == ["60°", "140°"]
-    assert results["errors_mm"].keys() == {"simulation", "reconstruction", "resphys", "simfree"}
+    assert results["errors_mm"].keys() == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
     assert all(summary["trajectories"] == 2 for summary in results["errors_mm"].values())
     expected = {"dataset.h5", "reconstruction_resphys.h5", "resphys.safetensors", "simfree.safetensors", "rollouts.h5"}
     assert expected | {"errors.json", "times.json", "report.html"} <= {path.name for path in finished.iterdir()}

@@ -15,6 +15,7 @@ from warp_resphys.experiment.simulate import initial_state
 from warp_resphys.experiment.target import build_target
 from warp_resphys.experiment.trials import all_trials, split_of
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.mesh.poses import twisted
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
@@ -103,7 +104,7 @@ class TestALawThatHelps:
 
     def test_it_is_better_than_identification_under_every_load(self, rubber):
         errors = means(rubber)
-        assert list(errors) == ["simulation", "sysid", "law", "simfree", "resphys", "reconstruction"]
+        assert list(errors) == [*BASELINES, "simulation", "sysid", "law", "simfree", "resphys", "reconstruction"]
         assert errors["sysid"] < errors["simulation"]
         assert errors["law"] < 0.05 * errors["sysid"]
         trials = by_trial(rubber)
@@ -159,7 +160,7 @@ class TestALawThatDoesNotHelp:
         law, errors = read(known, "law.json"), means(known)
         assert not law["accepted"]
         assert law["validation"]["law"] > law["validation"]["below"]
-        assert list(errors) == ["simulation", "sysid", "simfree", "resphys", "reconstruction"]
+        assert list(errors) == [*BASELINES, "simulation", "sysid", "simfree", "resphys", "reconstruction"]
         assert errors["sysid"] < 1e-4 * errors["simulation"]
 
     def test_the_force_corrects_the_identified_simulator_and_does_not_fade_out(self, known):

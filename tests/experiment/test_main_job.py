@@ -38,6 +38,7 @@ from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import package_versions
+from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.networks import ResidualForce
 from warp_resphys.learning.predictors import LearnedPredictor
 
@@ -60,11 +61,12 @@ class TestCompleteRun:
         results = metrics(finished[0])
         keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
         keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
-        keys |= {"first_guesses"}
+        keys |= {"first_guesses", "baselines"}
         assert set(results) == keys
         assert set(results["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
-        assert set(results["errors_mm"]) == {"simulation", "reconstruction", "resphys", "simfree"}
-        assert set(results["errors_vs_reconstruction_mm"]) == {"simulation", "resphys", "simfree"}
+        assert set(results["errors_mm"]) == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
+        assert set(results["errors_vs_reconstruction_mm"]) == {*BASELINES, "simulation", "resphys", "simfree"}
+        assert results["baselines"].keys() == {*BASELINES}
         assert list(results["seconds"]) == STAGES
         assert all(0.0 < s < 600.0 for s in results["seconds"].values())
         assert 0.1 < results["peak_memory_gib"] < 4.0
@@ -204,7 +206,7 @@ class TestChanges:
             assert not metadata["reduced"]
             records = json.loads(Path(f"run/{history}.json").read_text())["epochs"]
             assert [r["epoch"] for r in records if "rollout_error_mm" in r] == [1, 2]
-        assert metrics()["errors_mm"].keys() == {*MODELS, "simfree"}
+        assert metrics()["errors_mm"].keys() == {*BASELINES, *MODELS, "simfree"}
 
     def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
         monkeypatch.setattr(learn, "rollout_error", lambda *_: lambda _: float("inf"))

@@ -451,3 +451,28 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     assert results["errors_mm"]["resphys"]["diverged"] == 1
     assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
     assert results["growth"]["sysid"] == pytest.approx(0.0)
+
+
+def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(finished):
+    """The stored variance beside roll-outs with parameters that are drawn from a narrowed posterior."""
+    record = json.loads((finished / "run" / "stages" / "evaluate.json").read_text())
+    experiment = Experiment(parse(EvaluateStage, record["settings"]), finished / "run")
+    identified = experiment.identification("sysid")
+    names, uncertainty = [*identified["parameters"]], identified["uncertainty"]
+    deviation = 1e-3 * np.array([uncertainty["deviation"][name] for name in names])
+    covariance = np.array(uncertainty["correlation"]) * np.outer(deviation, deviation)
+    means = [identified["parameters"][name] for name in names]
+    drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
+    replay = experiment.replay(experiment.model_simulator("sysid"), ["t003"], "sysid")
+    sets = {name: torch.from_numpy(drawn[:, column].copy()) for column, name in enumerate(names)}
+    points = replay.varied(experiment.start(replay, "sysid"), sets)[:, 0].numpy()
+    with read_hdf5(finished / "run" / "rollouts.h5", "rollouts") as file:
+        stored = read_array(file, "sysid_spread")[0]
+        np.testing.assert_array_equal(read_array(file, "resphys_spread")[0], stored)
+    expected = 1e6 * points.var(0).mean(-1)
+    assert stored.shape == expected.shape
+    np.testing.assert_allclose(stored[-4:], expected[-4:], rtol=0.25)
+    assert stored[-1].max() > 3.0 * stored[0].max()  # It grows with the motion.
+    intervals = json.loads((finished / "run" / "errors.json").read_text())["intervals"]["models"]
+    assert {"without_spread", "by_trial", "by_amplitude", "variance"} <= intervals["sysid"].keys()
+    assert "without_spread" not in intervals["interpolation"]

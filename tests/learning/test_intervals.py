@@ -1,17 +1,31 @@
-"""Prediction intervals: coverage with known errors, and the choice of the scale."""
+"""Prediction intervals: coverage with known errors, also by displacement and time since a change of the inputs."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from warp_resphys.learning.intervals import Intervals
+from warp_resphys.learning.intervals import Intervals, Predicted, coverage, time_since_change
 
 REST = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
 
 
+def constant(moved, since):
+    return 1e-3 + 0.0 * moved
+
+
+def growing(moved, since):
+    return 1e-4 + 0.2 * moved
+
+
+def transient(moved, since):
+    return 1e-4 + (0.02 + 0.4 * np.exp(-since / 0.3)) * moved
+
+
 def trials(count, seed, noise, frames=60):
-    """Swinging markers, and observed ones with slowly varying errors of size ``noise(displacement)`` [m]."""
+    """Swinging markers, and observed ones with slowly varying errors of a size ``noise(displacement, time)`` [m]."""
     draw = np.random.default_rng(seed)
-    simulated, observed = [], []
+    made = []
     for _ in range(count):
         time = np.linspace(0.0, 3.0, frames)[:, None, None]
         x = REST + draw.uniform(0.5, 1.5) * np.array([0.01, 0.03])[:, None] * np.sin(
@@ -21,73 +35,133 @@ def trials(count, seed, noise, frames=60):
         for k in range(1, frames):
             shocks[k] = 0.8 * shocks[k - 1] + 0.6 * shocks[k]
         moved = np.linalg.norm(x - REST, axis=-1, keepdims=True)
-        simulated.append(x)
-        observed.append(x + noise(moved) * shocks)
-    return simulated, observed
+        made.append(Predicted(x, x + noise(moved, time) * shocks, time[:, 0, 0]))
+    return made
 
 
-@pytest.mark.parametrize(
-    ("noise", "scale"),
-    [(lambda moved: 1e-3 + 0.0 * moved, "constant"), (lambda moved: 1e-4 + 0.2 * moved, "displacement")],
-)
-def test_intervals_have_their_coverage_on_other_trials(noise, scale):
-    """Mean coverage over many calibrations, with few or many trials, for both kinds of errors."""
-    for count in (3, 10):
-        result, scales = [], []
-        for seed in range(40):
-            intervals = Intervals.calibrated(*trials(count, seed, noise), REST)
-            result.append(intervals.coverage(*trials(20, 1000 + seed, noise), REST)["coverage"])
-            scales.append(intervals.scale)
-        assert 0.85 < np.mean(result) < 0.95, count
-        assert scales.count(scale) > 30
+def covered(intervals, some):
+    return coverage([intervals.covered(trial, REST) for trial in some])
+
+
+@pytest.mark.parametrize("noise", [constant, growing, transient])
+@pytest.mark.parametrize("count", [3, 10])
+def test_intervals_have_their_coverage_on_other_trials_of_any_amplitude(noise, count):
+    """Mean coverage over many calibrations, with few or many trials."""
+    made = [(Intervals.calibrated(trials(count, s, noise), REST), trials(20, 1000 + s, noise)) for s in range(30)]
+    results = [covered(*pair) for pair in made]
+    assert 0.86 < np.mean([result["coverage"] for result in results]) < 0.96
+    thirds = np.mean([result["by_amplitude"] for result in results], axis=0)
+    assert (thirds > 0.84).all(), thirds
+    assert (thirds < 0.97).all(), thirds
+
+
+def test_intervals_are_as_wide_as_the_errors_are_large():
+    """Of the growing ones of Gaussian errors 90 % lie within 1.64 deviations."""
+    intervals = Intervals.calibrated(trials(30, 3, transient), REST)
+    x = REST + np.array([0.02, 0.0, 0.0])
+    for since in (0.05, 0.5, 3.0):
+        expected = 1.64 * transient(0.02, since)
+        np.testing.assert_allclose(intervals.half_widths(x, REST, since), expected, rtol=0.35)
+    assert (intervals.half_widths(x, REST) >= intervals.half_widths(x, REST, 0.05)).all()  # At an unknown time.
+    times = np.array([0.05, 3.0])
+    series = intervals.half_widths(np.stack([x, x]), REST, times)
+    assert series.shape == (2, 2)
+    assert (series[0] > 3.0 * series[1]).all()
 
 
 def test_intervals_are_wider_for_a_marker_with_larger_errors():
-    simulated, observed = trials(8, 0, lambda moved: 1e-3 + 0.0 * moved)
-    for markers in observed:
-        markers[:, 1] += 0.004
-    intervals = Intervals.calibrated(simulated, observed, REST)
+    made = trials(8, 0, constant)
+    for trial in made:
+        trial.observed[:, 1] += 0.004
+    intervals = Intervals.calibrated(made, REST)
     assert intervals.factor[1] > 1.5 * intervals.factor[0]
     again = Intervals.from_plain(intervals.plain())
     assert again == intervals
-    held = again.coverage(simulated, observed, REST)
+    held = covered(again, made)
     assert held["coverage"] > 0.9
     assert 1.5 < held["half_width_mm"] < 6.0
+    assert Intervals.from_plain({"scale": "constant", "factor": [1.0], "standing": [0.0]}) is None  # Earlier versions.
+    assert Intervals.from_plain(None) is None
 
 
 def test_unseen_markers_have_no_influence_on_intervals():
-    simulated, observed = trials(6, 1, lambda moved: 1e-3 + 0.0 * moved)
-    whole = Intervals.calibrated(simulated, observed, REST)
-    for markers in observed[:3]:
-        markers[10:, 0] = np.nan
-    some = Intervals.calibrated(simulated, observed, REST)
-    assert some.factor == pytest.approx(whole.factor, rel=0.3)
-    observed[0][:] = np.nan
-    assert np.isfinite(some.coverage(simulated, observed, REST)["coverage"])
+    made = trials(6, 1, constant)
+    whole = Intervals.calibrated(made, REST)
+    for trial in made[:3]:
+        trial.observed[10:, 0] = np.nan
+    some = Intervals.calibrated(made, REST)
+    at = REST + 0.01
+    assert some.half_widths(at, REST, 1.0) == pytest.approx(whole.half_widths(at, REST, 1.0), rel=0.3)
+    made[0].observed[:] = np.nan
+    assert np.isfinite(covered(some, made)["coverage"])
 
 
 def test_a_model_that_diverges_has_no_intervals():
-    simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
-    simulated[2][30:] = np.nan
-    assert Intervals.calibrated(simulated, observed, REST) is None
+    made = trials(4, 2, constant)
+    made[2].simulated[30:] = np.nan
+    assert Intervals.calibrated(made, REST) is None
 
 
 def test_a_marker_that_was_never_seen_has_the_widest_interval():
-    simulated, observed = trials(4, 2, lambda moved: 1e-3 + 0.0 * moved)
-    simulated, observed = ([x[:, [0, 1, 1]].copy() for x in some] for some in (simulated, observed))
-    rest = REST[[0, 1, 1]]
-    for markers in observed:
-        markers[:, 1] += 0.004
-    known = Intervals.calibrated(simulated, observed, rest)
-    for markers in observed:
-        markers[:, 2] = np.nan
-    result = Intervals.calibrated(simulated, observed, rest)
+    made = [
+        Predicted(*(series[:, [0, 1, 1]].copy() for series in (trial.simulated, trial.observed)), trial.since)
+        for trial in trials(4, 2, constant)
+    ]
+    for trial in made:
+        trial.observed[:, 1] += 0.004
+        trial.observed[:, 2] = np.nan
+    result = Intervals.calibrated(made, REST[[0, 1, 1]])
     assert result.factor[2] == result.factor[1] > 1.5 * result.factor[0]
-    assert result.factor[:2] == pytest.approx(known.factor[:2], rel=1e-9)
-    assert result.standing == pytest.approx(known.standing)
-    rest = REST
-    observed = [x[:, :2] for x in observed]
-    simulated = [x[:, :2] for x in simulated]
-    for markers in observed:
-        markers[:] = np.nan
-    assert Intervals.calibrated(simulated, observed, rest) is None
+    for trial in made:
+        trial.observed[:] = np.nan
+    assert Intervals.calibrated(made, REST[[0, 1, 1]]) is None
+
+
+def test_a_body_that_never_moves_has_intervals_too():
+    """As the baseline at rest does: its errors are constant then."""
+    made = [
+        Predicted(np.broadcast_to(REST, t.observed.shape).copy(), t.observed, t.since) for t in trials(5, 4, constant)
+    ]
+    intervals = Intervals.calibrated(made, REST)
+    assert intervals.variance[1:4] == (0.0, 0.0, 0.0)
+    assert covered(intervals, made)["coverage"] >= 0.9
+
+
+def test_the_time_since_a_change_is_not_reset_by_noise():
+    times = np.broadcast_to(0.1 * np.arange(8.0)[:, None], (8, 2))
+    valve = np.zeros((8, 2, 1))
+    valve[3:, 0] = 1.0
+    valve[:, 1, 0] = np.linspace(0.0, 1.0, 8)  # A ramp changes throughout.
+    noise = 0.01 * np.random.default_rng(0).uniform(-1.0, 1.0, valve.shape)
+    since = time_since_change(times, [valve + noise * [[[1.0], [0.0]]]])
+    np.testing.assert_allclose(since[:, 0], [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(since[:, 1], 0.0)
+    np.testing.assert_allclose(time_since_change(times, []), times)
+    assert np.isinf(time_since_change(times[:1], [valve[:1]])).all()
+
+
+def test_coverage_by_amplitude_gives_trials_equal_weight():
+    made = trials(6, 5, constant)
+    intervals = Intervals.calibrated(made, REST)
+    own = [intervals.covered(trial, REST) for trial in made]
+    result = coverage(own)
+    assert result["coverage"] == pytest.approx(np.mean([trial.inside.mean() for trial in own]))
+    assert np.mean(result["by_amplitude"]) == pytest.approx(result["coverage"], abs=1e-3)
+
+
+def test_intervals_grow_with_the_uncertainty_of_the_parameters():
+    """Outside of the calibration trials, where the spread is a hundred times as large and the errors follow it."""
+
+    def spread_out(count, seed, size):
+        draw = np.random.default_rng(seed)
+        made = []
+        for trial in trials(count, seed, constant):
+            off = size * draw.normal() * np.ones((1, 2, 3))  # An error of a parameter lasts.
+            made.append(replace(trial, observed=trial.observed + off, spread=np.full((60, 2), size**2)))
+        return made
+
+    intervals = Intervals.calibrated(spread_out(20, 6, 1e-3), REST)
+    assert 0.8 < covered(intervals, spread_out(200, 7, 0.1))["coverage"] < 0.97
+    alone = Intervals.calibrated([replace(trial, spread=None) for trial in spread_out(20, 6, 1e-3)], REST)
+    assert covered(alone, spread_out(200, 7, 0.1))["coverage"] < 0.1
+    assert intervals.variance[-1] >= 1.0

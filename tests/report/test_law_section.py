@@ -152,12 +152,14 @@ def test_errors_by_load_and_multiples():
         identify=None,
         data=released().data.changed(others={"up": {"weight_g": 50.0}, "twist": {"twist_deg": 90.0}}),
     )
-    (said,) = conclusions(metrics, config)
-    assert "leaves 99 % (90 %: 99 to 99) less error than the law on 2 trials" in said
+    said, few = conclusions(metrics, config)
+    assert "leaves 99 % less error than the law on 2 trials (1 and 3 to 0.01 and 0.03 mm)." in said
     assert said.endswith(
-        " On 2 trials outside of the training loads it has 50 times (90 %: 40 to 60) the error of the law (mean 2 to "
-        "100 mm): it does harm."
+        " On 2 trials outside of the training loads it has 50 times the error of the law (2 and 2 to 80 and 120 mm)."
     )
+    assert few.startswith("These gains rest on 2 held-out trials")
+    many = {**metrics, "per_trajectory": metrics["per_trajectory"] * 3}
+    assert conclusions(many, config)[0].endswith("(mean 2 to 100 mm): it does harm.")
     assert percent_text(49.0) == "50 times"
     (left,) = range_texts(metrics, ["50 g", "up"])
     assert left.endswith("from the start (up). There the learned force fades out, and the law remains.")

@@ -1,6 +1,7 @@
 """What a run shows, in words: the verdict, the conclusions, notes, and numbers as they are written."""
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -17,15 +18,16 @@ from warp_resphys.learning.metrics import (
 from warp_resphys.report.conclusions import (
     Identified,
     advice,
-    best,
     conclusions,
     epochs_kept,
     gains,
+    headline,
     intervals_text,
     untrained,
 )
 from warp_resphys.report.notes import error_notes, kept_note, network_note
 from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, duration_text, error_parts, number_text
+from warp_resphys.report.recommendation import recommendation, recommended
 from warp_resphys.report.run_page import largest_filtered, range_texts
 from warp_resphys.report.verdict import (
     growth_text,
@@ -50,15 +52,23 @@ def said_of(model, sentences):
 
 class TestGains:
     def test_a_gain_that_other_draws_of_the_trials_show_helps(self):
-        """Shares of 30, 20 and 40 % on each trial: draws of three lie between."""
-        errors = {"simulation": [2.0, 2.0, 2.0], "sysid": [1.0, 1.0, 2.0], "resphys": [0.7, 0.8, 1.2]}
-        assert said_of("resphys", gains(errors, {"resphys": [3]})) == (
-            "The learned force (ResPhys) leaves 32 % (90 %: 20 to 40) less error than SysID on 3 trials (mean 1.33 to "
-            "0.9 mm): it helps."
-        )
-        said = said_of("sysid", gains(errors, {}))
-        assert "33 % (90 %: 0 to 50) less" in said
+        """Shares of 30, 20, 40, 30 and 30 % of the error of SysID: draws of five lie between."""
+        errors = {"simulation": [2.0] * 5, "sysid": [1.0, 1.0, 2.0, 1.0, 2.2], "resphys": [0.7, 0.8, 1.2, 0.7, 1.54]}
+        said = said_of("resphys", gains(errors, {"resphys": [3]}))
+        assert "leaves 31 % (90 %: 2" in said
+        assert said.endswith("less error than SysID on 5 trials (mean 1.44 to 0.988 mm): it helps.")
+        said = said_of("sysid", gains({**errors, "simulation": [2.0, 0.8, 2.0, 2.0, 2.0]}, {}))
+        assert "on 5 trials (mean 1.76 to 1.44 mm)" in said
         assert said.endswith("other trials may show the opposite.")
+
+    def test_fewer_than_five_trials_give_their_errors_and_no_interval(self):
+        errors = {"sysid": [1.0, 1.0, 2.0], "resphys": [0.7, 0.8, 1.2]}
+        said, few = gains(errors, {"resphys": [3]})
+        assert said == (
+            "The learned force (ResPhys) leaves 32 % less error than SysID on 3 trials (1, 1 and 2 to 0.7, 0.8 and 1.2 "
+            "mm)."
+        )
+        assert few.startswith("These gains rest on 3 held-out trials, and others may differ")
 
     def test_what_was_published_of_it_stands_beside_it(self):
         errors = {"sysid": [2.0, 2.0], "resphys": [2.1, 2.1]}
@@ -72,20 +82,20 @@ class TestGains:
     @pytest.mark.parametrize(
         ("after", "said"),
         [
-            ([0.9, 1.2, 0.8], f"leaves 3 % (90 %: {MINUS}20 to 20) less error than SysID on 3 trials"),
-            ([1.1, 1.3, 0.9], f"leaves 10 % (90 %: {MINUS}10 to 30) more error than SysID on 3 trials"),
-            ([1.2, 1.3, 1.1], "leaves 20 % (90 %: 10 to 30) more error than SysID on 3 trials"),
-            ([0.5, None, 0.6], "fails: 1 of 3 held-out roll-outs diverged."),
+            ([0.9, 1.2, 0.8, 0.9, 1.0], f"leaves 4 % (90 %: {MINUS}11 to 16) less error than SysID on 5 trials"),
+            ([1.1, 1.3, 0.8, 1.1, 1.1], f"leaves 8 % (90 %: {MINUS}8 to 22) more error than SysID on 5 trials"),
+            ([1.2, 1.3, 1.1, 1.2, 1.2], "leaves 20 % (90 %: 14 to 26) more error than SysID on 5 trials"),
+            ([0.5, None, 0.6, 0.5, 0.5], "fails: 1 of 5 held-out roll-outs diverged."),
         ],
     )
     def test_what_does_not_help_is_said_too(self, after, said):
-        errors = {"sysid": [1.0, 1.0, 1.0], "simulation": [1.0, 1.0, 1.0], "resphys": after}
+        errors = {"sysid": [1.0] * 5, "simulation": [1.0] * 5, "resphys": after}
         sentence = said_of("resphys", gains(errors, {"resphys": [1]}))
         assert said in sentence
-        assert sentence.endswith("does harm.") == (after == [1.2, 1.3, 1.1])
+        assert sentence.endswith("does harm.") == (after == [1.2, 1.3, 1.1, 1.2, 1.2])
 
     def test_trials_of_very_different_errors_do_not_hide_a_gain_on_each(self):
-        errors = {"simulation": [0.1, 3.0, 1.0], "resphys": [0.00001, 0.0006, 0.0001]}
+        errors = {"simulation": [0.1, 3.0, 1.0, 1.0, 2.0], "resphys": [0.00001, 0.0006, 0.0001, 0.0001, 0.0004]}
         said = said_of("resphys", gains(errors, {}))
         assert "99.98 % (90 %: 99.98 to 99.99) less" in said
         assert said.endswith("it helps.")
@@ -105,11 +115,61 @@ class TestGains:
         errors = {"simulation": [1.0, 2.0], "sysid": [0.7, 1.4], "resphys": [0.7, 1.4]}
         assert "adds nothing to SysID" in said_of("resphys", gains(errors, {"resphys": [0, 0]}))
         assert "In 1 of 2 folds no epoch" in said_of("resphys", gains(errors, {"resphys": [0, 2]}))
-        means = {model: summary(sum(each) / 2) for model, each in errors.items()}
-        assert best(means, untrained({"resphys": [0, 0], "simfree": [4, 0]})) == "sysid"
-        assert best({**means, "resphys": summary(0.6)}) == "resphys"
-        assert best({"simulation": summary(1.0), "resphys": summary(2.0), "published": summary(0.1)}) == "simulation"
-        assert best({"resphys": summary(None)}) == ""
+        assert recommended(errors, untrained({"resphys": [0, 0], "simfree": [4, 0]})) == "sysid"
+
+
+class TestRecommendation:
+    ERRORS: ClassVar = {
+        "rest": [9.0, 8.0, 9.0, 10.0, 9.0],
+        "interpolation": [1.1, 1.0, 1.2, 1.1, 1.0],
+        "simulation": [3.0] * 5,
+        "sysid": [0.6, 0.5, 0.7, 0.6, 0.5],
+        "resphys": [0.4, 0.5, 0.5, 0.4, 0.3],
+        "reconstruction": [0.01] * 5,  # Fitted to these trials.
+    }
+
+    def test_the_best_corrected_model_stands_beside_the_best_of_all_others(self):
+        first, second = recommendation(self.ERRORS)
+        assert first.startswith("On 5 trials the best corrected model, ResPhys, leaves 61 % (90 %: ")
+        assert first.endswith(
+            "less error than the best of all others, interpolation between the training trials, which needs no physics "
+            "(mean 1.08 to 0.42 mm): it helps."
+        )
+        assert second == "Recommended: ResPhys."
+
+    def test_where_no_physics_is_needed_that_is_said(self):
+        first, second = recommendation({**self.ERRORS, "regression": [0.1, 0.2, 0.1, 0.1, 0.1]})
+        assert "more error than the best of all others, kernel regression over the training trials" in first
+        assert first.endswith(": such trials need no simulator.")
+        assert second.startswith("Recommended: kernel regression over the training trials. It is for trials like")
+
+    def test_a_gain_that_other_draws_do_not_show_is_not_recommended(self):
+        errors = {**self.ERRORS, "resphys": [0.5, 0.6, 0.5, 0.5, 0.6]}
+        assert recommended(errors) == "sysid"
+        first, second = recommendation(errors)
+        assert first.endswith(": it helps.")  # Beside the best without a correction.
+        assert "SysID, the simplest model that these trials do not show to be worse than the best, ResPhys" in second
+
+    def test_a_harmful_correction_is_called_so(self):
+        first, second = recommendation({"simulation": [1.0] * 5, "resphys": [2.0, 2.1, 2.0, 2.2, 2.0]})
+        assert first.endswith(": it does harm.")
+        assert second == "Recommended: the uncorrected simulation."
+
+    def test_few_trials_give_their_errors_and_no_claim(self):
+        errors = {model: values[:2] for model, values in self.ERRORS.items()}
+        first, second = recommendation(errors)
+        assert "(1.1 and 1 to 0.4 and 0.5 mm)" in first
+        assert "helps" not in first
+        assert "90 %" not in first
+        assert second == "Recommended: ResPhys."
+
+    def test_a_model_that_diverged_and_an_untrained_one_are_not_compared(self):
+        errors = {**self.ERRORS, "interpolation": [1.0, None, 1.0, 1.0, 1.0]}
+        first, _ = recommendation(errors, {"resphys"})
+        assert "the best corrected model, SysID" in first
+        assert "the uncorrected simulation (mean 3 to 0.58 mm)" in first
+        assert recommended({"resphys": [None]}) == ""
+        assert recommendation({"resphys": [1.0]}) == []
 
 
 class TestAdvice:
@@ -165,7 +225,11 @@ def test_conclusions_of_folds_and_of_one_split():
     metrics = {"folds": {"a": fold(2.0, 1.0, 1.0, 0, 2e6), "b": fold(2.0, 1.2, 0.6, 3, 3e5)}}
     assert epochs_kept(metrics) == {"resphys": [0, 3]}
     sentences = conclusions(metrics, SETTINGS)
-    assert "leaves 45 % (90 %: 40 to 50) less" in said_of("sysid", sentences)
+    assert "leaves 45 % less" in said_of("sysid", sentences)
+    assert headline(metrics, SETTINGS)[0] == (
+        "On 2 trials the best corrected model, ResPhys, leaves 60 % less error than the best of all others, the "
+        "uncorrected simulation (2 and 2 to 1 and 0.6 mm)."
+    )
     assert "In 1 of 2 folds no epoch of its training was kept." in said_of("resphys", sentences)
     for said in ("In 1 of 2 folds, youngs_modulus", "In 2 of 2 folds, poissons_ratio"):
         assert any(sentence.startswith(said) for sentence in sentences)

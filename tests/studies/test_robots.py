@@ -12,6 +12,7 @@ from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
+from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.page import NONE, error_parts
 from warp_resphys.studies.reproduction import reproduce
 from warp_resphys.studies.robot_results import Measured, summary, verdict
@@ -60,9 +61,11 @@ def test_a_robot_has_a_row_a_picture_and_what_was_tested(finished):
         row = next(line for line in text.splitlines() if line.startswith("| SoPrA |"))
         cells = [cell.strip() for cell in row.split("|")[1:-1]]
         means = [error_parts(metrics["errors_mm"][m])[0] for m in ("simulation", "sysid", "simfree", "resphys")]
-        assert [cell.split()[0] for cell in cells[1:5]] == means
+        assert [cell.split()[0] for cell in cells[2:6]] == means
+        plain = {model: metrics["errors_mm"][model]["mean"] for model in BASELINES if model in metrics["errors_mm"]}
+        assert cells[1].startswith(error_parts(metrics["errors_mm"][min(plain, key=plain.get)])[0])
         share = 1.0 - metrics["errors_mm"]["sysid"]["mean"] / metrics["errors_mm"]["simulation"]["mean"]
-        assert cells[5].replace("\N{MINUS SIGN}", "-").startswith(f"{100.0 * share:.0f} % (")
+        assert cells[6].replace("\N{MINUS SIGN}", "-") == f"{100.0 * share:.0f} %"
         assert "Tested on 2 trials, held out: " in text
         assert "A finer mesh moves the markers of the identified simulator by " in text
         assert "Tentacle: no folder tentacle" in text
@@ -83,6 +86,7 @@ def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch)
     other = {
         **known["sopra"],
         "day": "2020-02-02",
+        "beside": None,
         "errors_mm": {"sysid": {**known["sopra"]["errors_mm"]["sysid"], "mean": 77.7}},
     }
     old = {**known["sopra"], "day": "2019-01-01", "seconds": 1.0}
@@ -95,7 +99,7 @@ def test_robots_of_earlier_runs_keep_their_rows(finished, tmp_path, monkeypatch)
     assert "2020-02-02" in page
     assert "2019-01-01" not in page
     row = next(line for line in page.splitlines() if line.startswith("| Fish tail |"))
-    assert "77.7" in row.split("|")[3]
+    assert "77.7" in row.split("|")[4]
     assert Path("docs/robots/fish_tail.png").is_file()
 
 
@@ -130,14 +134,16 @@ def measured(*gain):
 def test_a_force_helps_where_the_whole_interval_of_several_trials_does():
     robots = settings_of(Reproduction, "reproduce").robots
     names = list(robots)[:4]
-    gains = [(0.5, 0.2, 0.7, 4), (0.5, -0.1, 0.7, 4), (0.5, 0.5, 0.5, 1), ()]
+    gains = [(0.5, 0.2, 0.7, 5), (0.5, -0.1, 0.7, 5), (0.5, 0.4, 0.6, 4), ()]
     rows = {name: measured(*gain) for name, gain in zip(names, gains, strict=True)}
     assert [row.is_helped for row in rows.values()] == [True, False, False, False]
-    assert f"on 1 of 4 robots ({robots[names[0]].title})." in verdict(robots, rows)
+    said = verdict(robots, rows)
+    assert f"identification on 1 of 4 robots ({robots[names[0]].title})." in said
+    assert "everything else (uncorrected, a network alone, without physics) on 0 of 4 robots, and" in said
     (table,) = summary(robots, rows, failed=[names[1]]).blocks
     assert [row.head for row in table.rows] == [robots[name].title for name in names]
     texts = ["50 % (20 to 70)", "50 % (\N{MINUS SIGN}10 to 70)", "50 %", NONE]
-    assert [row.cells[5].text for row in table.rows] == texts
+    assert [row.cells[6].text for row in table.rows] == texts
     assert [row.small.endswith("failed since 2026-01-02") for row in table.rows] == [False, True, False, False]
 
 

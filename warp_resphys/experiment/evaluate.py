@@ -3,6 +3,8 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from statistics import mean, pstdev
@@ -18,21 +20,25 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.intervals import LEVEL, Intervals
+from ..learning.baselines import BASELINES
+from ..learning.intervals import LEVEL, Covered, Intervals, Predicted, coverage
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
 from ..learning.replay import Start
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
 from ..stepping.state import State
 from .build import finer
+from .driving import since_change
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, read_dataset, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, read_dataset, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
+from .spread import parameter_spread
+from .without_physics import without_physics
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals
+INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals, beside the baselines
 _FILM_FRAMES = 256  # maximum
 _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
@@ -50,24 +56,30 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     work_on([*chain(*parts.values(), *calibrating.values())], _rolled_out, workers)
     order = [*chain(*experiment.batches(names))]
     rows = [order.index(name) for name in names]
-    observed = {model: _all_observed(experiment, model, its_parts)[rows] for model, its_parts in parts.items()}
+    observed, plain = without_physics(experiment, names)
+    observed |= {model: _all_observed(experiment, model, its_parts)[rows] for model, its_parts in parts.items()}
+    spreads = _spreads(experiment, settings.groups["1"])
     shown = _film_steps(int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6))
     attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
+            if model not in parts:
+                continue
             bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings.time_step / experiment.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
+        for model, spread in spreads.items():
+            create(file, f"{model}_spread", spread, "m^2", time_axis=1)
     left = {
         model: np.concatenate([part.read("left")[:, -1] for part in its_parts])[rows]
         for model, its_parts in parts.items()
         if model in LEARNED and settings.range_guard
     }
-    errors = summary(context, experiment, settings.groups, observed, left)
+    errors = summary(context, experiment, settings.groups, observed, left) | {"baselines": plain}
     if settings.calibration:
-        errors |= _intervals(experiment, calibrating, observed)
+        errors |= _intervals(experiment, calibrating, observed, spreads)
     write_json(context.run_dir / ERRORS, errors)
     remove_parts(context)
 
@@ -98,24 +110,54 @@ def _all_observed(experiment: Experiment, model: str, parts: Sequence[TrialPart]
     return padded([_observed(experiment, model, part) for part in parts], experiment.dataset.observed.shape[1])
 
 
+def _spreads(experiment: Experiment, names: Sequence[str]) -> dict[str, FloatArray]:
+    """Variances (R, T, M) of markers due to the identified parameters [m^2], by model, see `parameter_spread`."""
+    if experiment.dataset.bound is None:
+        return {}
+    made: dict[str, FloatArray | None] = {}
+    own: dict[str, FloatArray] = {}
+    for model in INTERVAL_MODELS:
+        if model in experiment.models and model != SIMFREE:
+            kind = experiment.sources(model)[0]
+            made[kind] = made[kind] if kind in made else parameter_spread(experiment, model, names)
+            own |= {} if (spread := made[kind]) is None else {model: spread}
+    return own
+
+
 def _intervals(
-    experiment: Experiment, calibrating: Mapping[str, Sequence[TrialPart]], tested: Mapping[str, FloatArray]
+    experiment: Experiment,
+    calibrating: Mapping[str, Sequence[TrialPart]],
+    tested: Mapping[str, FloatArray],
+    spreads: Mapping[str, FloatArray],
 ) -> dict[str, Any]:
-    """Prediction intervals by model and their coverage of the test trials, see `learning.intervals`."""
+    """Prediction intervals by model and their coverage of the test trials, see `learning.intervals`.
+
+    Those of a robot, which does not know the variance due to the parameters, are `without_spread`.
+    """
     settings, rest = experiment.settings, experiment.dataset.bound
     assert isinstance(settings, EvaluateStage)
     assert rest is not None
     names = [*chain(*experiment.batches(settings.calibration))]
     observed = experiment.dataset.observed[experiment.dataset.rows(names)]
-    target = _counted(experiment, settings.groups["1"])
+    test = settings.groups["1"]
+    target = _counted(experiment, test)
+    predicted = partial(_predicted, experiment.dataset)
     learned = [row for row, name in enumerate(names) if name in settings.split.train]
     observed[learned, experiment.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     models: dict[str, Any] = {}
-    for model, parts in calibrating.items():
-        intervals = Intervals.calibrated(list(_all_observed(experiment, model, parts)), list(observed), rest)
-        if intervals is not None:
-            coverage = intervals.coverage(list(tested[model][: len(target)]), list(target), rest)
-            models[model] = {**intervals.plain(), **coverage}
+    simulated, _ = without_physics(experiment, names, left_out=True)
+    simulated |= {model: _all_observed(experiment, model, parts) for model, parts in calibrating.items()}
+    calibrating_spreads = _spreads(experiment, names)
+    for model in (model for model in simulated if model in tested):
+        trials = predicted(names, [*simulated[model]], [*observed], calibrating_spreads.get(model))
+        intervals = Intervals.calibrated(trials, rest)
+        if intervals is None:
+            continue
+        new = predicted(test, [*tested[model]], [*target], spreads.get(model))
+        covered = [intervals.covered(trial, rest) for trial in new]
+        models[model] = {**intervals.plain(), **coverage(covered), "by_trial": _by_trial(test, covered)}
+        alone = Intervals.calibrated([replace(trial, spread=None) for trial in trials], rest)
+        models[model] |= {"without_spread": alone.plain()} if model in spreads and alone is not None else {}
     split = "training" if learned else "validation"
     return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
 
@@ -157,29 +199,54 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
         return {}
     target = list(data.observed[data.rows(names)])
     models: dict[str, Any] = {}
-    for model in INTERVAL_MODELS:
-        simulated = []
+    for model in (*BASELINES, *INTERVAL_MODELS):
+        simulated, spreads = list[FloatArray](), list[FloatArray]()
         for folder in folders.values():
             with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
                 simulated += [read_array(file, f"{model}_observed")[0]] if f"{model}_observed" in file else []
+                spreads += [read_array(file, f"{model}_spread")[0]] if f"{model}_spread" in file else []
         if len(simulated) < len(names):
             continue
-        coverage = []
-        for out in range(len(names)):
-            others, observed = (series[:out] + series[out + 1 :] for series in (simulated, target))
-            intervals = Intervals.calibrated(others, observed, data.bound)
-            coverage += [] if intervals is None else [intervals.coverage([simulated[out]], [target[out]], data.bound)]
-        if len(coverage) == len(names):
-            models[model] = {key: mean(fold[key] for fold in coverage) for key in coverage[0]}
+        trials = _predicted(data, names, simulated, target, spreads if len(spreads) == len(names) else None)
+        covered = list[Covered]()
+        for out, trial in enumerate(trials):
+            intervals = Intervals.calibrated(trials[:out] + trials[out + 1 :], data.bound)
+            covered += [] if intervals is None else [intervals.covered(trial, data.bound)]
+        if len(covered) == len(names):
+            models[model] = {**coverage(covered), "by_trial": _by_trial(names, covered)}
     return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
+
+
+def _predicted(
+    dataset: Dataset,
+    names: Sequence[str],
+    simulated: Sequence[FloatArray],
+    observed: Sequence[FloatArray],
+    spreads: Sequence[FloatArray] | NDArray[np.float64] | None = None,
+) -> list[Predicted]:
+    """Trials as they were predicted and observed."""
+    rows = zip(simulated[: len(names)], observed, since_change(dataset, names), strict=True)
+    known = [None] * len(names) if spreads is None else spreads
+    return [Predicted(*row, spread) for row, spread in zip(rows, known, strict=True)]
+
+
+def _by_trial(names: Sequence[str], covered: Sequence[Covered]) -> dict[str, float]:
+    """Share of the coordinates inside their interval, by trial in which a marker was seen."""
+    return {n: float(own.inside.mean()) for n, own in zip(names, covered, strict=True) if len(own.inside)}
 
 
 def _film_trial(experiment: Experiment, names: Sequence[str]) -> str:
     """The test trial with the largest motion, of which bodies are drawn."""
+    amplitudes = _amplitudes(experiment, names)
+    return max(names, key=lambda name: amplitudes[name])
+
+
+def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
+    """Root mean square displacement of the observed points [m], by trial."""
     amplitudes: dict[str, float] = {}
     for batch in experiment.batches(names):
         amplitudes |= dict(zip(batch, experiment.trials(batch).amplitude.tolist(), strict=True))
-    return max(names, key=lambda name: amplitudes[name])
+    return amplitudes
 
 
 def _film_steps(steps: int) -> IntArray:
@@ -214,9 +281,13 @@ def summary(
         models["reconstruction"] = _reconstructed(context, names)
     test = {model: values[:count] for model, values in models.items()}
     errors = {model: _errors(x, observed, first) for model, x in test.items()}
+    amplitudes = {name: 1e3 * size for name, size in _amplitudes(experiment, names).items()}
     content: dict[str, Any] = {
         "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
-        "per_trajectory": summarise_trajectories(tuple(names), errors),
+        "per_trajectory": [
+            {**row, "amplitude_mm": amplitudes[row["name"]], **_thirds(errors, number)}
+            for number, row in enumerate(summarise_trajectories(tuple(names), errors))
+        ],
     }
     if dataset.bound is None:
         target = test["reconstruction"]
@@ -241,6 +312,14 @@ def summary(
             }
     sideways = _sideways(experiment, names)
     return {**content, **({"sideways_mm": sideways} if sideways else {})}
+
+
+def _thirds(errors: Mapping[str, Sequence[FloatArray]], number: int) -> dict[str, dict[str, list[float]]]:
+    """Mean errors in the thirds of a trial's frames [mm], by model whose roll-out is defined; empty for a pose."""
+    own = {model: rows[number] for model, rows in errors.items() if np.isfinite(rows[number]).all()}
+    parts = {model: np.array_split(row, 3) for model, row in own.items() if len(row) >= 3}
+    means = {model: [float(part.mean()) for part in series] for model, series in parts.items()}
+    return {"thirds_mm": means} if means else {}
 
 
 def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -> list[FloatArray]:

@@ -23,12 +23,22 @@ from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import closest_points
-from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
+from ..report.data import (
+    MODELS,
+    Driven,
+    Film,
+    FollowedPath,
+    Recordings,
+    RunReport,
+    TrialResults,
+    models_in_figures,
+)
 from ..report.notes import error_notes, kept_note, material_note, network_note, published_note, target_note
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
+from .driving import since_change
 from .experiment import LEARNED
 from .files import (
     CONTROL,
@@ -206,13 +216,15 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         rolled = tuple(map(str, file.attrs["names"]))
         scaled = _read_scaled(folder)
         test = [name for name in rolled if scaled is None or name not in scaled.names]
-        models = [model for model in MODELS if f"{model}_observed" in file]
+        errors = read_json(folder / ERRORS)["errors_mm"]
+        models = [model for model in models_in_figures(errors) if f"{model}_observed" in file]
         unknown = sorted(set(test) - set(dataset.names))
         if unknown or not models:
             what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
             raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
         shape = (len(rolled), *dataset.observed.shape[1:])
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
+        spreads = {m: read_array(file, f"{m}_spread", shape[:-1])[: len(test)] for m in models if f"{m}_spread" in file}
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
     begins = tuple(dataset.begins[row] for row in rows)
@@ -232,6 +244,8 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         bound=bound,
         gravity=dataset.gravity,
         time_step=dataset.time_step,
+        since=since_change(dataset, test)[:, :length],
+        spreads={model: values[:, :length] for model, values in spreads.items()},
         **_seen(run, dataset),
     )
 

@@ -1,38 +1,45 @@
 """Predictions without physics of the trials of an experiment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..learning.baselines import PlainTrials, predictions
+from ..learning.baselines import BASELINES, REST, PlainTrials, predictions
+from .driving import driving
 from .experiment import Experiment
-from .files import GIVEN, STATIC
+from .files import GIVEN
 
 FloatArray = NDArray[np.float64]
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
 
 
-def without_physics(experiment: Experiment, names: Sequence[str]) -> tuple[dict[str, FloatArray], dict[str, str]]:
+def without_physics(
+    experiment: Experiment, names: Sequence[str], *, left_out: bool = False
+) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
+
+    Coordinates that no training trial shows stay at rest. A model that does not predict all frames of all trials, such
+    as interpolation after the end of the training, is left out.
 
     Args:
         experiment: the experiment.
         names: names of the R trials.
+        left_out: whether a trial is predicted without itself if it is a training trial.
 
     Returns:
-        By model: the observed points (R, T, M, 3) [m], NaN in trials for which there are no training trials, and the
-        settings in words.
+        By model: the observed points (R, T, M, 3) [m], and the settings in words.
     """
-    shape = experiment.dataset.observed.shape[1:]
+    shape = (len(names), *experiment.dataset.observed.shape[1:])
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
-    for batch in experiment.batches(names):
-        begins = experiment.begins(batch[0])
-        learned = [name for name in experiment.settings.split.train if experiment.begins(name) == begins]
+    for batch in _batches(experiment, names, left_out):
+        begins, without = experiment.begins(batch[0]), batch if left_out else ()
+        train = [name for name in experiment.settings.split.train if name not in without]
+        learned = [name for name in train if experiment.begins(name) == begins]
         if not learned:
             continue
         trials, asked = _motions(experiment, learned, batch)
@@ -40,26 +47,39 @@ def without_physics(experiment: Experiment, names: Sequence[str]) -> tuple[dict[
         if not len(trials.values):
             continue
         rows = [names.index(name) for name in batch]
-        for model, own in predictions(trials, asked).items():
-            values.setdefault(model, np.full((len(names), *shape), np.nan))[rows] = own.values.reshape(-1, *shape)
-            settings[model] = "; ".join(filter(None, (settings.get(model), own.settings)))
-    values = {model: own for model, own in values.items() if np.isfinite(own).any()}
-    return values, {model: settings[model] for model in values}
+        made = predictions(trials, asked)
+        for model, own in made.items():
+            shown = np.isfinite(own.values).any(1, keepdims=True)
+            known = np.where(shown, own.values, made[REST].values)
+            values.setdefault(model, np.full(shape, np.nan))[rows] = known.reshape(-1, *shape[1:])
+            settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
+    seen = np.isfinite(experiment.dataset.observed[experiment.dataset.rows(names)])
+    whole = [model for model in BASELINES if model in values and np.isfinite(values[model][seen]).all()]
+    return {model: values[model] for model in whole}, {model: settings[model] for model in whole}
+
+
+def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:
+    """Trials that begin in the same way; training trials by themselves if they are left out."""
+    alone = set(experiment.settings.split.train) if left_out else set()
+    for batch in experiment.batches(names):
+        yield from ([name] for name in batch if name in alone)
+        if others := [name for name in batch if name not in alone]:
+            yield others
 
 
 def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str]) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
     trials, others = (_observed(experiment, names) for names in (learned, asked))
     trials.values[:, experiment.learned_steps(trials.values.shape[1] - 1) + 1 :] = np.nan
-    driving = [_driving(experiment, names) for names in (learned, asked)]
+    acting = [driving(experiment.dataset, names) for names in (learned, asked)]
     known = [experiment.dataset.payload[experiment.dataset.rows(names)][:, None] for names in (learned, asked)]
     if experiment.begins(asked[0]) in ("released", GIVEN):  # at rest where the training ends
         ends = np.array([_end(own) for own in trials.values])
         at_rest = np.array([_mean(column) for column in ends.T])
         trials, others = (replace(own, origin=np.broadcast_to(at_rest, own.first.shape)) for own in (trials, others))
-    sizes = {name: _size(values) for name, values in driving[0].items()}
+    sizes = {name: _size(values) for name, values in acting[0].items()}
     made = []
-    for motions, inputs, loads in zip((trials, others), driving, known, strict=True):
+    for motions, inputs, loads in zip((trials, others), acting, known, strict=True):
         frames = [values / sizes[name] for name, values in inputs.items()]
         empty = np.zeros((*motions.values.shape[:2], 0))
         made.append(replace(motions, inputs=np.concatenate([empty, *frames], 2), known=loads / _size(known[0])))
@@ -90,18 +110,3 @@ def _observed(experiment: Experiment, names: Sequence[str]) -> PlainTrials:
         own[rows].reshape(len(rows), *own.shape[1:-2], -1).copy() for own in (dataset.observed, dataset.held)
     )
     return PlainTrials(values, first, first, np.zeros((*values.shape[:2], 0)), np.zeros((len(rows), 0)))
-
-
-def _driving(experiment: Experiment, names: Sequence[str]) -> Mapping[str, FloatArray]:
-    """(R, T, C) what acts during each frame, by input; a pose has the last values."""
-    dataset = experiment.dataset
-    rows = dataset.rows(names)
-    series = {name: values[rows] for name, values in dataset.inputs.items()}
-    series |= {} if dataset.base is None else {"base": dataset.base[rows]}
-    steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
-    if experiment.begins(names[0]) == STATIC:
-        steps = np.full_like(steps, np.iinfo(np.int64).max)
-    return {
-        name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)
-        for name, values in series.items()
-    }

@@ -17,6 +17,9 @@ from scipy.spatial.distance import cdist
 FloatArray = NDArray[np.float64]
 Kernel = Callable[[FloatArray, FloatArray], FloatArray]
 
+REST: Final = "rest"
+BASELINES: Final = (REST, "interpolation", "regression", "linear")  # names of the predictions
+
 _RIDGES: Final = (1e-8, 1e-4, 1e-2, 1e-1)  # of a regression, over the mean of the kernel's diagonal
 _WIDTHS: Final = (0.25, 0.5, 1.0, 2.0)  # of Gaussian kernels, over the median distance between trials
 _EXACT: Final = 1e-8  # ridge of an interpolation
@@ -91,7 +94,7 @@ def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction
         their place, with three trials or more. ``linear``: a linear state-space model with inputs (Proctor, Brunton and
         Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for motions.
     """
-    result = {"rest": Prediction(np.broadcast_to(asked.origin[:, None], asked.values.shape).copy())}
+    result = {REST: Prediction(np.broadcast_to(asked.origin[:, None], asked.values.shape).copy())}
     if np.ptp(trials.features(trials), axis=0).any():
         result["interpolation"] = _predicted(trials, asked, _spline, _EXACT, 0.0)
         if len(trials.values) > 2:

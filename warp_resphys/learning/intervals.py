@@ -5,37 +5,74 @@ error. So intervals are calibrated on the model's errors in trials that it was n
 prediction: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; scaled as by Lei et al. 2018).
 For trials of the same distribution they have the stated coverage, whatever the model.
 
-The half-width of a marker's coordinates is a quantile times a scale. The scale is either constant or grows with the
-marker's displacement, whichever gives the narrower intervals on the calibration trials.
+The half-width of a marker's coordinates is a quantile times a scale, the deviation of a normal distribution whose
+variance has a constant part and parts that grow with the square of the marker's displacement: one just after a change
+of the inputs, one soon after it, and one long after it; and, if it is known, the variance due to the posterior of the
+parameters, which grows outside of the training. The sizes of the parts are those of the largest likelihood.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
 
 FloatArray = NDArray[np.float64]
 
-LEVEL = 0.9
-_STANDING = 0.1  # scale of a marker at rest, relative to its mean displacement
-_LEVELS = 11  # number of quantiles that are tried, from the wanted level to the largest value
-_SCALES = ("constant", "displacement")
+LEVEL: Final = 0.9
+TIMES: Final = (0.1, 0.5)  # s after a change of the inputs: between just after, soon after and long after it
+_SAME: Final = 0.02  # change of an input that counts as none, over its largest size
+_LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
+_LEAST: Final = 1e-3  # of the mean variance: part that is always there
+_PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
+_SMALLEST: Final = -12.0  # logarithm of a part over the mean variance
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A predicted trial, and its observation.
+
+    Attributes:
+        simulated: (T, M, 3) [m].
+        observed: (T, M, 3) [m], NaN where a marker was not seen.
+        since: (T,) since the last change of the inputs [s]; infinite for a pose.
+        spread: (T, M) variance due to the posterior of the parameters [m^2]; None if it is not known.
+    """
+
+    simulated: FloatArray
+    observed: FloatArray
+    since: FloatArray
+    spread: FloatArray | None = None
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(T, M) whether a marker was seen."""
+        return np.asarray(np.isfinite(self.observed).all(-1))
+
+    @property
+    def errors(self) -> FloatArray:
+        """(T, M, 3) absolute errors [m], NaN where a marker was not seen."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return np.asarray(np.abs(self.simulated - self.observed))
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Half-widths of the intervals of M markers."""
+    """Half-widths of the intervals of M markers.
 
-    scale: str  # ``constant`` or ``displacement``
-    factor: tuple[float, ...]  # (M,) half-width [m] of a constant scale, or half-width over displacement
-    standing: tuple[float, ...]  # (M,) added to the displacement [m]
+    Attributes:
+        factor: (M,) half-width over the scale.
+        variance: constant part of the squared scale [m^2]; its parts over the squared displacement: just after, soon
+            after and long after a change of the inputs; and its part over the variance due to the parameters.
+    """
+
+    factor: tuple[float, ...]
+    variance: tuple[float, ...]
 
     @classmethod
-    def calibrated(
-        cls, simulated: Sequence[FloatArray], observed: Sequence[FloatArray], rest: FloatArray, level: float = LEVEL
-    ) -> "Intervals | None":
+    def calibrated(cls, trials: Sequence[Predicted], rest: FloatArray, level: float = LEVEL) -> "Intervals | None":
         """Calibrates intervals on trials that the model was not trained on; None if a roll-out diverged.
 
         The quantile is the lowest for which intervals from all trials but one have the wanted mean coverage on the
@@ -43,84 +80,186 @@ class Intervals:
         weight. Markers that are seen in no trial get the largest quantile of the others, without a guarantee.
 
         Args:
-            simulated: (T, M, 3) of each trial, by the model [m].
-            observed: (T, M, 3) [m], NaN where a marker was not seen.
+            trials: predicted by the model.
             rest: (M, 3) markers on the undeformed body [m].
             level: wanted coverage, a share of the coordinates.
         """
-        seen = [_seen(y) for y in observed]  # (T, M)
-        if not all(np.isfinite(x[visible]).all() for x, visible in zip(simulated, seen, strict=True)):
+        trials = [trial for trial in trials if trial.seen.any()]
+        if not trials or not all(np.isfinite(trial.simulated[trial.seen]).all() for trial in trials):
             return None
-        ever_seen = np.any([visible.any(0) for visible in seen], axis=0)
-        if not ever_seen.any():
-            return None
-        pairs = zip(simulated, seen, strict=True)
-        moved = [np.where(visible | ~ever_seen, np.linalg.norm(x - rest, axis=-1), np.nan) for x, visible in pairs]
-        standing = tuple((_STANDING * np.nanmean(np.concatenate(moved), axis=0)).tolist())
-        candidates = []
-        for scale in _SCALES:
-            widths = [cls(scale, tuple(np.ones(len(rest))), standing).half_widths(x, rest) for x in simulated]
-            scores = [np.abs(x - y) / w[..., None] for x, y, w in zip(simulated, observed, widths, strict=True)]
-            factor = _factor(scores, level)
-            factor[~ever_seen] = factor[ever_seen].max()
-            means = [(w * factor)[visible].mean() for w, visible in zip(widths, seen, strict=True) if visible.any()]
-            candidates.append((float(np.mean(means)), cls(scale, tuple(factor.tolist()), standing)))
-        return min(candidates, key=lambda candidate: candidate[0])[1]
+        parts = [_parts(np.linalg.norm(t.simulated - rest, axis=-1), t.since, t.spread) for t in trials]
+        errors = [trial.errors for trial in trials]
+        variance = _variance(parts, errors)
+        left_out = []
+        for out in range(len(trials) if len(trials) > 1 else 0):
+            others = [number for number in range(len(trials)) if number != out]
+            own = _variance([parts[k] for k in others], [errors[k] for k in others])
+            scores = [error / np.sqrt(part @ own)[..., None] for part, error in zip(parts, errors, strict=True)]
+            left_out.append((scores[out], [scores[k] for k in others]))
+        scores = [error / np.sqrt(part @ variance)[..., None] for part, error in zip(parts, errors, strict=True)]
+        factor = _quantiles(scores, _level(left_out, level))
+        factor[~np.isfinite(factor)] = factor[np.isfinite(factor)].max()
+        return cls(tuple(factor.tolist()), tuple(variance.tolist()))
 
-    def half_widths(self, simulated: FloatArray, rest: FloatArray) -> FloatArray:
-        """Half-widths (..., M) for the coordinates of simulated markers (..., M, 3) [m]."""
-        moved = np.linalg.norm(simulated - rest, axis=-1)
-        scale = np.ones_like(moved) if self.scale == "constant" else moved + np.array(self.standing)
-        return np.asarray(scale * np.array(self.factor))
+    def half_widths(
+        self, simulated: FloatArray, rest: FloatArray, since: ArrayLike | None = None, spread: FloatArray | None = None
+    ) -> FloatArray:
+        """Half-widths (..., M) for the coordinates of simulated markers.
+
+        Args:
+            simulated: (..., M, 3) [m].
+            rest: (M, 3) [m].
+            since: (...,) since the last change of the inputs [s]; None for the time at which intervals are widest.
+            spread: (..., M) variance due to the posterior of the parameters [m^2]; None for none.
+        """
+        moved, variance = np.linalg.norm(simulated - rest, axis=-1), np.array(self.variance)
+        if since is None:
+            variance[1:4] = variance[1:4].max()
+        times = np.zeros(moved.shape[:-1]) if since is None else np.asarray(since)
+        return np.asarray(np.sqrt(_parts(moved, times, spread) @ variance) * np.array(self.factor))
 
     def plain(self) -> dict[str, Any]:
         """Returns the intervals as JSON data."""
-        return {"scale": self.scale, "factor": list(self.factor), "standing": list(self.standing)}
+        return {"factor": list(self.factor), "variance": list(self.variance)}
 
     @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> "Intervals":
-        """Returns the intervals that `plain` wrote."""
-        return cls(plain["scale"], tuple(plain["factor"]), tuple(plain["standing"]))
+    def from_plain(cls, plain: Mapping[str, Any] | None) -> "Intervals | None":
+        """Returns the intervals that `plain` wrote; None without any, or for those of an earlier version."""
+        return cls(tuple(plain["factor"]), tuple(plain["variance"])) if plain and "variance" in plain else None
 
-    def coverage(
-        self, simulated: Sequence[FloatArray], observed: Sequence[FloatArray], rest: FloatArray
-    ) -> dict[str, Any]:
-        """Measures coverage and width on trials that were not used for calibration, all with equal weight.
+    def covered(self, trial: Predicted, rest: FloatArray) -> "Covered":
+        """Measures a trial that was not used for calibration.
 
         Args:
-            simulated: (T, M, 3) of each trial [m].
-            observed: (T, M, 3) [m], NaN where a marker was not seen.
+            trial: predicted by the same model.
             rest: (M, 3) [m].
-
-        Returns:
-            ``coverage``, the share of the seen coordinates inside their interval, and the mean ``half_width_mm``.
         """
-        inside, widths = [], []
-        for x, y in zip(simulated, observed, strict=True):
-            visible, width = _seen(y), self.half_widths(x, rest)
-            if visible.any():
-                with np.errstate(invalid="ignore"):
-                    inside.append(float((np.abs(x - y) <= width[..., None])[visible].mean()))
-                widths.append(float(width[visible].mean()))
-        return {"coverage": float(np.mean(inside)), "half_width_mm": 1e3 * float(np.mean(widths))}
+        seen, width = trial.seen, self.half_widths(trial.simulated, rest, trial.since, trial.spread)
+        with np.errstate(invalid="ignore"):
+            inside = (trial.errors <= width[..., None])[seen].mean(-1)
+        return Covered(inside, width[seen], np.linalg.norm(trial.simulated - rest, axis=-1)[seen])
 
 
-def _seen(observed: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(observed).all(-1))
+@dataclass(frozen=True)
+class Covered:
+    """Intervals at the K seen markers and frames of a trial.
+
+    Attributes:
+        inside: (K,) share of the coordinates inside their interval.
+        half_widths: (K,) [m].
+        moved: (K,) predicted displacement [m].
+    """
+
+    inside: FloatArray
+    half_widths: FloatArray
+    moved: FloatArray
 
 
-def _factor(scores: Sequence[FloatArray], level: float) -> FloatArray:
-    """(M,) factors with which intervals have the wanted coverage, from scaled deviations (T, M, 3) of each trial."""
-    for quantile in np.linspace(level, 1.0, _LEVELS) if len(scores) > 1 else ():
-        covered = []
-        for number, left_out in enumerate(scores):
-            factor = _quantiles([*scores[:number], *scores[number + 1 :]], float(quantile))
-            seen = np.isfinite(left_out)
-            if seen.any():
-                covered.append(float((left_out <= factor[:, None])[seen].mean()))
-        if np.mean(covered) >= level:
-            return _quantiles(scores, float(quantile))
-    return _quantiles(scores, 1.0)
+def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatArray:
+    """Returns the times since the last change of the inputs of B trials [s]; infinite for poses.
+
+    An input changes where it leaves the value that it took at its last change by more than 2 % of its largest size in
+    the trial, so that noise is no change. The first frame counts as one.
+
+    Args:
+        times: (T, B) [s]; a trial of one frame is a pose.
+        inputs: (T, B, C) of each kind; none for bodies that are let go.
+    """
+    if len(times) == 1:
+        return np.full_like(times, np.inf)
+    last = np.broadcast_to(times[0], times.shape).copy()
+    for values in inputs:
+        limit, kept, changed = _SAME * np.abs(values).max(0), values[0].copy(), times[0].copy()
+        for frame in range(1, len(times)):
+            leaves = np.abs(values[frame] - kept) > limit
+            kept = np.where(leaves, values[frame], kept)
+            changed = np.where(leaves.any(-1), times[frame], changed)
+            last[frame] = np.maximum(last[frame], changed)
+    return np.asarray(times - last)
+
+
+def coverage(trials: Sequence[Covered]) -> dict[str, Any]:
+    """Summarises trials with equal weight; those without a seen marker are left out.
+
+    Returns:
+        ``coverage``, the share of the coordinates inside their interval; the mean ``half_width_mm``; ``by_amplitude``,
+        the coverage in the thirds of the predicted displacements, from the smallest.
+    """
+    trials = [trial for trial in trials if len(trial.inside)]
+    weights = np.concatenate([np.full(len(trial.inside), 1.0 / len(trial.inside)) for trial in trials])
+    inside, widths, moved = (
+        np.concatenate([getattr(trial, name) for trial in trials]) for name in ("inside", "half_widths", "moved")
+    )
+    order = np.argsort(moved)
+    thirds = np.array_split(order, np.searchsorted(np.cumsum(weights[order]), len(trials) * np.array([1, 2]) / 3.0))
+    return {
+        "coverage": float(np.average(inside, weights=weights)),
+        "half_width_mm": 1e3 * float(np.average(widths, weights=weights)),
+        "by_amplitude": [float(np.average(inside[own], weights=weights[own])) if len(own) else None for own in thirds],
+    }
+
+
+def _parts(moved: FloatArray, since: FloatArray, spread: FloatArray | None) -> FloatArray:
+    """(..., M, 5) parts of a variance.
+
+    Args:
+        moved: (..., M) displacements [m].
+        since: (...,) since a change of the inputs [s].
+        spread: (..., M) due to the parameters [m^2]; None for none.
+    """
+    just, soon = (np.exp(-since / time)[..., None] for time in TIMES)
+    squares, own = moved**2, np.zeros_like(moved) if spread is None else spread
+    return np.stack([np.ones_like(moved), just * squares, (soon - just) * squares, (1.0 - soon) * squares, own], -1)
+
+
+def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> FloatArray:
+    """(5,) sizes of the parts of the variance, those of the largest likelihood of normal errors.
+
+    The part due to the parameters counts at least once.
+
+    Args:
+        parts: (T, M, 5) of each trial.
+        errors: (T, M, 3) of each trial [m], NaN where a marker was not seen.
+    """
+    seen = [np.isfinite(error).all(-1) for error in errors]
+    rows = np.concatenate([part[visible] for part, visible in zip(parts, seen, strict=True)])
+    squares = np.concatenate([np.square(e[visible]).mean(-1) for e, visible in zip(errors, seen, strict=True)])
+    weights = np.concatenate([np.full(count, 1.0 / (count * len(seen))) for count in map(np.count_nonzero, seen)])
+    mean, sizes = max(float(weights @ squares), np.finfo(float).tiny), weights @ rows
+    used = np.flatnonzero(sizes > 0.0)
+    columns, relative, least = rows[:, used] / sizes[used], squares / mean, rows[:, -1] / mean + _LEAST
+
+    def loss(logarithms: FloatArray) -> tuple[float, FloatArray]:
+        own = np.exp(logarithms)
+        variance = columns @ own + least
+        slope = weights * (1.0 / variance - relative / variance**2)
+        value = weights @ (np.log(variance) + relative / variance) + _PENALTY * own.sum()
+        return float(value), (slope @ columns + _PENALTY) * own
+
+    starts = (np.full(len(used), value) for value in (-np.log(len(used)), -3.0))
+    bounds = [(_SMALLEST, 3.0)] * len(used)
+    found = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+    result = np.zeros(len(sizes))
+    result[used] = mean * np.exp(min(found, key=lambda end: float(end.fun)).x) / sizes[used]
+    result[[0, -1]] += _LEAST * mean, 1.0
+    return result
+
+
+def _level(left_out: Sequence[tuple[FloatArray, Sequence[FloatArray]]], level: float) -> float:
+    """The lowest level of quantiles that cover trials left out as wanted; one if there is none.
+
+    Args:
+        left_out: scaled errors (T, M, 3) of each trial, and those of all others with the same scale.
+        level: wanted mean coverage.
+    """
+
+    def covered(quantile: float, out: FloatArray, others: Sequence[FloatArray]) -> float:
+        return float((out <= _quantiles(others, quantile)[:, None])[np.isfinite(out)].mean())
+
+    for quantile in np.linspace(level, 1.0, _LEVELS) if left_out else ():
+        if np.mean([covered(float(quantile), *trial) for trial in left_out]) >= level:
+            return float(quantile)
+    return 1.0
 
 
 def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:

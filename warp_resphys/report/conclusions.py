@@ -12,7 +12,8 @@ from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
 from .data import other_trials
 from .notes import in_a_row
-from .page import MINUS, MOST_PERCENT, number_text, significant
+from .page import significant
+from .recommendation import LEAST_TRIALS, compared, means_text, outcome, recommendation
 
 # By model: its name in sentences, and the models that it may extend, of which the first available one is compared.
 _STEPS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
@@ -29,7 +30,6 @@ _LEARNED: Final = ("simfree", "resphys")  # With published gains; the published 
 _CLOSE: Final = 1e-4  # Distance from a bound or the first guess that counts as none, over a parameter's range.
 _REFINED: Final = "_refined"  # Suffix of a network refined through the simulator.
 INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
-_TINY: Final = 1e-4  # Errors [mm] below which Python writes an exponent.
 _CALIBRATED: Final[Mapping[str, str]] = {  # Source of prediction intervals.
     "validation": "its errors on the validation trials",
     "training": "its errors on the training trials, which tend to be too small",
@@ -58,6 +58,14 @@ def conclusions(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
     )
     sentences = laws_unused(folds) + sentences + intervals_text(metrics)
     return sentences + advice([_identified(fold, settings.identify) for fold in folds])
+
+
+def headline(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
+    """Return sentences on the best corrected model beside the best of all others, and on the recommended one."""
+    idle = untrained(epochs_kept(metrics))
+    inside, outside = _errors_by_load(metrics, other_trials(settings))
+    sentences = recommendation(inside or outside, idle)
+    return sentences + (recommendation(outside, idle, "outside of the training loads") if inside and outside else [])
 
 
 def laws_unused(folds: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -140,10 +148,9 @@ def _errors_by_load(
     return inside, outside
 
 
-def held_out(metrics: Mapping[str, Any]) -> list[Mapping[str, float | None]]:
-    """Return the errors of all models on each held-out trial [mm]."""
-    folds = list(metrics.get("folds", {}).values()) or [metrics]
-    return [row["errors_mm"] for fold in folds for row in fold.get("per_trajectory", ())]
+def trial_errors(metrics: Mapping[str, Any]) -> dict[str, list[float | None]]:
+    """Return the errors on each held-out trial [mm], by model that all folds have; None where a roll-out diverged."""
+    return _errors_by_load(metrics, ())[0]
 
 
 def intervals_text(metrics: Mapping[str, Any]) -> list[str]:
@@ -155,9 +162,14 @@ def intervals_text(metrics: Mapping[str, Any]) -> list[str]:
                 f"Prediction intervals of {name}, from {_CALIBRATED[intervals['calibrated_on']]}: "
                 f"{100.0 * intervals['level']:.0f} % of the measured coordinates should lie within ± "
                 f"{of_model['half_width_mm']:.2g} mm, on average, of the prediction; "
-                f"{100.0 * of_model['coverage']:.0f} % do."
+                f"{100.0 * of_model['coverage']:.0f} % do{_by_amplitude(of_model.get('by_amplitude', ()))}."
             ]
     return []
+
+
+def _by_amplitude(shares: Sequence[float | None]) -> str:
+    known = [f"{100.0 * share:.0f}" for share in shares if share is not None]
+    return f" ({in_a_row(known)} % from the smallest to the largest third of the displacements)" if known else ""
 
 
 def epochs_kept(metrics: Mapping[str, Any]) -> dict[str, list[int]]:
@@ -176,13 +188,6 @@ def untrained(epochs: Mapping[str, Sequence[int]]) -> set[str]:
     return {model for model, counts in epochs.items() if counts and not any(counts)}
 
 
-def best(errors: Mapping[str, Any], without: Collection[str] = ()) -> str:
-    """Return our model of least mean error, the simplest of equal ones, without those in `without`."""
-    means = {m: errors[m]["mean"] for m in ("simulation", *_STEPS) if m in errors and m not in without}
-    defined = {m: mean for m, mean in means.items() if mean is not None}
-    return min(defined, key=lambda m: defined[m], default="")
-
-
 def gains(
     errors: Mapping[str, Sequence[float | None]],
     epochs: Mapping[str, Sequence[int]],
@@ -192,7 +197,7 @@ def gains(
     """Return a sentence on each step: its gain on held-out trials, and whether it is significant.
 
     The gain is the share of the mean error that a step removes, with its 90 % interval, by
-    `learning.metrics.paired_gain`.
+    `learning.metrics.paired_gain`; with fewer than five trials their errors stand in its place.
 
     Args:
         errors: Of each model on the same held-out trials [mm], None where its roll-out diverged.
@@ -205,9 +210,8 @@ def gains(
         base = next((candidate for candidate in bases if candidate in errors), None)
         if model not in errors or base is None:
             continue
-        compared = model in _LEARNED and {model, base} <= theirs.keys()
         beside = ""
-        if compared:
+        if model in _LEARNED and {model, base} <= theirs.keys():
             ratio = theirs[model].mean / theirs[base].mean
             beside = f"; published: {100.0 * abs(1.0 - ratio):.1f} % {'less' if ratio <= 1.0 else 'more'}"
         kept = list(epochs.get(model, ()))
@@ -215,8 +219,9 @@ def gains(
         if outside and not (kept and not any(kept)):
             sentence += _gain_outside(_BASES[base], outside[model], outside[base])
         sentences.append(sentence[0].upper() + sentence[1:])
-    if sentences and all(len(values) == 1 for values in errors.values()):
-        sentences.append("These gains rest on one held-out trial, and others may differ: test on more.")
+    if sentences and (count := max(map(len, errors.values()))) < LEAST_TRIALS:
+        few = f"{count} held-out trials" if count > 1 else "one held-out trial"
+        sentences.append(f"These gains rest on {few}, and others may differ: test on {LEAST_TRIALS} or more.")
     return sentences
 
 
@@ -238,7 +243,7 @@ def _gain(
         return f"{name} cannot be compared with {base}, which diverged or has no error on held-out trials.{idle}"
     gain, means = _gain_and_means(pairs, published)
     many = f" on {gain.trials} trials" if gain.trials > 1 else ""
-    return f"{name} {_compared(gain, base)}{many} ({means}){_outcome(gain)}.{idle}"
+    return f"{name} {compared(gain, base)}{many} ({means}){outcome(gain)}.{idle}"
 
 
 def _gain_outside(base: str, after: Sequence[float | None], before: Sequence[float | None]) -> str:
@@ -251,41 +256,12 @@ def _gain_outside(base: str, after: Sequence[float | None], before: Sequence[flo
     if len(pairs) < count:
         return f"{where}, it cannot be compared with {base}."
     gain, means = _gain_and_means(pairs)
-    return f"{where} it {_compared(gain, base)} ({means}){_outcome(gain)}."
+    return f"{where} it {compared(gain, base)} ({means}){outcome(gain)}."
 
 
 def _gain_and_means(pairs: Sequence[tuple[float, float]], published: str = "") -> tuple[Gain, str]:
-    gain = paired_gain([b for _, b in pairs], [a for a, _ in pairs])
-    return gain, f"mean {_short(fmean(b for _, b in pairs))} to {_short(fmean(a for a, _ in pairs))} mm{published}"
-
-
-def _short(value: float) -> str:
-    """A number with three digits; a very small one with a power of ten."""
-    return number_text(value) if 0.0 < value < _TINY else f"{value:.3g}"
-
-
-def _compared(gain: Gain, base: str) -> str:
-    """The size of a gain or loss; a loss of more than 1000 % is written as a multiple."""
-    if gain.share < -MOST_PERCENT:
-        mean, low, high = (f"{float(f'{1.0 - x:.2g}'):,.0f}" for x in (gain.share, gain.upper, gain.lower))
-        return f"has {mean} times{f' (90 %: {low} to {high})' if gain.trials > 1 else ''} the error of {base}"
-    return f"leaves {_percent(gain)} {'less' if gain.share >= 0.0 else 'more'} error than {base}"
-
-
-def _outcome(gain: Gain) -> str:
-    if gain.trials == 1:
-        return ""
-    if gain.lower <= 0.0 <= gain.upper:
-        return ": other trials may show the opposite"
-    return f": it {'helps' if gain.share > 0.0 else 'does harm'}"
-
-
-def _percent(gain: Gain) -> str:
-    """The size of a gain or loss, with its 90 % interval over draws of the trials."""
-    digits = max(2, math.floor(-math.log10(1.0 - gain.share)) - 1) if 0.99 < gain.share < 1.0 else 0
-    ends = (gain.lower, gain.upper) if gain.share >= 0.0 else (-gain.upper, -gain.lower)
-    interval = " to ".join(f"{100.0 * end:.{digits}f}".replace("-", MINUS) for end in ends)
-    return f"{100.0 * abs(gain.share):.{digits}f} %" + (f" (90 %: {interval})" if gain.trials > 1 else "")
+    before, after = ([pair[which] for pair in pairs] for which in (1, 0))
+    return paired_gain(before, after), f"{means_text(before, after)}{published}"
 
 
 def advice(folds: Sequence[Sequence[Identified]]) -> list[str]:

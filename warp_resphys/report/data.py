@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ..learning.baselines import BASELINES
 from ..learning.metrics import PublishedError, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
@@ -20,6 +21,10 @@ IntArray = NDArray[np.int64]
 
 # In the order of the tables: name and description.
 MODELS: Final[Mapping[str, tuple[str, str]]] = {
+    "rest": ("At rest", "without physics: nothing moves"),
+    "interpolation": ("Interpolation", "without physics: straight lines between the training trials"),
+    "regression": ("Regression", "without physics: kernel ridge regression over the training trials"),
+    "linear": ("Linear model", "without physics: linear from frame to frame, with inputs (DMDc)"),
     "published": ("Published setting", "the simulator as the published code sets it up"),
     "simulation": ("Uncorrected simulation", "the simulator as it is, with the values of the data sheet"),
     "reconstruction": ("Reconstruction", "the simulator with forces fitted to the test trial itself"),
@@ -31,6 +36,12 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
 MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
+PLAIN_NAMES: Final = {  # By model without physics: its name in sentences.
+    "rest": "a body that does not move",
+    "interpolation": "interpolation between the training trials",
+    "regression": "kernel regression over the training trials",
+    "linear": "a linear model without physics",
+}
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
 _OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 
@@ -44,12 +55,16 @@ class TrialResults:
     begins: tuple[str, ...]  # Of each trial: given (the state is known), released, rest or static (a pose).
     times: FloatArray  # (R, T) of the evaluated frames [s].
     target: FloatArray  # (R, T, M, 3) [m] observed, NaN where a marker was not seen.
-    positions: Mapping[str, FloatArray]  # (R, T, M, 3) [m] by model; not finite after it diverged.
+    # (R, T, M, 3) [m] by model, of those without physics the best one; not finite after it diverged.
+    positions: Mapping[str, FloatArray]
     bound: FloatArray  # (M, 3) [m] the markers on the undeformed body, or its vertices.
     gravity: FloatArray  # (3,) [m/s^2]
     time_step: float  # Of the simulation [s].
     axes: tuple[int, ...] = (0, 1, 2)  # Observed axes of the body.
     own_frame: bool = False  # Whether the position of the body in the recordings is not known.
+    since: FloatArray | None = None  # (R, T) since the last change of the inputs [s].
+    # (R, T, M) variance due to the identified parameters [m^2], by model.
+    spreads: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def errors_mm(self) -> dict[str, FloatArray]:
@@ -59,7 +74,9 @@ class TrialResults:
     @property
     def plain_errors_mm(self) -> FloatArray:
         """Errors (R, T) [mm] of the uncorrected simulation or, without it, of the first model."""
-        return self.errors_mm.get("simulation", next(iter(self.errors_mm.values())))
+        errors = self.errors_mm
+        order = ("simulation", *(model for model in errors if model not in BASELINES), *errors)
+        return errors[next(model for model in order if model in errors)]
 
     @cached_property
     def worst(self) -> int:
@@ -217,6 +234,13 @@ def shown_models(positions: Mapping[str, Any]) -> list[str]:
         (m for m in ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic") if m in positions), None
     )
     return [m for m in (plain, solid) if m is not None]
+
+
+def models_in_figures(errors: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the models that figures show: of those without physics only the one of least mean error."""
+    plain = [model for model in BASELINES if model in errors]
+    best = min(plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default="")
+    return [model for model in MODELS if model in errors and (model not in plain or model == best)]
 
 
 def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
+from ..learning.baselines import BASELINES
 from ..learning.metrics import median_filter
 from .data import MODELS
 
@@ -37,6 +38,10 @@ TONES: Final[Mapping[str, Tone]] = {
     "muted": Tone("#5c6670", "#9aa4af"),
     "rule": Tone("#dde1e6", "#343b44"),
     "target": Tone("#b4bcc6", "#5d6875"),
+    "rest": Tone("#7d6b4f", "#c8b594"),
+    "interpolation": Tone("#7d6b50", "#c8b595"),
+    "regression": Tone("#7d6b51", "#c8b596"),
+    "linear": Tone("#7d6b52", "#c8b597"),
     "simulation": Tone("#c4481b", "#ff9a6c"),
     "reconstruction": Tone("#1d7a55", "#62d2a2"),
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
@@ -60,7 +65,12 @@ WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
 NARROW: Final = 3.7  # [in]
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
-_DASHED: Final = {"published": (0, (1, 1.2)), "sysid_elastic": (0, (4, 2)), "resphys_uncorrected": (0, (4, 2))}
+_DASHED: Final = {
+    **dict.fromkeys(BASELINES, (0, (2, 1))),
+    "published": (0, (1, 1.2)),
+    "sysid_elastic": (0, (4, 2)),
+    "resphys_uncorrected": (0, (4, 2)),
+}
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],

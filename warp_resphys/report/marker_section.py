@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..learning.baselines import BASELINES
 from ..learning.intervals import Intervals
 from .data import (
     MODELS,
@@ -22,7 +23,7 @@ from .data import (
 from .page import Canvas, Drawn, Part
 
 # Models whose coordinates are drawn, as more would overlap.
-_DRAWN: Final = ("simulation", "sysid", "law", "simfree", "resphys")
+_DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 _SPACE_SECONDS: Final = 2.5  # Of a path in space, where longer ones overlap.
@@ -69,7 +70,7 @@ def _driven_markers(data: RunReport, trials: TrialResults, row: int, driven: Dri
     """Draws the coordinates of markers and, below them, the inputs."""
     name, words, per = trials.names[row], driven.quantity.plural, driven.quantity.per
     kept = drawn_markers(trials.target[row], trials.bound, data.mesh.vertices[data.fixed])
-    models = [m for m in _DRAWN[1:] if m in trials.positions] or [m for m in MODELS if m in trials.positions]
+    models = [m for m in _DRAWN if m in trials.positions and m != "simulation"] or list(trials.positions)
     own, bands = replace(driven, values={words.capitalize(): driven.values[name]}), _bands(data, trials, row, kept)
     return canvas.figure(
         "markers",
@@ -100,12 +101,13 @@ def _paths(
 def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
     """Half-widths (T, M) [m] of the prediction intervals of some markers, of the last model with intervals."""
     intervals = data.metrics.get("intervals", {}).get("models", {})
-    named = (m for m in ("resphys", "law", "sysid") if "factor" in intervals.get(m, {}) and m in trials.positions)
-    model = next(named, None)
-    if model is None:
-        return {}
-    widths = Intervals.from_plain(intervals[model]).half_widths(trials.positions[model][row], trials.bound)
-    return {model: widths[:, kept]}
+    since = None if trials.since is None else trials.since[row]
+    for model in ("resphys", "law", "sysid"):
+        own = Intervals.from_plain(intervals.get(model))
+        if own is not None and model in trials.positions:
+            spread = trials.spreads[model][row] if model in trials.spreads else None
+            return {model: own.half_widths(trials.positions[model][row], trials.bound, since, spread)[:, kept]}
+    return {}
 
 
 def _band_note(bands: Mapping[str, FloatArray]) -> str:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from ..learning.baselines import BASELINES
 from .bodies import ComparedMotion, distance_scene, largest_distances
 from .camera import hangs
 from .data import (
@@ -175,7 +176,7 @@ def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> li
     from . import motion_figures
 
     row, blocks = trials.worst, list[Block]()
-    drawn = [m for m in ("simulation", "sysid", "law", "resphys") if m in trials.positions]
+    drawn = [m for m in (*BASELINES, "simulation", "sysid", "law", "resphys") if m in trials.positions]
     if trials.moves and len(data.tip):
         rest = data.mesh.vertices[data.tip].mean(axis=0)
         paths = {"target": trials.target[row], **{m: trials.positions[m][row] for m in drawn}}

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
-from .conclusions import OUTSIDE, best, conclusions, epochs_kept, errors_by_load, untrained
+from .conclusions import OUTSIDE, conclusions, epochs_kept, errors_by_load, trial_errors, untrained
 from .control_section import control_section
 from .data import MODELS, RunReport, TrialResults
 from .identification_section import identification_section
@@ -37,6 +37,7 @@ from .page import (
     published_parts,
     write_page,
 )
+from .recommendation import recommended
 from .sections import (
     against,
     horizons_section,
@@ -47,6 +48,7 @@ from .sections import (
     training_section,
 )
 from .shapes_section import shapes_section
+from .trials_section import trials_section
 from .verdict import unbroken, verdict
 
 _LOG = logging.getLogger(__name__)
@@ -126,6 +128,7 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
 def _errors_table(data: RunReport) -> PageTable:
     errors, models = data.metrics["errors_mm"], data.models
     idle = untrained(epochs_kept(data.metrics))
+    chosen = recommended(trial_errors(data.metrics), idle)
     published = published_beside(data.published, models)
     base, shares = against(errors) if data.sees_markers else ("", {})
     by_load = errors_by_load(data.metrics, data.others)
@@ -145,7 +148,7 @@ def _errors_table(data: RunReport) -> PageTable:
         cells += [_pair(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
         cells += [Cell(shares.get(model, NONE))] if base else []
         cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
-        rows.append(Row(name, cells, model == best(errors, idle), meaning))
+        rows.append(Row(name, cells, model == chosen, meaning))
     return PageTable(f"Error of the {_observed(data)} [mm]", columns, rows)
 
 
@@ -342,6 +345,7 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     scales_section,
     motion_section,
     error_section,
+    trials_section,
     control_section,
     paths_section,
     body_section,

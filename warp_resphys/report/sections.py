@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM
-from .data import MODELS, RunReport
+from .data import MODELS, RunReport, models_in_figures
 from .page import (
     NONE,
     Canvas,
@@ -99,8 +99,7 @@ def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
     diverged = any(summary["diverged"] for errors in scales.values() for summary in errors.values())
     means = {
         model: {float(s): e[model]["mean"] for s, e in scales.items() if model in e and e[model]["mean"] is not None}
-        for model in MODELS
-        if any(model in errors for errors in scales.values())
+        for model in models_in_figures(scales[min(scales, key=float)])
     }
     figure = canvas.figure(
         "error_over_scale",

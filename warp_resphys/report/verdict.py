@@ -7,10 +7,11 @@ from typing import Any
 
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from ..settings.run import RunSettings
-from .conclusions import INSIDE, OUTSIDE, epochs_kept, errors_by_load, untrained
-from .data import MODELS, RunReport
+from .conclusions import INSIDE, OUTSIDE, epochs_kept, errors_by_load, headline, untrained
+from .data import MODELS, PLAIN_NAMES, RunReport, models_in_figures
 from .notes import in_a_row
 from .page import MOST_PERCENT, NO_BREAK_SPACE, mm_text, published_parts
+from .recommendation import model_name
 
 
 def verdict(data: RunReport) -> str:
@@ -32,7 +33,7 @@ def verdict(data: RunReport) -> str:
         published = PUBLISHED_WINDOWS_MM.get(data.experiment, {})
         sentences.append(growth_text(metrics.get("growth", {}), list(metrics.get("horizons", {})), published))
     sentences.append(scale_text(metrics.get("scales", {})))
-    return unbroken(" ".join(filter(None, sentences)))
+    return unbroken(" ".join(filter(None, [*headline(metrics, data.settings), *sentences])))
 
 
 def learned_in_part(settings: RunSettings, tested: Collection[str]) -> bool:
@@ -107,7 +108,7 @@ def outside_text(errors: Mapping[str, Any], trials: Collection[str]) -> str:
 
 def _with(model: str) -> str:
     """Which model simulated, as in "2 mm with SysID"."""
-    return {"simulation": "uncorrected", "law": "with the law"}.get(model, f"with {MODELS[model][0]}")
+    return "uncorrected" if model == "simulation" else f"with {model_name(model)}"
 
 
 def _mean_of(summary: Mapping[str, Any]) -> str:
@@ -155,9 +156,10 @@ def marker_verdict(
             f"On {who}, {held}, {MODELS[main][0]} diverged in {errors[main]['diverged']} of "
             f"{errors[main]['trajectories']} roll-outs, so there is no mean error to report."
         )
+    plain = [m for m in models_in_figures(errors) if m in PLAIN_NAMES]
     beside = "".join(
         f", {mm_text(errors[m]['mean'])} {_with(m)}"
-        for m in ("law", "sysid", "sysid_elastic", "simulation")
+        for m in ("law", "sysid", "sysid_elastic", "simulation", *plain)
         if m in errors and m != main
     )
     return (
@@ -194,6 +196,7 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
     if not errors:
         return ""
     largest = max(errors, key=float)
-    means = {m: errors[largest][m]["mean"] for m in ("resphys", "law", "sysid", "simfree") if m in errors[largest]}
+    shown = [m for m in models_in_figures(errors[largest]) if m not in ("published", "simulation", "sysid_elastic")]
+    means = {m: errors[largest][m]["mean"] for m in reversed(shown)}
     parts = ", ".join(f"{mm_text(mean)} {_with(model)}" for model, mean in means.items())
     return f"At {float(largest):g} times the inputs of the training the error is {parts}." if parts else ""

@@ -170,7 +170,7 @@ class Description:
             mesh=Mesh(tensors["vertices"].numpy(), tensors["cells"].numpy(), regions),
             bound=tensors.get("bound"),
             learned=learned,
-            intervals=None if intervals is None else Intervals.from_plain(intervals),
+            intervals=Intervals.from_plain(intervals),
             **fields,
         )
 
@@ -215,6 +215,7 @@ def describe(folder: Path, model: str) -> Description:
     identified = experiment.identification(model)
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
+    own = intervals["models"].get(model, {})
     learned, actuation = learned_of(experiment, model), settings.actuation
     base = None if learned is None else experiment.base_movement_mask(simulator)
     return Description(
@@ -236,7 +237,7 @@ def describe(folder: Path, model: str) -> Description:
         sees_payload=model in LEARNED and (actuation.sees_payload or model == SIMFREE),
         told_of_base=None if base is None else tuple(base.tolist()),
         seen={n: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist())) for n, x in dataset.inputs.items()},
-        intervals=Intervals.from_plain(intervals["models"][model]) if model in intervals["models"] else None,
+        intervals=Intervals.from_plain(own.get("without_spread", own)),
         level=intervals["level"],
         errors_mm=errors.get("errors_mm", {}).get(model, {}),
     )

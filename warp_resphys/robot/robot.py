@@ -16,6 +16,7 @@ from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError
 from ..learning.feedback_equilibrium import equilibrium_under_feedback
+from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
 from ..learning.predictors import LearnedPredictor
@@ -175,15 +176,19 @@ class Robot:
         """Markers (B, M, 3) in a state, as recordings have them; vertices (B, N, 3) if these are observed [m]."""
         return state.q if self._observe is None else self._observe(state.q)
 
-    def half_widths(self, markers: torch.Tensor) -> NDArray[np.float64] | None:
-        """Half-widths (..., M) of the prediction intervals of markers' coordinates (..., M, 3) [m].
+    def half_widths(self, markers: torch.Tensor, since: ArrayLike | None = None) -> NDArray[np.float64] | None:
+        """Half-widths (..., M) of the prediction intervals of markers' coordinates.
 
         They are those of the experiment's report (`learning.intervals`); None if it has none.
+
+        Args:
+            markers: (..., M, 3) predicted [m].
+            since: (...,) time since the last change of the inputs [s]; None for that at which intervals are widest.
         """
         description = self.description
         if description.intervals is None or description.bound is None:
             return None
-        return description.intervals.half_widths(markers.detach().cpu().numpy(), description.bound.numpy())
+        return description.intervals.half_widths(markers.detach().cpu().numpy(), description.bound.numpy(), since)
 
     # Initial states
 
@@ -335,16 +340,18 @@ class Robot:
             acting.append(now)
             on_step(number + 1)
         markers = torch.stack([self.observe(state) for state in states])
+        times = self.time_step * np.arange(count + 1, dtype=np.float64)
+        driven = {name: torch.stack([now[name] for now in acting]) for name in series if acting}
         return Motion(
             robot=self.description,
-            times=self.time_step * np.arange(count + 1, dtype=np.float64),
+            times=times,
             q=torch.stack([state.q for state in states]),
             v=torch.stack([state.v for state in states]),
             markers=markers,
-            half_widths=self.half_widths(markers),
+            half_widths=self.half_widths(markers, _since_change(times, driven, state.batch)),
             left=torch.stack([state.left for state in states]),
             lost=torch.stack([state.lost for state in states]),
-            inputs={name: torch.stack([now[name] for now in acting]) for name in series if acting},
+            inputs=driven,
             known_inputs=self.inputs,
             final=state,
         )
@@ -381,3 +388,12 @@ class Robot:
         given = None if learned.network.actuation is None else conditions
         frame = None if base is None else BaseFrame(base, self.time_step, first=1)
         return LearnedPredictor(learned.network, given, learned.range_, self.frames, frame)
+
+
+def _since_change(times: NDArray[np.float64], driven: Mapping[str, torch.Tensor], batch: int) -> NDArray[np.float64]:
+    """(T + 1, B) time since the last change of commands (T, B, ...) at times (T + 1,) [s]."""
+    frames = np.minimum(np.arange(len(times)), len(times) - 2)
+    acting = [
+        values.detach().cpu().double().numpy()[frames].reshape(len(times), batch, -1) for values in driven.values()
+    ]
+    return time_since_change(np.broadcast_to(times[:, None], (len(times), batch)), acting)

@@ -14,6 +14,7 @@ from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
+from ..learning.baselines import BASELINES
 from ..report.bodies import ComparedMotion
 from ..report.camera import hangs
 from ..report.control_section import compared_controllers
@@ -73,7 +74,7 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     finished_record(run, "evaluate")
     metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
-        available = tuple(metrics["errors_mm"])
+        available = tuple(model for model in metrics["errors_mm"] if model not in BASELINES)
         models = tuple(shown_models(metrics["errors_mm"])) or available[:2]
     name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
@@ -110,9 +111,10 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
         InputError: an unknown trial or model, or a pose.
         DataFileError: there is no finished run.
     """
-    unknown = [name for name in models if name not in MODELS]
+    known = [name for name in MODELS if name not in BASELINES]
+    unknown = [name for name in models if name not in known]
     if unknown or not models:
-        raise InputError(f"models names {unknown[0] if unknown else 'none'}: choose some of {', '.join(MODELS)}.")
+        raise InputError(f"models names {unknown[0] if unknown else 'none'}: choose some of {', '.join(known)}.")
     positions, markers = {}, {}
     for model in models:
         robot = load(run, model)

@@ -8,8 +8,11 @@ from typing import Any
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.settings import Many, Natural, NotNegative, Settings, Some, Word, parse, setting
+from ..learning.baselines import BASELINES
 from ..learning.metrics import paired_gain
-from ..report.conclusions import held_out
+from ..report.conclusions import epochs_kept, trial_errors, untrained
+from ..report.data import MODELS, models_in_figures
+from ..report.notes import in_a_row
 from ..report.page import (
     MINUS,
     NONE,
@@ -25,6 +28,7 @@ from ..report.page import (
     error_parts,
     number_text,
 )
+from ..report.recommendation import LEAST_TRIALS, best_pair, model_name
 from ..report.verdict import learned_in_part
 from .rows import RecordedRobot
 from .runs import Run
@@ -44,6 +48,14 @@ class Share(Settings):
     trials: Natural
 
 
+class Beside(Settings):
+    """The best corrected model and the best of all others, at rest and without physics included."""
+
+    corrected: Word
+    other: Word
+    gain: Share
+
+
 class Measured(Settings):
     """Results of the run of a robot."""
 
@@ -54,6 +66,7 @@ class Measured(Settings):
     tested: Some[Word] = setting(description="test trials")
     how: Word = setting(description="how the test trials were kept from the training")
     errors_mm: dict[str, dict[str, Any]] = setting(description="by model, as metrics.json has them")
+    beside: Beside | None = setting(None, "the best corrected model beside the best of all others")
     gains: dict[str, Share | None] = setting(description="by model over the one that it corrects; null: it diverged")
     intervals: dict[str, Any] | None = setting(description="of ResPhys, with coverage and half_width_mm")
     seconds: NotNegative = setting(description="of all stages", unit="s")
@@ -73,7 +86,10 @@ class Measured(Settings):
             beyond=tuple(beyond),
             tested=tuple(tested),
             how=how,
-            errors_mm={model: metrics["errors_mm"][model] for model in _MODELS if model in metrics["errors_mm"]},
+            errors_mm={
+                model: metrics["errors_mm"][model] for model in (*BASELINES, *_MODELS) if model in metrics["errors_mm"]
+            },
+            beside=_beside(metrics),
             gains={model: _gain(metrics, model, other) for model, other in _corrected(metrics["errors_mm"]).items()},
             intervals=metrics.get("intervals", {}).get("models", {}).get("resphys"),
             seconds=sum(sum(part["seconds"].values()) for part in (metrics, *metrics.get("folds", {}).values())),
@@ -82,9 +98,24 @@ class Measured(Settings):
 
     @property
     def is_helped(self) -> bool:
-        """Whether the learned force reduces the error of identification, by the 90 % interval over several trials."""
-        gain = self.gains["resphys"]
-        return gain is not None and gain.trials > 1 and gain.lower > 0.0
+        """Whether the learned force reduces the error of identification, by the 90 % interval over the trials."""
+        return _is_clear(self.gains["resphys"])
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether a corrected model is better than all others, by the 90 % interval over the trials."""
+        return self.beside is not None and _is_clear(self.beside.gain)
+
+
+def _is_clear(gain: Share | None) -> bool:
+    return gain is not None and gain.trials >= LEAST_TRIALS and gain.lower > 0.0
+
+
+def _beside(metrics: Mapping[str, Any]) -> Beside | None:
+    errors = trial_errors(metrics)
+    corrected, other = best_pair(errors, untrained(epochs_kept(metrics)))
+    gain = _gain(metrics, corrected, other)
+    return None if gain is None else Beside(corrected=corrected, other=other, gain=gain)
 
 
 def read_kept(path: Path | None) -> dict[str, Measured]:
@@ -129,7 +160,8 @@ def _corrected(errors: Mapping[str, Any]) -> dict[str, str]:
 
 def _gain(metrics: Mapping[str, Any], after: str, before: str) -> Share | None:
     """Gain of a model over another on held-out trials; None where a roll-out diverged."""
-    pairs = [(row.get(before), row.get(after)) for row in held_out(metrics)]
+    errors = trial_errors(metrics)
+    pairs = [*zip(errors.get(before, ()), errors.get(after, ()), strict=True)]
     finite = [(b, a) for b, a in pairs if a is not None and b]
     if not finite or len(finite) < len(pairs):
         return None
@@ -144,7 +176,9 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
     gained = [model for model in ("sysid", "law", "resphys") if model in models]
     for name, result in measured.items():
         errors = result.errors_mm
-        cells = [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in models]
+        plain = next((model for model in models_in_figures(errors) if model in BASELINES), None)
+        cells = [Cell(NONE) if plain is None else Cell(number_text(errors[plain]["mean"]), MODELS[plain][0].lower())]
+        cells += [Cell(*error_parts(errors[model])) if model in errors else Cell(NONE) for model in models]
         cells += [Cell(_gain_text(result.gains.get(model))) for model in gained]
         held = result.intervals
         coverage = f"{100.0 * held['coverage']:.0f} % (± {held['half_width_mm']:.2g} mm)" if held is not None else NONE
@@ -153,14 +187,16 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         rows.append(Row(robots[name].title, cells, small="; ".join(small)))
     note = (
         "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
-        "deviation over trials. Less error: the share of the uncorrected error that SysID removes, and of SysID's "
-        "error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap). Coverage: share of the "
+        "deviation over trials. Without physics: the best of a body at rest, interpolation and kernel regression "
+        "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
+        "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
+        f"if there are {LEAST_TRIALS} or more. Coverage: share of the "
         "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: sum "
         "over all stages, also of folds that ran in parallel, on a machine with other load."
     )
     if with_law:
         note += " Where there is a law of the material, it is compared with SysID, and ResPhys with the law."
-    columns = [_COLUMNS[model] for model in models]
+    columns = ["Without physics", *(_COLUMNS[model] for model in models)]
     columns += [*(f"Less error by {_COLUMNS[model]}" for model in gained), "Coverage", "Time"]
     return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
 
@@ -169,7 +205,7 @@ def _gain_text(gain: Share | None) -> str:
     if gain is None:
         return NONE
     share, *ends = (f"{100.0 * value:.0f}".replace("-", MINUS) for value in (gain.share, gain.lower, gain.upper))
-    return f"{share} %" if gain.trials == 1 else f"{share} % ({' to '.join(ends)})"
+    return f"{share} %" if gain.trials < LEAST_TRIALS else f"{share} % ({' to '.join(ends)})"
 
 
 def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -> Part:
@@ -177,6 +213,12 @@ def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -
     count, path = len(result.tested), pictures / f"{name}.png"
     alt = f"The body of {robot.title} and its markers."
     text = [f"Tested on {count} trial{'s' if count > 1 else ''}, {result.how}: {', '.join(result.tested)}."]
+    if result.beside is not None:
+        own, other = (result.errors_mm[model] for model in (result.beside.corrected, result.beside.other))
+        text.append(
+            f"The best corrected model, {model_name(result.beside.corrected)}, leaves {number_text(own['mean'])} mm; "
+            f"the best of all others, {model_name(result.beside.other)}, {number_text(other['mean'])} mm."
+        )
     if result.moved_mm is not None:
         moved = number_text(result.moved_mm)
         text.append(f"A finer mesh moves the markers of the identified simulator by {moved} mm.")
@@ -204,9 +246,18 @@ def machines(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measure
 
 
 def verdict(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured]) -> str:
-    """A sentence on the robots for which the learned force helps."""
+    """Sentences on the robots that need a corrected simulator, and on those for which the learned force helps."""
     if not measured:
         return "No run has succeeded."
-    helped = [robots[name].title for name, result in measured.items() if result.is_helped]
-    which = f"{len(helped)} of {len(measured)} robots" + (f" ({', '.join(helped)})" if helped else "")
-    return f"The learned force reduces the error of identification, by its 90 % interval over the trials, on {which}."
+    needed, helped = (
+        [robots[name].title for name, result in measured.items() if getattr(result, kind)]
+        for kind in ("is_needed", "is_helped")
+    )
+    which = [f"{len(own)} of {len(measured)} robots{f' ({in_a_row(own)})' if own else ''}" for own in (needed, helped)]
+    few = [robots[name].title for name, result in measured.items() if len(result.tested) < LEAST_TRIALS]
+    text = (
+        "By its 90 % interval over the held-out trials, a corrected simulator leaves less error than everything else "
+        f"(uncorrected, a network alone, without physics) on {which[0]}, and the learned force reduces the error of "
+        f"identification on {which[1]}."
+    )
+    return text + (f" {in_a_row(few)}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")

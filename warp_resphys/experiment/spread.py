@@ -1,0 +1,65 @@
+"""How uncertain predicted markers are because the identified parameters are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..io.errors import ConvergenceError
+from ..io.progress import Progress
+from .experiment import Experiment
+
+FloatArray = NDArray[np.float64]
+
+_DIFFERENCE = 1e-3  # of a parameter, for derivatives, over its standard deviation
+
+
+def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -> FloatArray | None:
+    """Returns the variance of predicted markers under the posterior of a model's identified parameters.
+
+    The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
+    of these, so that it grows with the distance from the trials that determine them.
+
+    Args:
+        experiment: the experiment; solves that fail count as no spread.
+        model: with identified parameters.
+        names: names of the R trials.
+
+    Returns:
+        Means (R, T, M) over the coordinates [m^2]; None if the uncertainty of the parameters is not known.
+    """
+    identified = experiment.identification(model)
+    uncertainty = identified.get("uncertainty")
+    if uncertainty is None:
+        return None
+    values, parameters = identified["parameters"], [*uncertainty["deviation"]]
+    deviation = np.array([uncertainty["deviation"][name] for name in parameters])
+    root = _root(np.array(uncertainty["correlation"]))
+    spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
+    with Progress("evaluate: uncertainty of the parameters", len(names), "trials") as progress, torch.no_grad():
+        for whole in experiment.batches(names):
+            size = experiment.settings.batch or len(whole)
+            for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
+                replay = experiment.replay(experiment.model_simulator(model), batch, model)
+                start = experiment.start(replay, model)
+                steps = np.concatenate([np.zeros((1, len(parameters))), _DIFFERENCE * np.diag(deviation)])
+                sets = {
+                    name: replay.simulator.tensor(np.full(len(steps), values[name]) + steps[:, column])
+                    for column, name in enumerate(parameters)
+                }
+                try:
+                    points = (replay if replay.is_static else replay.varied)(start, sets).double().cpu().numpy()
+                except ConvergenceError:
+                    points = np.zeros((len(steps), *spread[: len(batch)].shape, 3))
+                moved = np.einsum("erTmc,ei->irTmc", (points[1:] - points[:1]) / _DIFFERENCE, root)
+                rows = [names.index(name) for name in batch]
+                spread[rows, : points.shape[2]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
+                progress.advance(len(batch))
+    return spread
+
+
+def _root(correlation: FloatArray) -> FloatArray:
+    """R with R R^T the correlation (P, P), without the parts that rounding makes negative."""
+    sizes, vectors = np.linalg.eigh(correlation)
+    return np.asarray(vectors * np.sqrt(np.maximum(sizes, 0.0)))

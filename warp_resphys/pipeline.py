@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
@@ -371,7 +371,9 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     columns = {name: errors for name, errors in columns.items() if errors != whole}
     what = "vertices" if run.markers is None else "markers"
     title = f"Error of the {what} in the test trials" + "; x: times the inputs" * ("scales" in metrics)
-    table = Table("model", "mean [mm]", "std [mm]", *columns, "diverged", title=title)
+    table = Table(
+        Column("model", min_width=max(map(len, whole))), "mean [mm]", "std [mm]", *columns, "diverged", title=title
+    )
     for model, summary in whole.items():
         means = [number_text(errors[model]["mean"]) if model in errors else "" for errors in columns.values()]
         std = "" if summary["std"] is None else number_text(summary["std"])

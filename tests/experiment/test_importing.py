@@ -19,7 +19,7 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
-from warp_resphys.experiment.importing import import_recordings
+from warp_resphys.experiment.importing import import_recordings, sessions_text
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.observing import Observer
 from warp_resphys.experiment.trials import trials_of
@@ -625,3 +625,11 @@ def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
     np.testing.assert_allclose(
         moved[..., 1].numpy(), np.broadcast_to(0.1 * times[:, None], moved.shape[:2]), atol=1e-15
     )
+
+
+def test_recordings_of_different_rates_look_like_sessions():
+    rates = {"a": 200.0, "b": 240.0, "c": 199.9}
+    said = sessions_text(rates, [None, None, None])
+    assert "(200 Hz: a, c; 240 Hz: b)" in said
+    assert "data.trials.NAME.session" in said
+    assert sessions_text(rates, [None, "monday", None]) == sessions_text({"a": 200.0}, [None]) == ""

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, run_without_report
 from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.report.identification_section import own_table
 from warp_resphys.report.uniaxial import small_strain
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
@@ -115,6 +118,46 @@ def test_a_law_is_identified_from_poses(poses, tmp_path):
     assert found["validation"]["trials"] == ["other"]
     assert found["validation"]["law"] < 0.1
     assert small_strain(found["constants"]).youngs_modulus == pytest.approx(MODULUS, rel=0.1)
+
+
+def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
+    """Between two sessions a marker moved by 4 mm; one tension is 7 % larger than its log says."""
+    sessions = {"weak": "monday", "strong": "monday", "other": "friday", "second": "friday", "both": "friday"}
+    logged = {**POSES, "strong": (1.5 / 1.07, 0.0)}
+    trials = ",".join(
+        f"{name}: {{file: {name}.csv, session: {sessions[name]}, inputs: {list(logged[name])}}}" for name in POSES
+    )
+    moved = poses.copy()
+    moved[[list(POSES).index(name) for name, session in sessions.items() if session == "friday"], 1, 2] -= 4e-3
+    write(tmp_path / "recordings", moved)
+    gain = "{lower: 0.7, upper: 1.3, per: trial, prior: {mean: 1.0, deviation: 0.05}}"
+    folder = run_without_report(
+        tmp_path,
+        *TINY,
+        "data.trials=null",
+        f"+data.trials={{{trials}}}",
+        f"+identify.parameters.tendon_tension_factor={gain}",
+        *("mesh_check=null", "identify.max_evaluations=8"),
+    )
+    assert dict(zip((data := read_dataset(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
+    found = json.loads((folder / "identification.json").read_text())["sysid"]
+    own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["own"].items()}
+    assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["own_deviation"]}
+    assert own["strong"] - 0.5 * (own["weak"] + own["second"]) > 0.03
+    assert found["parameters"]["tendon_tension_factor"] == 1.0
+    assert found["uncertainty"]["deviation"]["tendon_tension_factor"] == 0.05
+    assert not any("@" in name for name in found["uncertainty"]["deviation"])
+    monday, friday = (found["placement"]["sessions"][session]["offsets"] for session in ("monday", "friday"))
+    further, other = (friday[marker][2] - monday[marker][2] for marker in ("M2", "M3"))
+    assert further - other == pytest.approx(-4e-3, abs=1.2e-3)  # The frame of a session may be shifted, too.
+    table = own_table(found)
+    assert [row.head for row in table.rows] == ["weak", "strong", "second"]
+    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:  # A new trial has a gain that is not known.
+        assert 1e3 * np.sqrt(read_array(file, "sysid_spread").max()) > 1.0
+    robot = warp_resphys.load(folder, "sysid")
+    assert "tendon_tension_factor@strong" not in robot.description.parameters
+    shown = warp_resphys.recorded_trial(robot, "both")
+    assert float(shown.errors_mm(shown.play(robot)).mean()) < 20.0
 
 
 def check_of_the_mesh():

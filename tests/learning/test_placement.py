@@ -15,7 +15,14 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.misfit import Misfit
-from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement, estimate_placement
+from warp_resphys.learning.placement import (
+    Accuracy,
+    DisplacedMarkers,
+    PlacedMarkers,
+    Placement,
+    estimate_placement,
+    placement_of,
+)
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.mesh.poses import twisted
@@ -220,3 +227,81 @@ def test_misplaced_vertices_and_priors_out_of_range_are_refused():
         MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
     with pytest.raises(InputError, match=r"the prior has the mean 2e\+06, outside of the range"):
         Bounds(1e5, 1e6, prior=Prior(2e6, 1.0))
+
+
+OWN = {
+    **RANGES,
+    **{f"attached_mass_factor@w{i}": Bounds(0.7, 1.3, prior=Prior(1.0, 0.05)) for i in (1, 2, 3, 4)},
+}
+GAINS = (1.0, 0.93, 1.05, 1.0, 0.97)  # of the weights that hung on the body, over those that were logged
+
+
+def gained():
+    """A replay of poses whose weights were off by `GAINS`."""
+    replay, start = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
+    gains = torch.tensor(GAINS).double()[:, None]
+    return Replay(
+        SIM,
+        replay.observe,
+        replace(replay.trials, inputs=Inputs(attached_mass=replay.trials.inputs.attached_mass / gains)),
+    ), start
+
+
+def test_trials_have_their_own_gains():
+    pair, start = gained(), {name: 1.0 for name in OWN} | {"youngs_modulus": 4e5}
+    result = identifier(pair, OWN).run([start], 40)
+    found = [result.parameters[f"attached_mass_factor@w{i}"] for i in (1, 2, 3, 4)]
+    ratios = np.array(found) / np.mean(found) * np.mean(GAINS[1:])  # Their mean and the modulus are not separable.
+    np.testing.assert_allclose(ratios, GAINS[1:], atol=0.02)
+    naive = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
+    assert result.loss < 0.5 * naive.loss
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.05)
+
+
+def test_derivatives_by_the_values_of_trials_are_those_of_the_loss():
+    misfit = Misfit([gained()], OWN, accuracy=ACCURACY, centre=CENTRE.tolist())
+    unit = np.array([0.45, 0.4, 0.6, 0.55, 0.3])
+    misfit.update_prior_weight(unit)
+    misfit.update_prior_weight(unit)
+    gradient = misfit.linearise(unit).gradient
+    for column in range(len(unit)):
+        step = 1e-4 * np.eye(len(unit))[column]
+        ends = [misfit.linearise(unit + sign * step, derivatives=False).loss for sign in (1.0, -1.0)]
+        assert gradient[column] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=2e-4), column
+
+
+def test_every_session_has_its_placement():
+    """Between two sessions the markers move; in the second one, the body is placed elsewhere in the recordings."""
+    other = Placement(MOVED.flip(0), -ASKEW.shift, 0.5 * ASKEW.turn, CENTRE)
+    pairs = []
+    for session, placement in (("monday", ASKEW), ("friday", other)):
+        replay, start = posed(PlacedMarkers.of(bind(), placement), noise=1e-5)
+        names = tuple(f"{session}_{name}" for name in replay.trials.names)
+        pairs.append((Replay(SIM, bind(), replace(replay.trials, names=names, session=session)), start))
+    whole = Identifier(pairs, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist())
+    result = whole.run([{"youngs_modulus": 4e5}], 30)
+    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
+    assert list(result.placement["sessions"]) == ["monday", "friday"]
+    q = poses()[:2]
+    for session, placement in (("monday", ASKEW), ("friday", other)):
+        placed = PlacedMarkers.of(bind(), placement_of(result.placement, LABELS, session))
+        off = (placed(REST[None]) - PlacedMarkers.of(bind(), placement)(REST[None])).norm(dim=-1)
+        assert float(off.max()) < 3e-4
+    unknown = PlacedMarkers.of(bind(), placement_of(result.placement, LABELS, "sunday"))
+    assert torch.isfinite(unknown(q)).all()
+    one_session = [(Replay(SIM, bind(), replace(r.trials, session="")), start) for r, start in pairs]
+    mixed = Identifier(one_session, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist())
+    assert mixed.run([{"youngs_modulus": 4e5}], 30).loss > 10.0 * result.loss
+
+
+def test_a_value_of_a_trial_needs_a_common_one():
+    replay, _ = posed(bind())
+    with pytest.raises(InputError, match="give attached_mass_factor, that of the others, too"):
+        replay.prepare({"attached_mass_factor@w1": one(1.1)})
+    with pytest.raises(InputError, match="no parameter 'nothing' to identify"):
+        replay.prepare({"nothing@w1": one(1.1)})
+    both = {"attached_mass_factor": one(1.0), "attached_mass_factor@w1": one(1.5), "attached_mass_factor@x": one(9.0)}
+    _, inputs, _ = replay.prepare(both)
+    expected = replay.trials.inputs.attached_mass.clone()
+    expected[1] *= 1.5
+    torch.testing.assert_close(inputs.attached_mass, expected)

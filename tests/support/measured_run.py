@@ -174,7 +174,7 @@ def write_split(folder: Path, test: Sequence[str], models=MODELS, trials=TRIALS,
         },
     }
     if "resphys" in models:
-        intervals = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0]}
+        intervals = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0, 1.0]}
         held = {"coverage": 0.87, "half_width_mm": 3.0}
         each = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": {**intervals, **held}}}
         plain["intervals"] = each

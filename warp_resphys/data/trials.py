@@ -23,6 +23,7 @@ class Trials:
     inputs: Inputs = field(default_factory=Inputs)
     # before time zero, for trials that begin at rest; weights are the same as in `inputs`
     resting: Inputs = field(default_factory=Inputs)
+    session: str = ""  # in which all of them were recorded, if there are several
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.
@@ -59,7 +60,7 @@ class Trials:
         pick = torch.as_tensor(indices, device=self.times.device)
         fields = (self.times[pick], self.observed[pick], self.held[pick])
         names = tuple(self.names[i] for i in indices)
-        return Trials(names, *fields, self.inputs.select(pick), self.resting.select(pick))
+        return Trials(names, *fields, self.inputs.select(pick), self.resting.select(pick), self.session)
 
     def first(self, seconds: float) -> "Trials":
         """Returns the trials with the frames after a time [s] left out or marked as not seen."""
@@ -74,9 +75,9 @@ class Trials:
             torch.cat([getattr(t, n) for t in (self, other)]) for n in ("times", "observed", "held")
         )
         inputs, resting = self.inputs.joined(other.inputs), self.resting.joined(other.resting)
-        return Trials(self.names + other.names, times, observed, held, inputs, resting)
+        return Trials(self.names + other.names, times, observed, held, inputs, resting, self.session)
 
     def to(self, like: torch.Tensor) -> "Trials":
         """Returns the trials on the device and in the precision of a tensor."""
         fields = (self.times.to(like), self.observed.to(like), self.held.to(like))
-        return Trials(self.names, *fields, self.inputs.to(like), self.resting.to(like))
+        return Trials(self.names, *fields, self.inputs.to(like), self.resting.to(like), self.session)

@@ -79,6 +79,7 @@ def check_run(run: RunSettings) -> None:
         ]
         _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
+        _check_owners(run.identify, run)
 
 
 def _check_law(run: RunSettings, law: LawSettings) -> None:
@@ -185,6 +186,18 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: inputs cannot precede their command, so it "
                 "must be zero or more, in s; data.trials.NAME.onset is the time of a command."
+            )
+
+
+def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
+    """Checks parameters of which trials or sessions have their own values."""
+    tables = [run.recorded.trials] if run.recorded is not None else []
+    tables += [run.laboratory.trials] if run.laboratory is not None else []
+    named = any(trial.session for table in tables for trial in table.values())
+    for name, limits in identify.parameters.items():
+        if limits.per == "session" and not named:
+            raise InputError(
+                f"identify.parameters.{name}.per is session, but no trial names one: set data.trials.NAME.session."
             )
 
 

@@ -23,7 +23,8 @@ from ..energies.strings import PAYLOAD
 from ..fem.body import Body
 from ..io.errors import ConvergenceError
 from ..io.files import read_json
-from ..learning.placement import PlacedMarkers, Placement
+from ..learning.parameters import split_name
+from ..learning.placement import PlacedMarkers, placement_of
 from ..learning.release import begin_inputs, estimate_release
 from ..learning.replay import Replay, Start, later
 from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
@@ -155,13 +156,13 @@ class Experiment:
         bound = bound_markers(markers, self.body.mesh, self.dataset.bound, labels)
         return ViewedMarkers.of(bound, marker_view_of(markers, labels, self.dataset.sets)).to(self.like)
 
-    def observe_by(self, model: str) -> Observation:
-        """Observation with the marker placement that was identified for a model, if any."""
+    def observe_by(self, model: str, session: str = "") -> Observation:
+        """Observation with the marker placement that was identified for a model in a session, if any."""
         placement = self.identification(model).get("placement")
         if placement is None:
             return self.observe
         assert isinstance(self.observe, Markers)
-        return PlacedMarkers.of(self.observe, Placement.from_plain(placement, self.dataset.labels)).to(self.like)
+        return PlacedMarkers.of(self.observe, placement_of(placement, self.dataset.labels, session)).to(self.like)
 
     def trials(self, names: Sequence[str], simulator: Simulator | None = None) -> Trials:
         """Trials that begin in the same way, on the device of the simulators, with inputs at the simulator's steps."""
@@ -190,10 +191,10 @@ class Experiment:
         return movement.flatten(0, 1).std(0) > _STANDS_STILL
 
     def batches(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Groups trials by how they begin; the trials of a group can be simulated as one batch."""
-        groups: dict[str, list[str]] = {}
+        """Groups trials by how they begin and their session; the trials of a group can be simulated as one batch."""
+        groups: dict[tuple[str, str], list[str]] = {}
         for name in names:
-            groups.setdefault(self.begins(name), []).append(name)
+            groups.setdefault((self.begins(name), self.dataset.session(name)), []).append(name)
         return [tuple(group) for group in groups.values()]
 
     def moving(self, names: Sequence[str]) -> tuple[str, ...]:
@@ -220,7 +221,7 @@ class Experiment:
             v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[self.dataset.rows(trials.names), 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         known = self.parameters(model) if parameters is None else _tensors(parameters, simulator)
-        values = {name: value for name, value in known.items() if name in replay.parameter_names} or None
+        values = {name: value for name, value in known.items() if split_name(name)[0] in replay.parameter_names} or None
         if begins == "released":
             return estimate_release(simulator, replay.observe, trials, self.settings.release, values)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
@@ -232,8 +233,9 @@ class Experiment:
         return begin_inputs(replay, Start.resting(guess), self.settings.release, values)
 
     def replay(self, simulator: Simulator, names: Sequence[str], model: str = "simulation") -> Replay:
-        """Replay of trials that begin in the same way, with a model's observation."""
-        return Replay(simulator, self.observe_by(model), self.trials(names, simulator))
+        """Replay of trials of one of `batches`, with a model's observation."""
+        observe = self.observe_by(model, self.dataset.session(names[0]))
+        return Replay(simulator, observe, self.trials(names, simulator))
 
     def replays(
         self, simulator: Simulator, names: Sequence[str], model: str = "simulation"
@@ -254,8 +256,10 @@ class Experiment:
         return {"parameters": read_json(self.folder / LAW_FILE)["parameters"], "placement": placement}
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
-        """(1,) identified parameters of a model's simulator, by name; empty if none were identified."""
-        return _tensors(self.identification(model).get("parameters", {}), self.simulator("simulation"))
+        """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""
+        identified = self.identification(model)
+        values = {**identified.get("parameters", {}), **identified.get("own", {})}
+        return _tensors(values, self.simulator("simulation"))
 
     @property
     def models(self) -> list[str]:

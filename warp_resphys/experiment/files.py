@@ -102,6 +102,7 @@ class Dataset:
             `actuators.DRIVING_QUANTITIES`.
         channels: names of the C channels, by input.
         base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
+        sessions: session in which each trial was recorded; empty if there is one.
     """
 
     names: tuple[str, ...]
@@ -119,6 +120,11 @@ class Dataset:
     inputs: Mapping[str, FloatArray] = field(default_factory=dict)
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     base: FloatArray | None = None
+    sessions: tuple[str, ...] = ()
+
+    def session(self, name: str) -> str:
+        """Session in which a trial was recorded; empty if there is one."""
+        return self.sessions[self.names.index(name)] if self.sessions else ""
 
     @property
     def present(self) -> NDArray[np.bool_]:
@@ -139,6 +145,7 @@ class Dataset:
             DataFileError: the file cannot be written.
         """
         words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
+        words |= {"sessions": self.sessions} if self.sessions else {}
         words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
         attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
@@ -156,7 +163,7 @@ class Dataset:
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
-        words = {"names": self.names + other.names, "begins": self.begins + other.begins}
+        words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
         changed: dict[str, Any] = {**words, **arrays, "inputs": inputs}
         return replace(self, **changed)
 
@@ -183,7 +190,7 @@ class Dataset:
     def trials(
         self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float | None = None
     ) -> Trials:
-        """Returns trials that begin in the same way, in float64 on the CPU.
+        """Returns trials that begin in the same way and are of one session, in float64 on the CPU.
 
         Args:
             names: names of the trials.
@@ -208,7 +215,8 @@ class Dataset:
             given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
         resting = Inputs(**{key: given[key][-1] for key in self.inputs}) if static else Inputs()
         times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
-        return Trials(tuple(names), times, observed, torch.from_numpy(self.held[rows]), Inputs(**given), resting)
+        held, session = torch.from_numpy(self.held[rows]), self.session(names[0])
+        return Trials(tuple(names), times, observed, held, Inputs(**given), resting, session)
 
 
 def read_dataset(path: Path) -> Dataset:
@@ -240,6 +248,7 @@ def read_dataset(path: Path) -> Dataset:
             base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
             inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
             channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
+            sessions=tuple(map(str, file.attrs.get("sessions", ()))),
             **optional,
         )
 

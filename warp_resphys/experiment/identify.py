@@ -13,7 +13,7 @@ from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identifier
-from ..learning.parameters import configured_parameters
+from ..learning.parameters import configured_parameters, own_name, split_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import RangeSettings
@@ -43,11 +43,7 @@ def identify(context: StageContext) -> None:
     experiment = Experiment(settings, context.run_dir)
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-    ranges = {
-        model: {name: bounds_of(limits) for name, limits in search.items()}
-        for model, search in searches.items()
-        if search
-    }
+    ranges = {model: _bounds(experiment, search, names) for model, search in searches.items() if search}
     kinds = {model: MODELS[model][0] for model in ranges}
     estimated = ("released", "rest") if settings.release.delay > 0.0 else ("released",)
     released = any(experiment.begins(name) in estimated for name in names)
@@ -63,8 +59,8 @@ def identify(context: StageContext) -> None:
             replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
             placed = _placement(experiment) if model == "sysid" else {}
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
-            guess = {**configured_parameters(experiment.simulator(kinds[model]), bounds), **wanted.first_guess}
-            guess = {name: guess[name] for name in bounds}
+            known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
+            guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
             found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
             for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
@@ -73,18 +69,65 @@ def identify(context: StageContext) -> None:
                 found = _search(settings, identifier, values, kept[again], progress, 1)
                 if not changes(before, found["loss"]):
                     break
-            identified[model] = found | {"first_guess": guess}
+            if (where := wanted.placement) is not None and (found["placement"] or {}).get("sessions"):
+                prior = [size for size in (where.markers, where.shift) if size is not None]
+                found = {**found, "placement": {**found["placement"], "prior": prior}}
+            identified[model] = _separated(found, searches[model]) | {"first_guess": guess}
     if wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
         axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
         identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(experiment))
-        counts = {name: axis.points for name, axis in grid.items()}
-        identified[_LANDSCAPE] = _landscape(identifier, counts, identified["sysid"]["parameters"], kept[_LANDSCAPE])
+        counts, found = {name: axis.points for name, axis in grid.items()}, identified["sysid"]
+        at = {**found["parameters"], **found.get("own", {})}
+        identified[_LANDSCAPE] = _landscape(identifier, counts, at, kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, identified)
     for part in kept.values():
         forget_checkpoint(part.path)
+
+
+def _bounds(experiment: Experiment, search: Mapping[str, RangeSettings], names: Sequence[str]) -> dict[str, Bounds]:
+    """Bounds of all parameters, and of the values of trials and sessions."""
+    owners = {"session": list(dict.fromkeys(map(experiment.dataset.session, names))), "trial": [*names]}
+    return {
+        own: bounds_of(limits)
+        for name, limits in search.items()
+        for own in ([name] if limits.per == "all" else [own_name(name, owner) for owner in owners[limits.per]])
+    }
+
+
+def _guess(name: str, bounds: Bounds, known: Mapping[str, float]) -> float:
+    """First guess of a parameter; the mean of the prior for the value of a trial."""
+    parameter, owner = split_name(name)
+    return bounds.prior.mean if owner and bounds.prior is not None else known[parameter]
+
+
+def _separated(found: Mapping[str, Any], search: Mapping[str, RangeSettings]) -> dict[str, Any]:
+    """An identification with the values of trials and sessions in `own`, apart from those of all trials.
+
+    Other trials have the mean of the prior, and its deviation as their uncertainty.
+    """
+    held = {name: limits.prior for name, limits in search.items() if limits.per != "all" and limits.prior is not None}
+    if not held:
+        return dict(found)
+    names = [*found["parameters"]]
+    common = [name for name in names if not split_name(name)[1]]
+    own = {name: value for name, value in found["parameters"].items() if split_name(name)[1]}
+    parameters = {name: found["parameters"][name] for name in common}
+    result = {**found, "parameters": parameters | {n: p.mean for n, p in held.items()}, "own": own}
+    if (uncertainty := found["uncertainty"]) is None:
+        return result
+    rows = [names.index(name) for name in common]
+    correlation = np.eye(len(common) + len(held))
+    correlation[: len(rows), : len(rows)] = np.array(uncertainty["correlation"])[np.ix_(rows, rows)]
+    deviation = {name: uncertainty["deviation"][name] for name in common} | {n: p.deviation for n, p in held.items()}
+    poorest = {name: uncertainty["poorest"][name] for name in common} | dict.fromkeys(held, 0.0)
+    changed = {"deviation": deviation, "correlation": correlation.tolist(), "poorest": poorest}
+    return result | {
+        "uncertainty": {**uncertainty, **changed},
+        "own_deviation": {name: uncertainty["deviation"][name] for name in own},
+    }
 
 
 def bounds_of(settings: RangeSettings) -> Bounds:

@@ -6,7 +6,7 @@ step. Driven bodies are resampled to the time steps, during which inputs are con
 """
 
 import logging
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,8 @@ def import_recordings(context: StageContext) -> None:
     observed = observer.observe(settings.trials)
     if observer.drive is not None:
         _check_unit([x.driven for x in observed if x.driven is not None], settings.data, observer.drive)
+    if text := sessions_text({x.settings.name: x.raw.rate for x in observed}, [x.settings.session for x in observed]):
+        log.warning("import: %s", text)
     training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
     offsets = np.stack([_offset(observer, x) for x in observed])  # (R, M, 3) [m]
     mean = _mean_offset(offsets, observed, training)
@@ -75,6 +77,25 @@ def import_scaled(context: StageContext) -> None:
     offsets = np.stack([_offset(observer, x) for x in observed])
     shifts = _shifts(observer.settings.data, observed, dataset.bound - observer.nominal, offsets)
     _dataset(observer, observed, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
+
+
+def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) -> str:
+    """Returns a sentence on recordings that look like several sessions; empty if they do not, or if one is named.
+
+    Args:
+        rates: frames a second of the recordings, by trial.
+        sessions: configured sessions of these trials.
+    """
+    kinds: dict[int, list[str]] = {}
+    for name, rate in rates.items():
+        kinds.setdefault(round(rate), []).append(name)
+    if len(kinds) == 1 or any(sessions):
+        return ""
+    listed = "; ".join(f"{rate} Hz: {', '.join(names)}" for rate, names in sorted(kinds.items()))
+    return (
+        f"the recordings have different frame rates, as those of different sessions ({listed}): name them with "
+        "data.trials.NAME.session, so that markers may have other places in each."
+    )
 
 
 def _offset(observer: Observer, trial: Observed) -> FloatArray:
@@ -155,6 +176,7 @@ def _dataset(
         if trial.driven is not None:
             for series in inputs.values():
                 _fill_inputs(series[row], trial.driven, trial)
+    sessions = tuple(x.settings.session or "" for x in observed)
     base = _bases(observed, times, settings.time_step, observer.simulator.body.mesh.vertices)
     return Dataset(
         names=tuple(x.settings.name for x in observed),
@@ -171,6 +193,7 @@ def _dataset(
         inputs=inputs,
         channels={} if drive is None else {drive.quantity.name: drive.parts},
         base=base,
+        sessions=sessions if any(sessions) else (),
     )
 
 

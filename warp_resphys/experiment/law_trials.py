@@ -102,7 +102,9 @@ class LawTrials:
             self.checked = split.train[_HELD_OUT // 2 :: _HELD_OUT]
             self.learned = tuple(name for name in split.train if name not in self.checked)
         self.states = experiment.dataset.bound is None and experiment.dataset.velocity is not None
-        self.sysid = {name: float(value) for name, value in experiment.parameters("sysid").items()}
+        # A law is identified with values that all trials share.
+        common = experiment.identification("sysid").get("parameters", {})
+        self.sysid = {name: float(value) for name, value in common.items()}
         self.guess, self.mass = self._guess()
         self.shear = 2.0 * self.guess["c10"]
         self.seconds = settings.trial_seconds

@@ -19,7 +19,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
     """Returns the variance of predicted markers under the posterior of a model's identified parameters.
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
-    of these, so that it grows with the distance from the trials that determine them.
+    of these, so that it grows with the distance from the trials that determine them. In a session without identified
+    trials, the prior of the marker places adds its variance.
 
     Args:
         experiment: the experiment; solves that fail count as no spread.
@@ -34,6 +35,7 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
     if uncertainty is None:
         return None
     values, parameters = identified["parameters"], [*uncertainty["deviation"]]
+    own, placement = identified.get("own", {}), identified.get("placement") or {}
     deviation = np.array([uncertainty["deviation"][name] for name in parameters])
     root = _root(np.array(uncertainty["correlation"]))
     spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
@@ -44,7 +46,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
                 replay = experiment.replay(experiment.model_simulator(model), batch, model)
                 start = experiment.start(replay, model)
                 steps = np.concatenate([np.zeros((1, len(parameters))), _DIFFERENCE * np.diag(deviation)])
-                sets = {
+                sets = {name: replay.simulator.tensor([value]).expand(len(steps)) for name, value in own.items()}
+                sets |= {
                     name: replay.simulator.tensor(np.full(len(steps), values[name]) + steps[:, column])
                     for column, name in enumerate(parameters)
                 }
@@ -55,6 +58,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
                 moved = np.einsum("erTmc,ei->irTmc", (points[1:] - points[:1]) / _DIFFERENCE, root)
                 rows = [names.index(name) for name in batch]
                 spread[rows, : points.shape[2]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
+                if "sessions" in placement and experiment.dataset.session(batch[0]) not in placement["sessions"]:
+                    spread[rows] += sum(size**2 for size in placement["prior"])
                 progress.advance(len(batch))
     return spread
 

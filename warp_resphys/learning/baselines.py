@@ -252,7 +252,7 @@ def _fitted(series: Sequence[FloatArray], driving: FloatArray, ridge: float) -> 
     rows = [_rows(z[1:-1], z[:-2], own[: len(z) - 1]) for z, own in zip(series, driving, strict=True)]
     known, wanted = np.concatenate(rows), np.concatenate([z[2:] for z in series])
     gram = known.T @ known
-    gram += ridge * np.trace(gram) / len(gram) * np.eye(len(gram))
+    gram += (ridge * np.trace(gram) / len(gram) or 1.0) * np.eye(len(gram))  # Too few frames predict no motion.
     return np.asarray(np.linalg.solve(gram, known.T @ wanted))
 
 

@@ -6,10 +6,13 @@ all motions at once. Parameters are fractions of their ranges, "units" from 0 to
 Prior knowledge, normal distributions of parameters (`Prior`) and of marker places (`placement`), adds its squares,
 weighted as much as one independent residual of the data: by their mean square, times the number of frames that are
 correlated. That weight is computed at the start of a search and again at the minimum.
+
+A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
+mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +23,8 @@ from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from .bounds import Bounds
-from .parameters import check_names
-from .placement import Accuracy, DisplacedMarkers, Placement, estimate_placement
+from .parameters import check_names, split_name
+from .placement import Accuracy, DisplacedMarkers, Placement, estimate_placement, placement_jacobian
 from .replay import Replay, Start
 from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
@@ -81,6 +84,7 @@ class Misfit:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
             self._replays.append(self._prepared(replay, start, trials))
             self._weights.append(trials.loss_weight * (len(trials.names) / count))
+        self._moves = _moves_of(self.bounds)
         self.forget()
 
     def _prepared(self, replay: Replay, start: Start, trials: Trials) -> tuple[Replay, Start]:
@@ -142,32 +146,56 @@ class Misfit:
             derivatives: whether to compute derivatives; they are zero otherwise.
         """
         steps = _DIFFERENCE * np.where(unit < 0.5, 1.0, -1.0)
-        points = self.simulator.tensor(np.concatenate([unit[None], unit + np.diag(steps)][: 1 + derivatives]))
+        moves = self._moves if derivatives else []
+        moved = np.array([np.isin(np.arange(len(unit)), columns) * steps for columns in moves]).reshape(-1, len(unit))
+        points = self.simulator.tensor(np.concatenate([unit[None], unit + moved]))
         try:
             with torch.no_grad():
                 if derivatives and not any(self._equilibria):
                     self._find_equilibria(points[:1])
-                residuals, prior = self._residuals(points, varied=derivatives)
+                series = self._simulated(points, varied=derivatives)
         except ConvergenceError:
             return None
         self._keep_equilibria(points)
-
-        def slopes(values: FloatArray) -> FloatArray:
-            """(..., P) derivatives of values (E, ...) at the points."""
-            if not derivatives:
-                return np.zeros((*values.shape[1:], len(unit)))
-            change = values[1:] - values[:1]
-            return np.moveaxis(change / steps.reshape(-1, *[1] * (change.ndim - 1)), 0, -1)
-
-        trials = list[Linearised]()
-        for (replay, _), errors, weight in zip(self._replays, residuals, self._weights, strict=True):
+        if self._accuracy is None:
+            placed = [replay.errors(own) for (replay, _), own in zip(self._replays, series, strict=True)]
+            placing = _Placing.none(len(placed))
+        else:
+            with torch.no_grad():
+                placed, placing = self._at_best_placement(series)
+        trials, columns = list[Linearised](), list[FloatArray]()
+        for number, (errors, weight) in enumerate(zip(placed, self._weights, strict=True)):
+            observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
-            jacobian = slopes(weighted.reshape(*weighted.shape[:2], -1))
-            seen = replay.trials.observed.shape[-1] * replay.trials.seen.sum((1, 2)).cpu().numpy()
-            rows = weighted[0].reshape(*weighted.shape[1:3], -1)
-            trials += zip(rows, jacobian, seen.tolist(), strict=True)
-        rows = prior.double().cpu().numpy()
-        return LinearMisfit(trials, rows[0], slopes(rows))
+            flat = weighted.reshape(*weighted.shape[:2], -1)
+            slopes = self._slopes(flat[1:] - flat[:1], moves, steps, observed)  # (R, 3 T M, P)
+            seen = observed.observed.shape[-1] * observed.seen.sum((1, 2)).cpu().numpy()
+            trials += zip(weighted[0].reshape(*weighted.shape[1:3], -1), slopes, seen.tolist(), strict=True)
+            columns.append(slopes)
+        jacobians, placing_slopes = placing.projected(columns, math.sqrt(self.prior_weight))
+        trials = [(rows, own, seen) for (rows, _, seen), own in zip(trials, jacobians, strict=True)]
+        prior, slopes = self._prior_rows(unit)
+        return LinearMisfit(trials, np.concatenate([prior, placing.rows]), np.concatenate([slopes, placing_slopes]))
+
+    def _slopes(
+        self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials
+    ) -> FloatArray:
+        """(R, D, P) derivatives, from changes (E, R, D) of trials by `_moves_of` parameters, by steps (P,) of these."""
+        slopes, names = np.zeros((*change.shape[1:], len(steps))), [*self.bounds]
+        for own, columns in zip(change, moves, strict=True):
+            for column in columns:
+                owner = split_name(names[column])[1]
+                mine = [not owner or owner in (trial, trials.session) for trial in trials.names]
+                slopes[mine, :, column] = own[mine] / steps[column]
+        return slopes
+
+    def _prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(K,) weighted residuals of the priors of parameters, and their derivatives (K, P)."""
+        known = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
+        rows, slopes, weight = np.zeros(len(known)), np.zeros((len(known), len(unit))), math.sqrt(self.prior_weight)
+        for row, (i, mean, deviation) in enumerate(known):
+            rows[row], slopes[row, i] = weight * (unit[i] - mean) / deviation, weight / deviation
+        return rows, slopes
 
     def update_prior_weight(self, unit: FloatArray) -> float:
         """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
@@ -190,15 +218,15 @@ class Misfit:
             return None
         return uncertainty_of(found.trials, found.prior_slopes, self.prior_weight, self.bounds, unit)
 
-    def placement(self, unit: FloatArray) -> Placement | None:
-        """The best placement of the markers with (P,) parameters; None where it is exact."""
+    def placements(self, unit: FloatArray) -> dict[str, Placement]:
+        """The best placements of the markers with (P,) parameters, by session; empty where they are exact."""
         if self._accuracy is None:
-            return None
+            return {}
         with torch.no_grad():
             x = self.simulator.tensor(unit)[None]
             series = self._simulated(x)
             self._keep_equilibria(x)
-            return self._placed([points[0] for points in series])[0]
+            return self._at_best_placement(series)[1].placements
 
     def _residuals(self, unit: torch.Tensor, varied: bool = False) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
@@ -212,37 +240,65 @@ class Misfit:
             return [replay.errors(points) for replay, points in zip(replays, series, strict=True)], rows
         placed, placement_rows = [], []
         for row in range(len(unit)):
-            displaced = [points[row] for points in series]
-            if not self.prior_weight:  # The weight of the placement's prior is not known yet: nominal places.
-                placed.append([DisplacedMarkers.split(points)[0] for points in displaced])
-                placement_rows.append(unit.new_zeros(1))
-                continue
-            placement, deviations, moved = self._placed(displaced)
-            placement_rows.append(weight * deviations)
-            placed.append([placement.apply(points) for points in moved])
-        errors = [
-            replay.errors(torch.stack(points))
-            for replay, points in zip(replays, zip(*placed, strict=True), strict=True)
-        ]
+            own, placing = self._at_best_placement([points[row : row + 1] for points in series])
+            placed.append(own)
+            placement_rows.append(unit.new_tensor(placing.rows))
+        errors = [torch.cat(parts) for parts in zip(*placed, strict=True)]
         return errors, torch.cat([rows, torch.stack(placement_rows)], 1)
 
-    def _placed(self, series: Sequence[torch.Tensor]) -> tuple[Placement, torch.Tensor, list[torch.Tensor]]:
-        """The best placement for one set of parameters, the same in standard deviations, and the moved markers."""
+    def _at_best_placement(self, series: Sequence[torch.Tensor]) -> tuple[list[torch.Tensor], "_Placing"]:
+        """Residuals with the best placement for the first set of parameters, at which the loss is stationary in it.
+
+        While the weight of its prior is not known, the placement is nominal.
+
+        Args:
+            series: (E, R, T, 4 M, 3) simulated points and their displaced copies, by replay [m].
+
+        Returns:
+            (E, R, T, M, 3) by replay [m], and the placement.
+        """
         assert self._accuracy is not None
         parts = [DisplacedMarkers.split(points) for points in series]
-        with torch.no_grad():  # At the best placement, the loss is stationary in it.
-            markers, rotations = [points for points, _ in parts], [rotation for _, rotation in parts]
-            errors = [r.errors(points[None])[0] for (r, _), points in zip(self._replays, markers, strict=True)]
-            seen = [r.trials.seen for r, _ in self._replays]
-            placement, deviations = estimate_placement(
-                self._accuracy, self._centre, errors, seen, markers, rotations, self._weights, self.prior_weight
-            )
-        moved = [points + (rotation @ placement.offsets[..., None])[..., 0] for points, rotation in parts]
-        return placement, deviations, moved
+        replays, weight = [replay for replay, _ in self._replays], math.sqrt(self.prior_weight)
+        if not weight:
+            return [r.errors(points) for r, (points, _) in zip(replays, parts, strict=True)], _Placing.none(len(parts))
+        errors, columns = list(series), list[FloatArray]()
+        sessions, placements, rows = (
+            [replay.trials.session for replay in replays],
+            dict[str, Placement](),
+            list[FloatArray](),
+        )
+        for session in dict.fromkeys(sessions):
+            mine = [number for number, own in enumerate(sessions) if own == session]
+            with torch.no_grad():
+                placement, deviations = estimate_placement(
+                    self._accuracy,
+                    self._centre,
+                    [replays[k].errors(parts[k][0][:1])[0] for k in mine],
+                    [replays[k].trials.seen for k in mine],
+                    [parts[k][0][0] for k in mine],
+                    [parts[k][1][0] for k in mine],
+                    [self._weights[k] for k in mine],
+                    self.prior_weight,
+                )
+            placements[session] = placement
+            rows.append(weight * deviations.double().cpu().numpy())
+        for number, (points, rotations) in enumerate(parts):
+            placement, replay = placements[sessions[number]], replays[number]
+            placed = placement.apply(points + (rotations @ placement.offsets[..., None])[..., 0])
+            errors[number] = replay.errors(placed)
+            with torch.no_grad():
+                root = self._weights[number].sqrt()[:, None, None, None] * replay.trials.seen[..., None]
+                jacobian = placement_jacobian(placement, placed[0], rotations[0])
+                jacobian = jacobian * self._accuracy.deviations(points) * root[..., None]
+            columns.append(jacobian.flatten(1, 3).double().cpu().numpy())
+        return errors, _Placing(placements, sessions, columns, rows)
 
     def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
-        """(E,) values of each parameter."""
-        return {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
+        """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
+        values = {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
+        common = {split_name(name)[0]: range_ for name, range_ in self.bounds.items() if split_name(name)[1]}
+        return {n: torch.full_like(unit[:, 0], r.prior.mean) for n, r in common.items() if r.prior is not None} | values
 
     def _simulated(self, unit: torch.Tensor, varied: bool = False) -> list[torch.Tensor]:
         """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m], alike if they are `varied`."""
@@ -265,8 +321,8 @@ class Misfit:
         """Keeps the equilibria of the last simulation.
 
         Args:
-            unit: (1, P) parameters, or (1 + P, P) with one parameter changed in each further row. Equilibria of other
-                rows that were simulated are ignored.
+            unit: (1, P) parameters, or more rows in which the parameters of one of `_moves_of` are changed. Equilibria
+                of other rows that were simulated are ignored.
         """
         unit, before = unit.detach(), self._equilibria
         self.forget()
@@ -277,9 +333,77 @@ class Misfit:
             earlier = before[number]
             slopes = None if earlier is None else earlier.slopes
             if others:
-                steps = (unit[1:] - unit[:1]).diagonal()
-                slopes = (torch.stack(others) - first) / steps[:, None, None, None]
+                change = (torch.stack(others) - first).flatten(2).cpu().numpy()
+                steps = (unit[1:] - unit[:1]).abs().sum(0) * (unit[1:] - unit[:1]).sum(0).sign()
+                own = self._slopes(change, self._moves, steps.cpu().numpy(), replay.trials)
+                slopes = torch.from_numpy(np.moveaxis(own, -1, 0).copy()).to(first).unflatten(2, first.shape[1:])
             self._equilibria[number] = _Equilibria(unit[0], first, slopes)
+
+
+def _moves_of(names: Iterable[str]) -> list[list[int]]:
+    """Indices of the parameters that one motion gives the derivatives by: values of trials, of one parameter, together.
+
+    Raises:
+        InputError: values of trials and of sessions of one parameter, or a value of a trial without a prior.
+    """
+    moves: dict[str, list[int]] = {}
+    for number, name in enumerate(names):
+        parameter, owner = split_name(name)
+        moves.setdefault(parameter if owner else name, []).append(number)
+    return [*moves.values()]
+
+
+@dataclass(frozen=True)
+class _Placing:
+    """The best placements for one set of parameters.
+
+    Attributes:
+        placements: by session.
+        sessions: of each replay; empty if the placements are exact.
+        columns: (R, D, n) weighted derivatives of the residuals of each replay by its placement in standard deviations.
+        deviations: (n,) weighted placement in standard deviations, by session.
+    """
+
+    placements: dict[str, Placement]
+    sessions: list[str]
+    columns: list[FloatArray]
+    deviations: list[FloatArray]
+
+    @classmethod
+    def none(cls, count: int) -> "_Placing":
+        return cls({}, [""] * count, [], [])
+
+    @property
+    def rows(self) -> FloatArray:
+        """(K,) weighted residuals of the prior."""
+        return np.concatenate([np.zeros(0), *self.deviations])
+
+    def projected(self, jacobians: Sequence[FloatArray], weight: float) -> tuple[list[FloatArray], FloatArray]:
+        """Derivatives of the residuals, and of those of the prior, where the placement follows the parameters.
+
+        To first order it follows as in a linear problem (Kaufman, BIT 15 (1975) 49).
+
+        Args:
+            jacobians: (R, D, P) of each replay, at a constant placement.
+            weight: root of the weight of the prior.
+
+        Returns:
+            (D, P) of each trial, and (K, P).
+        """
+        if not self.columns:
+            return [own for jacobian in jacobians for own in jacobian], np.zeros((0, jacobians[0].shape[-1]))
+        follows: dict[str, FloatArray] = {}
+        for session in self.placements:
+            mine = [k for k, own in enumerate(self.sessions) if own == session]
+            a = np.concatenate([self.columns[k].reshape(-1, self.columns[k].shape[-1]) for k in mine])
+            j = np.concatenate([jacobians[k].reshape(-1, jacobians[k].shape[-1]) for k in mine])
+            follows[session] = np.linalg.solve(a.T @ a + weight**2 * np.eye(a.shape[1]), a.T @ j)
+        projected = [
+            own
+            for jacobian, columns, session in zip(jacobians, self.columns, self.sessions, strict=True)
+            for own in jacobian - columns @ follows[session]
+        ]
+        return projected, np.concatenate([-weight * follows[session] for session in self.placements])
 
 
 @dataclass(frozen=True)

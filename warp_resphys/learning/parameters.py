@@ -16,7 +16,19 @@ from ..io.errors import InputError
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
+_OWN: Final = "@"
 HUNG: Final = ("attached_mass", PAYLOAD.name)
+
+
+def own_name(name: str, owner: str) -> str:
+    """Name of a parameter's value for one trial, or for those of one session, such as ``tension_factor@bend_1``."""
+    return f"{name}{_OWN}{owner}"
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The parameter, and the trial or session whose value it is; empty for the value of all others."""
+    parameter, _, owner = name.partition(_OWN)
+    return parameter, owner
 
 
 def identifiable_parameters(simulator: Simulator) -> tuple[str, ...]:
@@ -43,7 +55,7 @@ def check_names(names: Iterable[str], known: Sequence[str]) -> None:
     Raises:
         InputError: a name is unknown.
     """
-    for name in names:
+    for name in (split_name(name)[0] for name in names):
         if name not in known:
             raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(known)}.")
 

@@ -38,6 +38,11 @@ class Accuracy:
     shift: float | None = None
     turn: float | None = None
 
+    def deviations(self, like: torch.Tensor) -> torch.Tensor:
+        """(3 M + 6,) standard deviations of offsets, shift and turn, for a tensor (..., M, 3) like the markers."""
+        each = [self.markers or 0.0] * (3 * like.shape[-2]) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
+        return like.new_tensor(each)
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -74,6 +79,15 @@ class Placement:
         return {"offsets": dict(zip(labels, self.offsets.tolist(), strict=True)), **rest}
 
     @classmethod
+    def mean(cls, placements: Sequence["Placement"]) -> "Placement":
+        """Returns the mean of placements, for rotations that are small."""
+        offsets, shift, turn = (
+            torch.stack([getattr(placement, name) for placement in placements]).mean(0)
+            for name in ("offsets", "shift", "turn")
+        )
+        return cls(offsets, shift, turn, placements[0].centre)
+
+    @classmethod
     def none(cls, count: int, centre: torch.Tensor) -> "Placement":
         """Returns the nominal placement of M markers."""
         zero = torch.zeros_like(centre)
@@ -85,6 +99,18 @@ class Placement:
         offsets = torch.tensor([plain["offsets"][label] for label in labels], dtype=torch.float64)
         rest = (torch.tensor(plain[key], dtype=torch.float64) for key in ("shift", "turn", "centre"))
         return cls(offsets, *rest)
+
+
+def plain_placements(placements: Mapping[str, Placement], labels: Sequence[str]) -> dict[str, Any]:
+    """Returns placements by session as JSON data: their mean, for other sessions, and those of `sessions`."""
+    plain = Placement.mean([*placements.values()]).plain(labels)
+    named = {session: placement.plain(labels) for session, placement in placements.items() if session}
+    return plain | ({"sessions": named} if named else {})
+
+
+def placement_of(plain: Mapping[str, Any], labels: Sequence[str], session: str = "") -> Placement:
+    """Returns the placement of a session from `plain_placements`; the mean of all for one that is not known."""
+    return Placement.from_plain(plain.get("sessions", {}).get(session, plain), labels)
 
 
 @dataclass(frozen=True)
@@ -166,16 +192,14 @@ def estimate_placement(
     Returns:
         The placement, and the same (P,) in standard deviations.
     """
-    count, like = errors[0].shape[-2], errors[0]
-    deviations = [accuracy.markers or 0.0] * (3 * count) + [accuracy.shift or 0.0] * 3 + [accuracy.turn or 0.0] * 3
-    scale = like.new_tensor(deviations)
+    count, scale = errors[0].shape[-2], accuracy.deviations(errors[0])
     solution, placement = torch.zeros_like(scale), Placement.none(count, centre)
     for _ in range(_ITERATIONS if accuracy.turn else 1):
         normal, right = torch.diag(torch.full_like(scale, prior_weight)), torch.zeros_like(scale)
         for error, visible, nominal, rotation, weight in zip(errors, seen, points, rotations, weights, strict=True):
             root = weight.sqrt()[:, None, None, None] * visible[..., None]  # (R, T, M, 1)
             placed = placement.apply(nominal + (rotation @ placement.offsets[..., None])[..., 0])
-            jacobian = (_jacobian(placement, placed, rotation) * scale * root[..., None]).flatten(0, 3)
+            jacobian = (placement_jacobian(placement, placed, rotation) * scale * root[..., None]).flatten(0, 3)
             residual = ((error + placed - nominal) * root).flatten() - jacobian @ solution
             normal = normal + jacobian.T @ jacobian
             right = right - jacobian.T @ residual
@@ -185,7 +209,7 @@ def estimate_placement(
     return placement, solution
 
 
-def _jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+def placement_jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
     """(R, T, M, 3, P) derivatives of placed markers by the offsets, the shift and the rotation vector.
 
     R(w + dw) = R(J dw) R(w), with J the left Jacobian of SO(3).

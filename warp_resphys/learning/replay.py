@@ -15,10 +15,11 @@ from ..data.input_response import InputResponse, response_of
 from ..data.observation import Observation
 from ..data.trials import Trials
 from ..dynamics.simulator import Constants, Simulator
+from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .feedback_equilibrium import equilibrium_under_feedback
-from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters
+from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
 
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
@@ -93,7 +94,8 @@ class Replay:
         """Returns constants and inputs of E sets of parameters and R trials, as (E R) environments; trials run fastest.
 
         Args:
-            parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W values.
+            parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W values; values of
+                single trials or sessions by `parameters.own_name`, beside the common value.
 
         Returns:
             The constants, the inputs of the trials, and those before time zero.
@@ -103,9 +105,9 @@ class Replay:
         """
         parameters = {} if parameters is None else parameters
         check_names([name for name in parameters if name not in self._shaped], self.parameter_names)
-        sim, count = self.simulator, len(self.trials.names)
+        sim = self.simulator
         sets = _count(parameters)
-        spread = {name: value.repeat_interleave(count, 0) for name, value in parameters.items()}
+        spread = self._spread(parameters, sets)
         constants = constants_of(sim, spread)
         inputs = self.trials.inputs.repeat(sets)
         changed = self._acting(inputs, spread)
@@ -116,6 +118,20 @@ class Replay:
         resting = self.trials.resting.repeat(sets)
         resting = resting.replace(**self._acting(resting, spread), **hung)
         return sim.prepare(constants), inputs, resting
+
+    def _spread(self, parameters: Parameters, sets: int) -> dict[str, torch.Tensor]:
+        """(E R,) values in all environments, from (E,) values; those of trials and sessions replace the common ones."""
+        count = len(self.trials.names)
+        spread = {name: v.repeat_interleave(count, 0) for name, v in parameters.items() if not split_name(name)[1]}
+        for name, value in parameters.items():
+            parameter, owner = split_name(name)
+            mine = [owner in (trial, self.trials.session) for trial in self.trials.names]
+            if owner and parameter not in spread:
+                raise InputError(f"{name} is the value of one trial: give {parameter}, that of the others, too.")
+            if owner and any(mine):
+                rows = torch.tensor(mine, device=value.device).repeat(sets)
+                spread[parameter] = torch.where(rows, value.repeat_interleave(count, 0), spread[parameter])
+        return spread
 
     def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
         """Inputs that act on the body under the commanded ones, with parameters (E R,) of their response."""

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
 from .data import MODELS, FloatArray, RunReport
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
@@ -52,6 +53,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         PageTable(MODELS[name][0], columns, parameter_rows(result, data.start, data.truth))
         for name, result in identified.items()
     ]
+    blocks += [table for result in identified.values() if (table := own_table(result)) is not None]
     ranges = {} if data.settings.identify is None else data.settings.identify.parameters
     uncertain = list(filter(None, (uncertainty_text(name, result, ranges) for name, result in identified.items())))
     notes = []
@@ -128,6 +130,28 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
         cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
         rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
     return rows
+
+
+def own_table(identified: Mapping[str, Any]) -> PageTable | None:
+    """Return the values of single trials and sessions, with their standard deviations; None if there are none."""
+    own, deviations = identified.get("own", {}), identified.get("own_deviation", {})
+    if not own:
+        return None
+    parameters = list(dict.fromkeys(split_name(name)[0] for name in own))
+    owners = list(dict.fromkeys(split_name(name)[1] for name in own))
+    wording = {parameter: parameter_wording(parameter) for parameter in parameters}
+    rows = []
+    for owner in owners:
+        cells = []
+        for parameter, (_, _, factor) in wording.items():
+            name = own_name(parameter, owner)
+            deviation = deviations.get(name)
+            beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
+            cells.append(Cell(digits(own.get(name), factor, deviation), beside=beside))
+        rows.append(Row(owner, cells))
+    columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]
+    note = "Identified for each by itself, near the mean of the prior, which all other trials have."
+    return PageTable("Trial or session", columns, rows, note)
 
 
 def parameter_wording(parameter: str) -> Wording:
@@ -207,7 +231,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     text += f"; they do not separate {', '.join(tied)}." if tied else "."
     for parameter, deviation in uncertainty["deviation"].items():
         prior = ranges[parameter].prior if parameter in ranges else None
-        if prior is not None and deviation > _UNINFORMED * prior.deviation:
+        if prior is not None and ranges[parameter].per == "all" and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
             where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
             text += f" They add almost nothing about {words[parameter]}: it stays at its prior, {where}."

@@ -118,7 +118,7 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
     if data.pages:
         rows = {**data.metrics["folds"], "Mean": data.metrics}
         means = _numbers({t: {m: e["mean"] for m, e in fold["errors_mm"].items()} for t, fold in rows.items()})
-        blocks.append(model_table("Test trial [mm]", means, _FOLDS, data.pages))
+        blocks.append(model_table("Test trial [mm]", means, data.metrics["errors_mm"], _FOLDS, data.pages))
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs outside the training range", heading=True))
         blocks.append(Items(ranges, "ranges"))
@@ -283,11 +283,11 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
     rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
     if len(rows) > 1:
         small = dict.fromkeys(data.others, OUTSIDE.lower())
-        blocks.append(model_table("Each trial [mm]", _numbers(rows), small=small))
+        blocks.append(model_table("Each trial [mm]", _numbers(rows), metrics["errors_mm"], small=small))
     if by_model := metrics.get("per_marker"):
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
-        blocks.append(model_table("Each marker [mm]", _numbers(by_label)))
+        blocks.append(model_table("Each marker [mm]", _numbers(by_label), metrics["errors_mm"]))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 
 

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from ..learning.baselines import BASELINES
 from ..learning.metrics import PUBLISHED_WINDOWS_MM
 from .data import MODELS, RunReport, models_in_figures
 from .page import (
@@ -46,12 +47,23 @@ def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 def model_table(
     head: str,
     rows: Mapping[str, Mapping[str, Cell]],
+    errors: Mapping[str, Mapping[str, Any]],
     note: str = "",
     pages: Mapping[str, str] | None = None,
     small: Mapping[str, str] | None = None,
 ) -> PageTable:
-    """Return a table of cells by row and model; `pages` are the links of rows, `small` is printed below their heads."""
-    models = [model for model in MODELS if any(model in row for row in rows.values())]
+    """Return a table of cells by row and model.
+
+    Args:
+        head: Above the first column.
+        rows: Cells by row and model.
+        errors: Summaries by model; of the models without physics, the one of least error is shown.
+        note: Below the table.
+        pages: Links of rows.
+        small: Printed below the heads of rows.
+    """
+    others = [model for model in BASELINES if model not in models_in_figures(errors)]
+    models = [model for model in MODELS if any(model in row for row in rows.values()) and model not in others]
     addresses, below = pages or {}, small or {}
     body = [
         Row(n, [r.get(m, Cell(NONE)) for m in models], small=below.get(n, ""), address=addresses.get(n, ""))
@@ -85,7 +97,8 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
         theirs = {m: percent_text(share, 1) for m, share in shares.items()}
         rows["Growth"] = {m: Cell(ours.get(m, NONE), theirs.get(m, "")) for m in next(iter(rows.values()))}
     note = "Growth of the mean error is from the shortest to the longest part of the same roll-outs."
-    return model_table("Mean error [mm]", rows, note + (" Small: published." if published else "")) if rows else None
+    note += " Small: published." if published else ""
+    return model_table("Mean error [mm]", rows, metrics.get("errors_mm", {}), note) if rows else None
 
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -118,7 +131,7 @@ def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
         cells = {m: Cell(_error(e), "" if m == base else shares.get(m, "")) for m, e in scales[scale].items()}
         rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
     note = "Inputs of the test trials times a factor; below the error, its difference from that of SysID."
-    return model_table("Inputs; mean error [mm]", rows, note) if rows else None
+    return model_table("Inputs; mean error [mm]", rows, scales[min(scales, key=float)], note) if rows else None
 
 
 def _error(summary: Mapping[str, Any]) -> str:

@@ -38,6 +38,16 @@ class RangeSettings(SpanSettings):
     """The search range of a parameter."""
 
     prior: PriorSettings | None = setting(None, "prior knowledge")
+    per: Literal["all", "session", "trial"] = setting(
+        "all",
+        "trials that share a value; session, trial: a value of each, near the mean of the prior, that of all others",
+    )
+
+    @model_validator(mode="after")
+    def _is_held(self) -> Self:
+        if self.per != "all" and self.prior is None:
+            raise ValueError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
+        return self
 
     @model_validator(mode="after")
     def _has_the_prior(self) -> Self:

@@ -71,6 +71,7 @@ class TrialSettings(Settings):
     onset: NotNegative | None = setting(None, "start of the inputs, by the clock of the recording; null: at once", "s")
     input_delay: float = setting(0.0, "delay of the inputs against their log, as clocks differ", "s")
     labels: Labels | None = setting(None, "of the markers of its file, in their order; null: those of the file")
+    session: Word | None = setting(None, "in which it was recorded; null: one session")
     payload: NotNegative = setting(0.0, "mass that hangs on the body", "kg")
     pull: Vector | None = setting(None, "force at the tip that holds a simulated body before its release", "N")
     base_motion: MotionSettings | None = setting(None, "of this trial, in place of data.base_motion")
@@ -99,6 +100,7 @@ class Trial(Settings):
     name: str
     begins: str  # one of `Begins`, or ``given`` where a simulation provides the state
     file: str | None = None  # its recording; None where it is simulated
+    session: str | None = None  # in which it was recorded
     payload: float = 0.0  # mass that hangs on the body [kg]
     pull: Vector | None = None  # force that holds the body before the release, in a simulated laboratory [N]
     sequence: int | None = None  # number of its random inputs, or None

@@ -1,5 +1,7 @@
 """Which marker is which, in recordings that do not name them."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -51,6 +53,12 @@ def test_ambiguous_markers_are_named():
     places = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]])  # a square
     with pytest.raises(DataFileError, match=r"swing.csv: which of its markers is which is not clear: .* 'a', "):
         assign(places @ TURN, places, NAMES[:4], source="swing.csv")
+    turned = np.concatenate([places[[2, 0]], [[0.5, 0.5, 0.0]], places[[1, 3]]])  # and a foreign one
+    with pytest.raises(DataFileError) as refused:
+        assign(turned @ TURN, places, NAMES[:4], source="swing.csv")
+    (pasted,) = re.findall(r"labels: \[(.*)\]\.", str(refused.value))
+    assert pasted.split(", ")[2] == "other_3"
+    assert sorted(pasted.split(", ")) == sorted([*NAMES[:4], "other_3"])
 
 
 def test_ambiguous_assignments_are_refused():

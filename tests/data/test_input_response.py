@@ -119,3 +119,16 @@ def test_a_characteristic_curve_of_slope_one_is_none_and_its_slopes_have_derivat
     assert torch.autograd.gradcheck(acting, (slopes,), atol=1e-6)
     steps = torch.diff(InputResponse(STEP, curve=(100.0, CURVE)).scaled(commands[:, 0, 0]))
     assert bool((steps >= -1e-9).all())
+
+
+def test_commands_within_the_dead_band_have_no_effect():
+    commands = np.array([-3.0, -1.0, 0.0, 0.5, 1.0, 1.5, 4.0])[:, None, None]
+    acting, _ = InputResponse(STEP, 2.0, dead_band=1.0).from_rest(commands)
+    np.testing.assert_allclose(acting[:, 0, 0], 2.0 * np.array([-2.0, 0.0, 0.0, 0.0, 0.0, 0.5, 3.0]))
+    np.testing.assert_array_equal(InputResponse(STEP, dead_band=0.0).from_rest(commands)[0], commands)
+    bands = torch.tensor([0.0, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
+    of_each = torch.as_tensor(commands).expand(-1, 3, 1)
+    result = InputResponse(STEP, dead_band=bands).from_rest(of_each)[0]
+    np.testing.assert_allclose(result[-1, :, 0].detach(), [4.0, 3.0, 0.0])
+    (slope,) = torch.autograd.grad(result[-1].sum(), bands)
+    np.testing.assert_allclose(slope, [-1.0, -1.0, 0.0])

@@ -222,3 +222,9 @@ def test_a_cluster_computes_what_one_process_computes(backend, tmp_path, monkeyp
     assert sum(count for count, _ in counted) == 3
     for steps, q in enumerate(results, start=1):
         np.testing.assert_allclose(q, falls(steps, lambda: None), rtol=0, atol=1e-12)
+
+
+def test_workers_repeat_no_warning_of_warp():
+    code = "import os; from warp_resphys.io.fan_out import _start_warp; _start_warp(); os.write(2, b'own message')"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (ended.stdout, ended.stderr) == ("", "own message")

@@ -285,6 +285,18 @@ class TestProgress:
             bar.advance(2)
         assert stream.getvalue() == "mesh: 2/2 bodies, 4 bodies/s, in 0:00\n"
 
+    def test_the_time_left_does_not_count_a_slow_start(self, clock):
+        """The first unit waits for its kernels for 60 s; the others take one."""
+        stream = io.StringIO()
+        with Progress("evaluate", 101, "frames", console=Console(file=stream)) as bar:
+            for number in range(41):
+                clock[0] += 60.0 if number == 0 else 1.0
+                bar.advance()
+        lines = stream.getvalue().splitlines()
+        assert lines[0] == "evaluate: 1/101 frames, 1:00 each, 1:40:00 left"
+        assert lines[1] == "evaluate: 11/101 frames, 1 frames/s, 1:30 left"
+        assert lines[-1] == "evaluate: 41/101 frames, 1 frames/s, 1:00 left"
+
     def test_slow_units_and_interruption(self, clock):
         stream = io.StringIO()
 

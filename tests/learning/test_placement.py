@@ -102,7 +102,8 @@ def test_the_placement_minimises_its_sum_of_squares():
         scaled = torch.cat([b[:12] / 1e-3, b[12:15] / 2e-3, b[15:] / 0.1])
         return (left.square().sum((1, 2, 3)) * weights[0]).sum() + 1e-5 * scaled.square().sum()
 
-    result, inside = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    placed = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    result, inside = placed.common, placed.deviations
     assert float(result.turn.norm()) > 0.02
     gradients = []
     for b in (torch.zeros(18).double(), torch.cat([result.offsets.flatten(), result.shift, result.turn])):
@@ -110,7 +111,7 @@ def test_the_placement_minimises_its_sum_of_squares():
         gradients.append(torch.autograd.grad(loss(b), b)[0])
     assert float(gradients[1].norm()) < 1e-4 * float(gradients[0].norm())
     np.testing.assert_allclose(inside[12:15], result.shift / 2e-3, rtol=1e-9)
-    held, _ = estimate_placement(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    held = estimate_placement(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5).common
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
 
@@ -258,8 +259,15 @@ def test_trials_have_their_own_gains():
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.05)
 
 
-def test_derivatives_by_the_values_of_trials_are_those_of_the_loss():
-    misfit = Misfit([gained()], OWN, accuracy=ACCURACY, centre=CENTRE.tolist())
+@pytest.mark.parametrize("sessions", [1, 2])
+def test_derivatives_by_the_values_of_trials_are_those_of_the_loss(sessions):
+    replay, start = gained()
+    parts = [(replay, start)]
+    if sessions > 1:
+        rows = [[0, 2, 3], [1, 4]]
+        trials = [replace(replay.trials.select(own), session=str(own)) for own in rows]
+        parts = [(Replay(SIM, bind(), t), start.select(own)) for t, own in zip(trials, rows, strict=True)]
+    misfit = Misfit(parts, OWN, accuracy=ACCURACY, centre=CENTRE.tolist())
     unit = np.array([0.45, 0.4, 0.6, 0.55, 0.3])
     misfit.update_prior_weight(unit)
     misfit.update_prior_weight(unit)

@@ -92,10 +92,12 @@ def assign(
     next_rms = others[0][1][0] if others else np.inf
     if next_rms < _CLEAR * max(rms, _LEAST):
         moved = [name for name, a, b in zip(names, best, others[0][0], strict=True) if a != b]
+        by_column = dict(zip(visible[list(best)].tolist(), names, strict=True))
+        labels = [by_column.get(column, f"other_{column + 1}") for column in range(len(np.asarray(seen)))]
         raise DataFileError(
             f"{source}: which of its markers is which is not clear: they fit to {_MILLI * rms:.1f} mm, and to "
-            f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; name them (labels), or correct "
-            "their places in the configuration."
+            f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; correct their places in the "
+            f"configuration or, if the first is right, give the recording labels: [{', '.join(labels)}]."
         )
     return Assignment(visible[list(best)], motion, rms, next_rms)
 

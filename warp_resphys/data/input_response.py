@@ -1,4 +1,4 @@
-"""Response of an input to its commands: factor, characteristic curve, delay, lag, slew rate, and exponential means.
+"""Response of an input to its commands: dead band, factor, curve, delay, lag, slew rate, and exponential means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -20,7 +20,7 @@ Number = torch.Tensor | float | None
 Curve = tuple[float, Mapping[str, Any]]  # typical command, and slopes by name
 
 SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
-RESPONSES = ("factor", "delay", "rise", "slew", *SLOPES)  # of an input to its commands
+RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", *SLOPES)  # of an input to its commands
 _FIRST_KNOT = 0.25  # of the typical command, where the second slope begins; the next knots are each twice as large
 _ROUNDED = 0.1  # of a knot: width over which the slope changes
 _LEAST_SLEW = 1e-12  # s/unit
@@ -43,6 +43,8 @@ class InputResponse:
             flow is choked; a number, or (1 or B,). None or zero for no limit.
         curve: typical command, and slopes of the characteristic curve by the names in `SLOPES`, numbers or (1 or B,);
             those left out are one. `_curved` describes it. None for a straight line.
+        dead_band: largest command without an effect, as of a tendon that hangs slack; larger ones act less by it. Zero
+            or more; a number, or (1 or B,). None for none.
         filters: F time constants of the exponential means [s].
     """
 
@@ -54,9 +56,10 @@ class InputResponse:
         rise: Number = None,
         slew: Number = None,
         curve: Curve | None = None,
+        dead_band: Number = None,
         filters: Sequence[float] = (),
     ) -> None:
-        self.filters, self._factor, self._curve = tuple(filters), factor, curve
+        self.filters, self._factor, self._curve, self._dead_band = tuple(filters), factor, curve, dead_band
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         follows = rise is not None or slew is not None
@@ -99,7 +102,11 @@ class InputResponse:
         return self(self.steady(0.0 * commands[0]), commands)[:2]
 
     def scaled(self, commands: Array) -> Array:
-        """Returns the input under constant commands (..., C): times the factor, and along the characteristic curve."""
+        """Returns the input under constant commands (..., C): beyond the dead band, with the factor, on the curve."""
+        if self._dead_band is not None:
+            like = _library(commands)
+            beyond = abs(commands) - _column(self._dead_band)
+            commands = like.sign(commands) * like.where(beyond > 0.0, beyond, 0.0 * beyond)
         scaled = commands if self._factor is None else commands * _column(self._factor)
         return scaled if self._curve is None else _curved(scaled, *self._curve)
 
@@ -118,12 +125,12 @@ class InputResponse:
 
 def response_of(
     quantity: Quantity, parameters: Mapping[str, torch.Tensor]
-) -> tuple[Number, Number, Number, Number, Curve | None]:
-    """Returns the identified factor, delay, rise, slew and curve of an input; None for those not identified."""
+) -> tuple[Number, Number, Number, Number, Curve | None, Number]:
+    """Returns the identified factor, delay, rise, slew, curve and dead band of an input; None where not identified."""
     own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
     slopes = {word: own[word] for word in SLOPES if own[word] is not None}
     curve = (quantity.typical, slopes) if slopes else None
-    return own["factor"], own["delay"], own["rise"], own["slew"], curve
+    return own["factor"], own["delay"], own["rise"], own["slew"], curve, own["dead_band"]
 
 
 def with_means(acting: Array, means: Array) -> Array:

@@ -177,6 +177,11 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
                 f"identify.parameters.{name}.lower is {limits.lower:g}: slew rates are positive, so it must be zero "
                 "or more, in s by the unit of the input."
             )
+        if word == "dead_band" and limits.lower < 0.0:
+            raise InputError(
+                f"identify.parameters.{name}.lower is {limits.lower:g}: a dead band is zero or more, in the unit of "
+                "the input."
+            )
         if word in SLOPES and limits.lower < 0.0:
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: a characteristic curve does not fall, so it "

@@ -70,7 +70,7 @@ def identify(context: StageContext) -> None:
                 if not changes(before, found["loss"]):
                     break
             if (where := wanted.placement) is not None and (found["placement"] or {}).get("sessions"):
-                prior = [size for size in (where.markers, where.shift) if size is not None]
+                prior = [where.between_sessions * size for size in (where.markers, where.shift) if size is not None]
                 found = {**found, "placement": {**found["placement"], "prior": prior}}
             identified[model] = _separated(found, searches[model]) | {"first_guess": guess}
     if wanted.grid is not None:
@@ -145,7 +145,7 @@ def _placement(experiment: Experiment) -> dict[str, Any]:
         return {}
     turn = None if wanted.turn is None else math.radians(wanted.turn)
     standing = [*markers.reference.values()] or [*markers.tracked.values()]
-    accuracy = Accuracy(wanted.markers, wanted.shift, turn)
+    accuracy = Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions)
     return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
 
 

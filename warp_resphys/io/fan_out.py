@@ -142,7 +142,7 @@ def fan_out(
 def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
     """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
-    wp.config.log_level = wp.LOG_WARNING  # without Warp's greeting in every worker
+    _start_warp()
     torch.set_num_threads(1)
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
@@ -158,6 +158,19 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
         raise WorkerError(str(error)) from None
     except Exception:
         raise WorkerFaultError(f"a worker process failed:\n{traceback.format_exc()}") from None
+
+
+def _start_warp() -> None:
+    """Starts Warp without its greeting, and without its warnings, which the parent process has shown."""
+    wp.config.log_level = wp.LOG_WARNING
+    shown = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)  # Its library writes them itself.
+        wp.init()
+    finally:
+        os.dup2(shown, 2)
+        os.close(shown)
 
 
 class _ProgressFile:

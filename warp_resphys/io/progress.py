@@ -43,12 +43,14 @@ class Progress:
         self._console = Console(stderr=True, quiet=not _shown) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
+        self._marks = ((0.0, 0), (0.0, 0))  # times at which the units done had doubled, and these units
         self._bars: Bars | None = None
         self._task = TaskID(0)
 
     def __enter__(self) -> Progress:
         """Starts the clock, and shows the bar in a terminal."""
         self._start = self._next = time.perf_counter()
+        self._marks = ((self._start, 0), (self._start, 0))
         if not self._console.is_terminal:
             self._next += _LINE_SECONDS
             return self
@@ -72,16 +74,22 @@ class Progress:
         self.done += count
         if fields:
             self._fields = fields
-        now = time.perf_counter()
+        now, new = time.perf_counter(), self.done - self._start_at
+        if new >= 2 * self._marks[1][1]:
+            self._marks = (self._marks[1], (now, new))
         if now >= self._next:
             self._show(now)
 
     def status(self) -> str:
-        """Count, rate, remaining time and latest values in one line."""
-        elapsed, new = time.perf_counter() - self._start, self.done - self._start_at
+        """Count, rate, remaining time and latest values in one line.
+
+        The rate is that of the later units, as the first ones wait for kernels to be compiled or processes to start.
+        """
+        now, new = time.perf_counter(), self.done - self._start_at
+        elapsed, (since, before) = now - self._start, self._marks[0]
         parts = [f"{self.done}/{self.total} {self.unit}"]
-        if new > 0 and elapsed > 0:
-            rate = new / elapsed
+        if new > before and now > since:
+            rate = (new - before) / (now - since)
             duration = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
             parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{duration} each")
             left = (self.total - self.done) / rate

@@ -18,7 +18,7 @@ from ..io.errors import ConvergenceError
 from ..linalg.least_squares import UnitBox, minimise
 from .bounds import Bounds
 from .misfit import FloatArray, Misfit
-from .placement import Accuracy, plain_placements
+from .placement import Accuracy
 from .replay import Replay, Start
 from .uncertainty import Uncertainty
 
@@ -37,7 +37,7 @@ class Identification:
     # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
     history: list[list[dict[str, float]]] = field(default_factory=list)
     at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
-    placement: dict[str, Any] | None = None  # of the markers, as `placement.plain_placements` has it
+    placement: dict[str, Any] | None = None  # of the markers, as `placement.Placed.plain` has it
     uncertainty: Uncertainty | None = None  # None if the simulation fails beside the minimum
 
 
@@ -168,13 +168,13 @@ class Identifier:
         unit = misfit.to_unit(best["parameters"])
         misfit.prior_weight = best.get("prior_weight", 0.0)
         misfit.forget()  # As in a resumed run, in which all attempts are finished.
-        placements = misfit.placements(unit)
+        placed = misfit.placed(unit)
         return Identification(
             parameters=best["parameters"],
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
             at_bounds=tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4),
-            placement=plain_placements(placements, self._labels) if placements else None,
+            placement=None if placed is None else placed.plain(self._labels),
             uncertainty=misfit.uncertainty(unit),
         )
 

@@ -24,7 +24,7 @@ from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from .bounds import Bounds
 from .parameters import check_names, split_name
-from .placement import Accuracy, DisplacedMarkers, Placement, estimate_placement, placement_jacobian
+from .placement import Accuracy, DisplacedMarkers, Placed, estimate_placement
 from .replay import Replay, Start
 from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
@@ -159,7 +159,7 @@ class Misfit:
         self._keep_equilibria(points)
         if self._accuracy is None:
             placed = [replay.errors(own) for (replay, _), own in zip(self._replays, series, strict=True)]
-            placing = _Placing.none(len(placed))
+            placing = _Placing.none()
         else:
             with torch.no_grad():
                 placed, placing = self._at_best_placement(series)
@@ -218,15 +218,15 @@ class Misfit:
             return None
         return uncertainty_of(found.trials, found.prior_slopes, self.prior_weight, self.bounds, unit)
 
-    def placements(self, unit: FloatArray) -> dict[str, Placement]:
-        """The best placements of the markers with (P,) parameters, by session; empty where they are exact."""
+    def placed(self, unit: FloatArray) -> Placed | None:
+        """The best placements of the markers with (P,) parameters; None where they are exact."""
         if self._accuracy is None:
-            return {}
+            return None
         with torch.no_grad():
             x = self.simulator.tensor(unit)[None]
             series = self._simulated(x)
             self._keep_equilibria(x)
-            return self._at_best_placement(series)[1].placements
+            return self._at_best_placement(series)[1].placed
 
     def _residuals(self, unit: torch.Tensor, varied: bool = False) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
@@ -261,38 +261,25 @@ class Misfit:
         parts = [DisplacedMarkers.split(points) for points in series]
         replays, weight = [replay for replay, _ in self._replays], math.sqrt(self.prior_weight)
         if not weight:
-            return [r.errors(points) for r, (points, _) in zip(replays, parts, strict=True)], _Placing.none(len(parts))
-        errors, columns = list(series), list[FloatArray]()
-        sessions, placements, rows = (
-            [replay.trials.session for replay in replays],
-            dict[str, Placement](),
-            list[FloatArray](),
-        )
-        for session in dict.fromkeys(sessions):
-            mine = [number for number, own in enumerate(sessions) if own == session]
-            with torch.no_grad():
-                placement, deviations = estimate_placement(
-                    self._accuracy,
-                    self._centre,
-                    [replays[k].errors(parts[k][0][:1])[0] for k in mine],
-                    [replays[k].trials.seen for k in mine],
-                    [parts[k][0][0] for k in mine],
-                    [parts[k][1][0] for k in mine],
-                    [self._weights[k] for k in mine],
-                    self.prior_weight,
-                )
-            placements[session] = placement
-            rows.append(weight * deviations.double().cpu().numpy())
+            return [r.errors(points) for r, (points, _) in zip(replays, parts, strict=True)], _Placing.none()
+        sessions, errors = [replay.trials.session for replay in replays], list(series)
+        with torch.no_grad():
+            result = estimate_placement(
+                self._accuracy,
+                self._centre,
+                [r.errors(points[:1])[0] for r, (points, _) in zip(replays, parts, strict=True)],
+                [replay.trials.seen for replay in replays],
+                [points[0] for points, _ in parts],
+                [rotations[0] for _, rotations in parts],
+                self._weights,
+                self.prior_weight,
+                sessions,
+            )
         for number, (points, rotations) in enumerate(parts):
-            placement, replay = placements[sessions[number]], replays[number]
-            placed = placement.apply(points + (rotations @ placement.offsets[..., None])[..., 0])
-            errors[number] = replay.errors(placed)
-            with torch.no_grad():
-                root = self._weights[number].sqrt()[:, None, None, None] * replay.trials.seen[..., None]
-                jacobian = placement_jacobian(placement, placed[0], rotations[0])
-                jacobian = jacobian * self._accuracy.deviations(points) * root[..., None]
-            columns.append(jacobian.flatten(1, 3).double().cpu().numpy())
-        return errors, _Placing(placements, sessions, columns, rows)
+            own = result.sessions[sessions[number]]
+            errors[number] = replays[number].errors(own.apply(points + (rotations @ own.offsets[..., None])[..., 0]))
+        columns = [slopes.flatten(1, 3).double().cpu().numpy() for slopes in result.columns]
+        return errors, _Placing(result, columns, weight * result.deviations.double().cpu().numpy())
 
     def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
         """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
@@ -358,25 +345,18 @@ class _Placing:
     """The best placements for one set of parameters.
 
     Attributes:
-        placements: by session.
-        sessions: of each replay; empty if the placements are exact.
-        columns: (R, D, n) weighted derivatives of the residuals of each replay by its placement in standard deviations.
-        deviations: (n,) weighted placement in standard deviations, by session.
+        placed: these; None if they are exact.
+        columns: (R, D, K) derivatives of the weighted residuals of each replay by the placements.
+        rows: (K,) weighted residuals of their prior.
     """
 
-    placements: dict[str, Placement]
-    sessions: list[str]
+    placed: Placed | None
     columns: list[FloatArray]
-    deviations: list[FloatArray]
+    rows: FloatArray
 
     @classmethod
-    def none(cls, count: int) -> "_Placing":
-        return cls({}, [""] * count, [], [])
-
-    @property
-    def rows(self) -> FloatArray:
-        """(K,) weighted residuals of the prior."""
-        return np.concatenate([np.zeros(0), *self.deviations])
+    def none(cls) -> "_Placing":
+        return cls(None, [], np.zeros(0))
 
     def projected(self, jacobians: Sequence[FloatArray], weight: float) -> tuple[list[FloatArray], FloatArray]:
         """Derivatives of the residuals, and of those of the prior, where the placement follows the parameters.
@@ -392,18 +372,10 @@ class _Placing:
         """
         if not self.columns:
             return [own for jacobian in jacobians for own in jacobian], np.zeros((0, jacobians[0].shape[-1]))
-        follows: dict[str, FloatArray] = {}
-        for session in self.placements:
-            mine = [k for k, own in enumerate(self.sessions) if own == session]
-            a = np.concatenate([self.columns[k].reshape(-1, self.columns[k].shape[-1]) for k in mine])
-            j = np.concatenate([jacobians[k].reshape(-1, jacobians[k].shape[-1]) for k in mine])
-            follows[session] = np.linalg.solve(a.T @ a + weight**2 * np.eye(a.shape[1]), a.T @ j)
-        projected = [
-            own
-            for jacobian, columns, session in zip(jacobians, self.columns, self.sessions, strict=True)
-            for own in jacobian - columns @ follows[session]
-        ]
-        return projected, np.concatenate([-weight * follows[session] for session in self.placements])
+        pairs = [*zip(self.columns, jacobians, strict=True)]
+        rows, slopes = (np.concatenate([x.reshape(-1, x.shape[-1]) for x in of]) for of in zip(*pairs, strict=True))
+        follows = np.linalg.solve(rows.T @ rows + weight**2 * np.eye(rows.shape[1]), rows.T @ slopes)
+        return [own for a, j in pairs for own in j - a @ follows], -weight * follows
 
 
 @dataclass(frozen=True)

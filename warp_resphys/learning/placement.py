@@ -32,11 +32,13 @@ class Accuracy:
         markers: of each coordinate of a marker's place on the body [m].
         shift: of each coordinate of the origin of the recording's frame [m].
         turn: of each component of its rotation vector [rad].
+        between_sessions: of what the placement of a session differs from that of all by, over those above.
     """
 
     markers: float | None = None
     shift: float | None = None
     turn: float | None = None
+    between_sessions: float = 0.5
 
     def deviations(self, like: torch.Tensor) -> torch.Tensor:
         """(3 M + 6,) standard deviations of offsets, shift and turn, for a tensor (..., M, 3) like the markers."""
@@ -79,15 +81,6 @@ class Placement:
         return {"offsets": dict(zip(labels, self.offsets.tolist(), strict=True)), **rest}
 
     @classmethod
-    def mean(cls, placements: Sequence["Placement"]) -> "Placement":
-        """Returns the mean of placements, for rotations that are small."""
-        offsets, shift, turn = (
-            torch.stack([getattr(placement, name) for placement in placements]).mean(0)
-            for name in ("offsets", "shift", "turn")
-        )
-        return cls(offsets, shift, turn, placements[0].centre)
-
-    @classmethod
     def none(cls, count: int, centre: torch.Tensor) -> "Placement":
         """Returns the nominal placement of M markers."""
         zero = torch.zeros_like(centre)
@@ -101,15 +94,8 @@ class Placement:
         return cls(offsets, *rest)
 
 
-def plain_placements(placements: Mapping[str, Placement], labels: Sequence[str]) -> dict[str, Any]:
-    """Returns placements by session as JSON data: their mean, for other sessions, and those of `sessions`."""
-    plain = Placement.mean([*placements.values()]).plain(labels)
-    named = {session: placement.plain(labels) for session, placement in placements.items() if session}
-    return plain | ({"sessions": named} if named else {})
-
-
 def placement_of(plain: Mapping[str, Any], labels: Sequence[str], session: str = "") -> Placement:
-    """Returns the placement of a session from `plain_placements`; the mean of all for one that is not known."""
+    """Returns the placement of a session from `Placed.plain`; the common one for a session that is not known."""
     return Placement.from_plain(plain.get("sessions", {}).get(session, plain), labels)
 
 
@@ -165,6 +151,29 @@ class DisplacedMarkers(Observation):
         return markers, torch.stack([copy - markers for copy in displaced], -1)
 
 
+@dataclass(frozen=True)
+class Placed:
+    """Placements with the least sum of squares.
+
+    Attributes:
+        common: placement of a session that is not known.
+        sessions: placement of each session.
+        deviations: (K,) the common placement and what those of the sessions differ from it by, in standard deviations;
+            the former alone for one session.
+        columns: (R, T, M, 3, K) derivatives of the weighted residuals by these, by group of trials.
+    """
+
+    common: Placement
+    sessions: dict[str, Placement]
+    deviations: torch.Tensor
+    columns: list[torch.Tensor]
+
+    def plain(self, labels: Sequence[str]) -> dict[str, Any]:
+        """Returns the placements as JSON data: the common one, and those of the named `sessions`."""
+        named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
+        return self.common.plain(labels) | ({"sessions": named} if named else {})
+
+
 def estimate_placement(
     accuracy: Accuracy,
     centre: torch.Tensor,
@@ -174,10 +183,11 @@ def estimate_placement(
     rotations: Sequence[torch.Tensor],
     weights: Sequence[torch.Tensor],
     prior_weight: float,
-) -> tuple[Placement, torch.Tensor]:
+    sessions: Sequence[str] | None = None,
+) -> Placed:
     """Returns the placement with the least sum of squares for one set of physical parameters (Gauss-Newton).
 
-    Sequences have one tensor for each group of trials.
+    Sequences have one entry for each group of trials.
 
     Args:
         accuracy: prior standard deviations.
@@ -188,25 +198,47 @@ def estimate_placement(
         rotations: (R, T, M, 3, 3) of the body at the markers.
         weights: (R,) of each trial's squared errors [1/m^2].
         prior_weight: of the squared placement in standard deviations.
-
-    Returns:
-        The placement, and the same (P,) in standard deviations.
+        sessions: of the groups; None for one.
     """
-    count, scale = errors[0].shape[-2], accuracy.deviations(errors[0])
-    solution, placement = torch.zeros_like(scale), Placement.none(count, centre)
+    own = [""] * len(errors) if sessions is None else [*sessions]
+    names = [*dict.fromkeys(own)]
+    count, each = errors[0].shape[-2], accuracy.deviations(errors[0])
+    size, further = len(each), len(names) if len(names) > 1 else 0
+    scale = torch.cat([each, *[accuracy.between_sessions * each] * further])
+    solution = torch.zeros_like(scale)
+
+    def placement(values: torch.Tensor) -> Placement:
+        return Placement(values[:-6].view(count, 3), values[-6:-3], values[-3:], centre)
+
+    def at(values: torch.Tensor) -> dict[str, Placement]:
+        parts = (scale * values).split(size)
+        return {name: placement(parts[0] + (parts[1 + k] if further else 0.0)) for k, name in enumerate(names)}
+
+    def columns(placements: Mapping[str, Placement]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Residuals (R, T, M, 3) and their derivatives (R, T, M, 3, K), weighted."""
+        result = []
+        for session, error, visible, nominal, rotation, weight in zip(
+            own, errors, seen, points, rotations, weights, strict=True
+        ):
+            root, where = weight.sqrt()[:, None, None, None] * visible[..., None], placements[session]
+            placed = where.apply(nominal + (rotation @ where.offsets[..., None])[..., 0])
+            slopes = error.new_zeros(*error.shape, len(scale))
+            jacobian = placement_jacobian(where, placed, rotation) * root[..., None]
+            for block in (0, 1 + names.index(session)) if further else (0,):
+                columns = slice(block * size, (block + 1) * size)
+                slopes[..., columns] = jacobian * scale[columns]
+            result.append(((error + placed - nominal) * root, slopes))
+        return result
+
     for _ in range(_ITERATIONS if accuracy.turn else 1):
         normal, right = torch.diag(torch.full_like(scale, prior_weight)), torch.zeros_like(scale)
-        for error, visible, nominal, rotation, weight in zip(errors, seen, points, rotations, weights, strict=True):
-            root = weight.sqrt()[:, None, None, None] * visible[..., None]  # (R, T, M, 1)
-            placed = placement.apply(nominal + (rotation @ placement.offsets[..., None])[..., 0])
-            jacobian = (placement_jacobian(placement, placed, rotation) * scale * root[..., None]).flatten(0, 3)
-            residual = ((error + placed - nominal) * root).flatten() - jacobian @ solution
+        for residual, slopes in columns(at(solution)):
+            jacobian = slopes.flatten(0, 3)
             normal = normal + jacobian.T @ jacobian
-            right = right - jacobian.T @ residual
+            right = right - jacobian.T @ (residual.flatten() - jacobian @ solution)
         solution = torch.linalg.solve(normal, right)
-        x = scale * solution
-        placement = Placement(x[:-6].view(count, 3), x[-6:-3], x[-3:], centre)
-    return placement, solution
+    placements = at(solution)
+    return Placed(placement(scale[:size] * solution[:size]), placements, solution, [c for _, c in columns(placements)])
 
 
 def placement_jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:

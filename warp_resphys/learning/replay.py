@@ -80,8 +80,9 @@ class Replay:
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
             body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
-            time [s] of its response, its reciprocal slew rate and the slopes of its characteristic curve:
-            ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew`` and ``pressure_slope_1``.
+            time [s] of its response, its reciprocal slew rate, its dead band and the slopes of its characteristic
+            curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew``,
+            ``pressure_dead_band`` and ``pressure_slope_1``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:

@@ -33,11 +33,19 @@ _COMMANDS: Final[Mapping[str, Wording]] = {
     "delay": ("Delay", "ms", 1e3),
     "rise": ("Time constant", "ms", 1e3),
     "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
+    "dead_band": ("Dead band", "", 1.0),
     "slope": ("Slope", "", 1.0),
 }
 _COMMAND: Final = re.compile(
-    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|slope)(?:_([1-8]))?"
+    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|slope)(?:_([1-8]))?"
 )
+_BANDS: Final = {
+    "pressure": ("kPa", 1e-3),
+    "stress": ("kPa", 1e-3),
+    "tension": ("N", 1.0),
+    "contraction": ("mm", 1e3),
+    "muscle_contraction": ("%", 100.0),
+}
 _WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
 _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
@@ -159,6 +167,8 @@ def parameter_wording(parameter: str) -> Wording:
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]
+        if word == "dead_band":
+            unit, factor = _BANDS["muscle_contraction" if parameter.startswith("muscle_contraction") else words]
         kind += f" {octave} of the characteristic" if octave else ""
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):

@@ -59,7 +59,7 @@ class Commands:
         h, filters = simulator.time_step, description.filters if description.learned is not None else ()
         driven = [name for name, declared in inputs.items() if declared.is_driven]
         responses = {name: response_of(simulator.inputs[name], parameters) for name in driven}
-        self._responses = {name: InputResponse(h, *own, filters) for name, own in responses.items()}
+        self._responses = {name: InputResponse(h, *own, filters=filters) for name, own in responses.items()}
 
     def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> RobotState:
         """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""

@@ -78,6 +78,7 @@ class PlacementSettings(Settings):
     markers: Positive | None = setting(None, "of each coordinate of a marker's position", "m")
     shift: Positive | None = setting(None, "of each coordinate of the recordings' origin", "m")
     turn: Positive | None = setting(None, "of each component of the recordings' rotation", "degrees")
+    between_sessions: Positive = setting(0.5, "of what a session differs from all by, over those above")
 
 
 def _without_null(values: Any) -> Any:

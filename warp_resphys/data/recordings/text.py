@@ -364,9 +364,15 @@ def _frames(
             "1e12; sort the lines and fill it in."
         )
     interval, span = float(np.median(steps)) if timed else 1.0, float(stamps[-1] - stamps[0])
-    foreign = DataFileError(f"{path}: its times or frame numbers do not belong to one recording; check that column.")
+
+    def foreign(row: int) -> DataFileError:
+        return DataFileError(
+            f"{path}, line {lines[row]}: from the line before on, time or frame passes from {stamps[row - 1]:g} to "
+            f"{stamps[row]:g}, so that both do not belong to one recording; check that column."
+        )
+
     if _LEAST_RECORDED * span > interval * len(stamps):
-        raise foreign
+        raise foreign(int(np.argmax(steps)) + 1)
     if timed:  # The whole recording gives the interval more precisely than rounded times.
         interval = span / round(span / interval)
     exact = (stamps - stamps[0]) / interval
@@ -378,7 +384,7 @@ def _frames(
             "at a constant frame rate."
         )
     if (np.diff(frames) < 1).any():
-        raise foreign
+        raise foreign(int(np.argmax(np.diff(frames) < 1)) + 1)
     if not timed:
         return frames, None
     rate = 1.0 / interval

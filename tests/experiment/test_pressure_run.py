@@ -461,6 +461,8 @@ def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(fini
     names, uncertainty = [*identified["parameters"]], identified["uncertainty"]
     deviation = 1e-3 * np.array([uncertainty["deviation"][name] for name in names])
     covariance = np.array(uncertainty["correlation"]) * np.outer(deviation, deviation)
+    ranges = np.diag([12.0 / uncertainty["ranges"][name] ** 2 for name in names])  # variances of uniform distributions
+    covariance = 1e-6 * np.linalg.inv(np.linalg.inv(1e6 * covariance) + ranges)
     means = [identified["parameters"][name] for name in names]
     drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
     replay = experiment.replay(experiment.model_simulator("sysid"), ["t003"], "sysid")

@@ -123,7 +123,8 @@ def _separated(found: Mapping[str, Any], search: Mapping[str, RangeSettings]) ->
     correlation[: len(rows), : len(rows)] = np.array(uncertainty["correlation"])[np.ix_(rows, rows)]
     deviation = {name: uncertainty["deviation"][name] for name in common} | {n: p.deviation for n, p in held.items()}
     poorest = {name: uncertainty["poorest"][name] for name in common} | dict.fromkeys(held, 0.0)
-    changed = {"deviation": deviation, "correlation": correlation.tolist(), "poorest": poorest}
+    ranges = {n: uncertainty["ranges"][n] for n in common} | {n: search[n].upper - search[n].lower for n in held}
+    changed = {"deviation": deviation, "correlation": correlation.tolist(), "poorest": poorest, "ranges": ranges}
     return result | {
         "uncertainty": {**uncertainty, **changed},
         "own_deviation": {name: uncertainty["deviation"][name] for name in own},

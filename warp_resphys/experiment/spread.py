@@ -20,7 +20,7 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
     of these, so that it grows with the distance from the trials that determine them. In a session without identified
-    trials, the prior of the marker places adds its variance.
+    trials, the prior of the marker places adds its variance. The ranges of the parameters limit their covariance.
 
     Args:
         experiment: the experiment; solves that fail count as no spread.
@@ -37,7 +37,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
     values, parameters = identified["parameters"], [*uncertainty["deviation"]]
     own, placement = identified.get("own", {}), identified.get("placement") or {}
     deviation = np.array([uncertainty["deviation"][name] for name in parameters])
-    root = _root(np.array(uncertainty["correlation"]))
+    ranges = uncertainty.get("ranges", {})
+    root = _root(np.array(uncertainty["correlation"]), deviation / [ranges.get(name, np.inf) for name in parameters])
     spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
     with Progress("evaluate: uncertainty of the parameters", len(names), "trials") as progress, torch.no_grad():
         for whole in experiment.batches(names):
@@ -64,7 +65,16 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
     return spread
 
 
-def _root(correlation: FloatArray) -> FloatArray:
-    """R with R R^T the correlation (P, P), without the parts that rounding makes negative."""
-    sizes, vectors = np.linalg.eigh(correlation)
+def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:
+    """R with R R^T the covariance of parameters over their standard deviations, which their ranges limit.
+
+    A range counts as a normal distribution of the variance of a uniform one: where the data leave a parameter open, the
+    linearised posterior would reach far beyond it.
+
+    Args:
+        correlation: (P, P) of the posterior.
+        shares: (P,) standard deviations over the ranges.
+    """
+    limited = np.linalg.solve(np.eye(len(shares)) + correlation * (12.0 * shares**2), correlation)
+    sizes, vectors = np.linalg.eigh(0.5 * (limited + limited.T))
     return np.asarray(vectors * np.sqrt(np.maximum(sizes, 0.0)))

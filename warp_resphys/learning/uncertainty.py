@@ -29,6 +29,7 @@ class Uncertainty:
     # the least certain direction: weights of the parameters, in fractions of their ranges
     poorest: dict[str, float]
     poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
+    ranges: dict[str, float]  # derivative of each parameter by its fraction of its range, in its unit
 
 
 def uncertainty_of(
@@ -62,6 +63,7 @@ def uncertainty_of(
         correlation=(covariance / np.outer(deviation, deviation)).tolist(),
         poorest=dict(zip(bounds, poorest.tolist(), strict=True)),
         poorest_deviation=float(np.sqrt(max(vectors[:, 0] @ covariance @ vectors[:, 0], 0.0))),
+        ranges=dict(zip(bounds, map(float, slopes), strict=True)),
     )
 
 

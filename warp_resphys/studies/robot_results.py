@@ -253,11 +253,15 @@ def verdict(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         [robots[name].title for name, result in measured.items() if getattr(result, kind)]
         for kind in ("is_needed", "is_helped")
     )
-    which = [f"{len(own)} of {len(measured)} robots{f' ({in_a_row(own)})' if own else ''}" for own in (needed, helped)]
+    compared = [result for result in measured.values() if result.beside is not None]
+    which = [
+        f"{len(own)} of {len(of)} robots{f' ({in_a_row(own)})' if own else ''}"
+        for own, of in ((needed, compared), (helped, measured))
+    ]
     few = [robots[name].title for name, result in measured.items() if len(result.tested) < LEAST_TRIALS]
     text = (
         "By its 90 % interval over the held-out trials, a corrected simulator leaves less error than everything else "
-        f"(uncorrected, a network alone, without physics) on {which[0]}, and the learned force reduces the error of "
-        f"identification on {which[1]}."
+        f"(uncorrected, a network alone, without physics) on {which[0]} for which all of these were measured, and the "
+        f"learned force reduces the error of identification on {which[1]}."
     )
     return text + (f" {in_a_row(few)}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")

@@ -24,6 +24,7 @@ FloatArray = NDArray[np.float64]
 LEVEL: Final = 0.9
 TIMES: Final = (0.1, 0.5)  # s after a change of the inputs: between just after, soon after and long after it
 _SAME: Final = 0.02  # change of an input that counts as none, over its largest size
+_QUARTERS: Final = 4  # parts of a single trial
 _LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
 _PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
@@ -51,6 +52,15 @@ class Predicted:
         """(T, M) whether a marker was seen."""
         return np.asarray(np.isfinite(self.observed).all(-1))
 
+    def quarters(self) -> "list[Predicted]":
+        """The four quarters of the frames; the whole of fewer frames."""
+        if len(self.since) < _QUARTERS:
+            return [self]
+        parts = np.array_split(np.arange(len(self.since)), _QUARTERS)
+        spreads = [None if self.spread is None else self.spread[own] for own in parts]
+        rows = zip(parts, spreads, strict=True)
+        return [Predicted(self.simulated[own], self.observed[own], self.since[own], spread) for own, spread in rows]
+
     @property
     def errors(self) -> FloatArray:
         """(T, M, 3) absolute errors [m], NaN where a marker was not seen."""
@@ -76,8 +86,9 @@ class Intervals:
         """Calibrates intervals on trials that the model was not trained on; None if a roll-out diverged.
 
         The quantile is the lowest for which intervals from all trials but one have the wanted mean coverage on the
-        trial left out; the largest deviation if there is no such quantile or only one trial. All trials have equal
-        weight. Markers that are seen in no trial get the largest quantile of the others, without a guarantee.
+        trial left out; the largest deviation if there is no such quantile, or only one pose. The quarters of a single
+        motion count as trials. All trials have equal weight.
+        Markers that are seen in no trial get the largest quantile of the others, without a guarantee.
 
         Args:
             trials: predicted by the model.
@@ -87,6 +98,8 @@ class Intervals:
         trials = [trial for trial in trials if trial.seen.any()]
         if not trials or not all(np.isfinite(trial.simulated[trial.seen]).all() for trial in trials):
             return None
+        if len(trials) == 1:
+            trials = [quarter for quarter in trials[0].quarters() if quarter.seen.any()]
         parts = [_parts(np.linalg.norm(t.simulated - rest, axis=-1), t.since, t.spread) for t in trials]
         errors = [trial.errors for trial in trials]
         variance = _variance(parts, errors)

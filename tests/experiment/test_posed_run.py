@@ -120,6 +120,21 @@ def test_a_law_is_identified_from_poses(poses, tmp_path):
     assert small_strain(found["constants"]).youngs_modulus == pytest.approx(MODULUS, rel=0.1)
 
 
+def test_refinement_knows_no_sessions():
+    session = "+data.trials.m1_u01.session=monday"
+    with pytest.raises(InputError, match=r"refinement knows one placement .* set refinement=none"):
+        check(composed("experiment=tentacle", "data.folder=recordings", session, "refinement=solver_in_the_loop"))
+    with pytest.raises(InputError, match=r"per is session, but no trial names one: set data\.trials\.NAME\.session"):
+        check(
+            composed(
+                "experiment=tentacle",
+                "data.folder=recordings",
+                "+identify.parameters.tendon_tension_factor={lower: 0.8, upper: 1.2, per: session, "
+                "prior: {mean: 1.0, deviation: 0.1}}",
+            )
+        )
+
+
 def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     """Between two sessions a marker moved by 4 mm; one tension is 7 % larger than its log says."""
     sessions = {"weak": "monday", "strong": "monday", "other": "friday", "second": "friday", "both": "friday"}

@@ -15,7 +15,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.page import NONE, error_parts
 from warp_resphys.studies.reproduction import reproduce
-from warp_resphys.studies.robot_results import Measured, summary, verdict
+from warp_resphys.studies.robot_results import Measured, _beside, summary, verdict
 from warp_resphys.studies.rows import Reproduction
 
 SMALL = [
@@ -129,6 +129,13 @@ def measured(*gain):
     errors = {model: {"mean": 2.0, "std": 0.5} for model in ("simulation", "sysid")}
     row |= {"errors_mm": errors, "gains": {"sysid": None, "resphys": share}, "intervals": None}
     return parse(Measured, {**row, "seconds": 90.0, "moved_mm": None})
+
+
+def test_the_best_corrected_model_is_one_of_the_table():
+    errors = {"rest": 9.0, "simulation": 2.0, "sysid_elastic": 0.1, "sysid": 1.0, "published": 0.1}
+    row = _beside({"per_trajectory": [{"name": "a", "errors_mm": errors}]})
+    assert (row.corrected, row.other) == ("sysid", "simulation")
+    assert row.gain.share == pytest.approx(0.5)
 
 
 def test_a_force_helps_where_the_whole_interval_of_several_trials_does():

@@ -199,6 +199,10 @@ def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
     tables = [run.recorded.trials] if run.recorded is not None else []
     tables += [run.laboratory.trials] if run.laboratory is not None else []
     named = any(trial.session for table in tables for trial in table.values())
+    if named and run.refinement is not None and identify.placement is not None:
+        raise InputError(
+            "refinement knows one placement of the markers, and trials name sessions: set refinement=none."
+        )
     for name, limits in identify.parameters.items():
         if limits.per == "session" and not named:
             raise InputError(

@@ -1,14 +1,17 @@
 """How uncertain predicted markers are because the identified parameters are."""
 
+import logging
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
 from .experiment import Experiment
+
+log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 
@@ -23,7 +26,7 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
     trials, the prior of the marker places adds its variance. The ranges of the parameters limit their covariance.
 
     Args:
-        experiment: the experiment; solves that fail count as no spread.
+        experiment: the experiment; trials that cannot be simulated have no spread, which a warning says.
         model: with identified parameters.
         names: names of the R trials.
 
@@ -54,7 +57,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
                 }
                 try:
                     points = (replay if replay.is_static else replay.varied)(start, sets).double().cpu().numpy()
-                except ConvergenceError:
+                except ConvergenceError as error:
+                    log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
                     points = np.zeros((len(steps), *spread[: len(batch)].shape, 3))
                 moved = np.einsum("erTmc,ei->irTmc", (points[1:] - points[:1]) / _DIFFERENCE, root)
                 rows = [names.index(name) for name in batch]

@@ -251,9 +251,9 @@ def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> Floa
 
     starts = (np.full(len(used), value) for value in (-np.log(len(used)), -3.0))
     bounds = [(_SMALLEST, 3.0)] * len(used)
-    found = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
+    ends = [minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     result = np.zeros(len(sizes))
-    result[used] = mean * np.exp(min(found, key=lambda end: float(end.fun)).x) / sizes[used]
+    result[used] = mean * np.exp(min(ends, key=lambda end: float(end.fun)).x) / sizes[used]
     result[[0, -1]] += _LEAST * mean, 1.0
     return result
 

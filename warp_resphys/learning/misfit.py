@@ -228,9 +228,9 @@ class Misfit:
             self._keep_equilibria(x)
             return self._at_best_placement(series)[1].placed
 
-    def _residuals(self, unit: torch.Tensor, varied: bool = False) -> tuple[list[torch.Tensor], torch.Tensor]:
+    def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
-        series = self._simulated(unit, varied)
+        series = self._simulated(unit)
         weight = math.sqrt(self.prior_weight)
         priors = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
         columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in priors]
@@ -328,11 +328,7 @@ class Misfit:
 
 
 def _moves_of(names: Iterable[str]) -> list[list[int]]:
-    """Indices of the parameters that one motion gives the derivatives by: values of trials, of one parameter, together.
-
-    Raises:
-        InputError: values of trials and of sessions of one parameter, or a value of a trial without a prior.
-    """
+    """Indices of the parameters that one motion gives the derivatives by: all values of trials of a parameter."""
     moves: dict[str, list[int]] = {}
     for number, name in enumerate(names):
         parameter, owner = split_name(name)

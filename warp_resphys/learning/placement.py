@@ -42,8 +42,8 @@ class Accuracy:
 
     def deviations(self, like: torch.Tensor) -> torch.Tensor:
         """(3 M + 6,) standard deviations of offsets, shift and turn, for a tensor (..., M, 3) like the markers."""
-        each = [self.markers or 0.0] * (3 * like.shape[-2]) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
-        return like.new_tensor(each)
+        sizes = [self.markers or 0.0] * (3 * like.shape[-2]) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
+        return like.new_tensor(sizes)
 
 
 @dataclass(frozen=True)
@@ -202,9 +202,9 @@ def estimate_placement(
     """
     own = [""] * len(errors) if sessions is None else [*sessions]
     names = [*dict.fromkeys(own)]
-    count, each = errors[0].shape[-2], accuracy.deviations(errors[0])
-    size, further = len(each), len(names) if len(names) > 1 else 0
-    scale = torch.cat([each, *[accuracy.between_sessions * each] * further])
+    count, common = errors[0].shape[-2], accuracy.deviations(errors[0])
+    size, further = len(common), len(names) if len(names) > 1 else 0
+    scale = torch.cat([common, *[accuracy.between_sessions * common] * further])
     solution = torch.zeros_like(scale)
 
     def placement(values: torch.Tensor) -> Placement:
@@ -223,7 +223,7 @@ def estimate_placement(
             root, where = weight.sqrt()[:, None, None, None] * visible[..., None], placements[session]
             placed = where.apply(nominal + (rotation @ where.offsets[..., None])[..., 0])
             slopes = error.new_zeros(*error.shape, len(scale))
-            jacobian = placement_jacobian(where, placed, rotation) * root[..., None]
+            jacobian = _jacobian(where, placed, rotation) * root[..., None]
             for block in (0, 1 + names.index(session)) if further else (0,):
                 columns = slice(block * size, (block + 1) * size)
                 slopes[..., columns] = jacobian * scale[columns]
@@ -241,7 +241,7 @@ def estimate_placement(
     return Placed(placement(scale[:size] * solution[:size]), placements, solution, [c for _, c in columns(placements)])
 
 
-def placement_jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+def _jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
     """(R, T, M, 3, P) derivatives of placed markers by the offsets, the shift and the rotation vector.
 
     R(w + dw) = R(J dw) R(w), with J the left Jacobian of SO(3).

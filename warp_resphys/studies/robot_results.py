@@ -112,7 +112,7 @@ def _is_clear(gain: Share | None) -> bool:
 
 
 def _beside(metrics: Mapping[str, Any]) -> Beside | None:
-    errors = trial_errors(metrics)
+    errors = {model: own for model, own in trial_errors(metrics).items() if model in (*BASELINES, *_MODELS)}
     corrected, other = best_pair(errors, untrained(epochs_kept(metrics)))
     gain = _gain(metrics, corrected, other)
     return None if gain is None else Beside(corrected=corrected, other=other, gain=gain)

@@ -320,6 +320,23 @@ while (claim := study.claim()) is not None:
             (2, "running", None),
         ]
 
+    def test_a_process_that_ends_while_it_draws_settings_changes_none(self, tmp_path, monkeypatch):
+        expected = study_in(tmp_path / "whole").claim().settings
+        study = study_in(tmp_path / "cut")
+
+        def draws_one_setting(space):
+            trial = type(study._study).ask(study._study)
+            trial._suggest(*next(iter(space.items())))
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patched:
+            patched.setattr(study._study, "ask", draws_one_setting)
+            with pytest.raises(KeyboardInterrupt):
+                study.claim()
+        study._lock_of(0).release()
+        taken = study_in(tmp_path / "cut").claim()
+        assert (taken.number, taken.settings) == (0, expected)
+
     def test_trials_that_fail_do_not_count_and_those_that_are_given_up_do(self, tmp_path):
         study = study_in(tmp_path, trials=2)
         study.end(study.claim(), None, 1.0, TrialState.FAIL)

@@ -123,7 +123,7 @@ class Study:
                 if running.state == TrialState.RUNNING:
                     with suppress(Timeout), self._lock_of(number).acquire(timeout=0):
                         self._study.tell(running.number, state=TrialState.FAIL)
-                        self._study.enqueue_trial(running.params, user_attrs={_CONTINUES: number})
+                        self._study.enqueue_trial(self._drawn(running), user_attrs={_CONTINUES: number})
             if len(self._trials(TrialState.RUNNING, TrialState.COMPLETE, TrialState.PRUNED)) >= self.trials:
                 return None
             waiting = [lost.user_attrs[_CONTINUES] for lost in self._trials(TrialState.WAITING)]
@@ -136,6 +136,11 @@ class Study:
             trial = self._study.ask({key: dimension.distribution for key, dimension in self.space.items()})
             trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
             return Claim(number, self._settings(trial.params), trial, lock)
+
+    def _drawn(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Returns the settings of a trial; those given if its process ended while it drew them, to draw anew."""
+        complete = trial.params.keys() >= self.space.keys()
+        return trial.params if complete else trial.system_attrs.get("fixed_params", {})
 
     def _lock_of(self, number: int) -> FileLock:
         return FileLock(self.folder / "trials" / f"{number}.lock")

@@ -1,4 +1,4 @@
-"""Response of an input to its commands: dead band, factor, curve, delay, lag, slew rate, and exponential means.
+"""Response of an input to its commands: zero, dead band, factor, curve, delay, lag, slew rate, exponential means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -20,7 +20,7 @@ Number = torch.Tensor | float | None
 Curve = tuple[float, Mapping[str, Any]]  # typical command, and slopes by name
 
 SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
-RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", *SLOPES)  # of an input to its commands
+RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", "zero", *SLOPES)  # of an input to its commands
 _FIRST_KNOT = 0.25  # of the typical command, where the second slope begins; the next knots are each twice as large
 _ROUNDED = 0.1  # of a knot: width over which the slope changes
 _LEAST_SLEW = 1e-12  # s/unit
@@ -45,6 +45,9 @@ class InputResponse:
             those left out are one. `_curved` describes it. None for a straight line.
         dead_band: largest command without an effect, as of a tendon that hangs slack; larger ones act less by it. Zero
             or more; a number, or (1 or B,). None for none.
+        zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; a number, or (1 or B,). None
+            for zero.
+        lower: least input; with a zero, lower ones count as this one.
         filters: F time constants of the exponential means [s].
     """
 
@@ -57,9 +60,12 @@ class InputResponse:
         slew: Number = None,
         curve: Curve | None = None,
         dead_band: Number = None,
+        zero: Number = None,
+        lower: float = -math.inf,
         filters: Sequence[float] = (),
     ) -> None:
         self.filters, self._factor, self._curve, self._dead_band = tuple(filters), factor, curve, dead_band
+        self._zero, self._lower = zero, lower
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         follows = rise is not None or slew is not None
@@ -102,7 +108,10 @@ class InputResponse:
         return self(self.steady(0.0 * commands[0]), commands)[:2]
 
     def scaled(self, commands: Array) -> Array:
-        """Returns the input under constant commands (..., C): beyond the dead band, with the factor, on the curve."""
+        """Returns the input under constant commands (..., C): beyond zero and dead band, with factor, on the curve."""
+        if self._zero is not None:
+            moved = commands - _column(self._zero)
+            commands = _library(commands).where(moved > self._lower, moved, 0.0 * moved + self._lower)
         if self._dead_band is not None:
             like = _library(commands)
             beyond = abs(commands) - _column(self._dead_band)
@@ -125,12 +134,13 @@ class InputResponse:
 
 def response_of(
     quantity: Quantity, parameters: Mapping[str, torch.Tensor]
-) -> tuple[Number, Number, Number, Number, Curve | None, Number]:
-    """Returns the identified factor, delay, rise, slew, curve and dead band of an input; None where not identified."""
+) -> tuple[Number, Number, Number, Number, Curve | None, Number, Number, float]:
+    """Returns the identified factor, delay, rise, slew, curve, dead band and zero or None, and the least input."""
     own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
     slopes = {word: own[word] for word in SLOPES if own[word] is not None}
     curve = (quantity.typical, slopes) if slopes else None
-    return own["factor"], own["delay"], own["rise"], own["slew"], curve, own["dead_band"]
+    first = own["factor"], own["delay"], own["rise"], own["slew"]
+    return *first, curve, own["dead_band"], own["zero"], quantity.lower
 
 
 def with_means(acting: Array, means: Array) -> Array:

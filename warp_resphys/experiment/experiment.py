@@ -37,8 +37,10 @@ from .files import (
     GIVEN,
     IDENTIFICATION,
     LAW_FILE,
+    RESTING,
     SCALED_DATASET,
     STATIC,
+    UNDER_INPUTS,
     Dataset,
     read_dataset,
     read_if_there,
@@ -225,7 +227,7 @@ class Experiment:
         if begins == "released":
             return estimate_release(simulator, replay.observe, trials, self.settings.release, values)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
-        if begins == STATIC:  # Small changes of a parameter then start close to the solution.
+        if begins in (STATIC, UNDER_INPUTS):  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.prepare(values)
                 guess = simulator.static_equilibrium(resting, constants).q
@@ -311,7 +313,11 @@ class Experiment:
             constant += [] if moving is None else [moving[0]]
             return torch.cat(constant, -1) if constant else None
         response = InputResponse(replay.simulator.time_step, filters=filters)
-        series = [with_means(*response.from_rest(values)) for values in driven]
+        before = [resting.actuation.get(name) for name in acting.actuation if name != PAYLOAD.name]
+        series = []
+        for values, first in zip(driven, before, strict=True):
+            memory = response.steady(0.0 * values[0] if first is None else first)
+            series.append(with_means(*response(memory, values)[:2]))
         series += [] if moving is None else [moving]
         if not series:
             return constant[0] if constant else None
@@ -331,7 +337,7 @@ class Experiment:
         Only the part of each trial that is used for training is returned.
         """
         simulator, trials = replay.simulator, replay.trials
-        if self.dataset.smoothed is not None and self.begins(trials.names[0]) == "rest":
+        if self.dataset.smoothed is not None and self.begins(trials.names[0]) in RESTING:
             smoothed = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
             targets = later(smoothed, start.delay, simulator.time_step)
         elif self.begins(trials.names[0]) in (GIVEN, STATIC):

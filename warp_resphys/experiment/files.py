@@ -48,6 +48,8 @@ REPORT: Final = "report.html"
 
 GIVEN: Final = "given"  # beginning of simulated trials, whose initial state is known
 STATIC: Final = "static"
+UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the first frame
+RESTING: Final = ("rest", UNDER_INPUTS)  # of motions that inputs begin, read at the time steps
 _KIND = "dataset"
 _UNITS = {
     **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
@@ -213,7 +215,8 @@ class Dataset:
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
             given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
-        resting = Inputs(**{key: given[key][-1] for key in self.inputs}) if static else Inputs()
+        before = {STATIC: -1, UNDER_INPUTS: 0}.get(self.begins[rows[0]])
+        resting = Inputs() if before is None else Inputs(**{key: given[key][before] for key in self.inputs})
         times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
         held, session = torch.from_numpy(self.held[rows]), self.session(names[0])
         return Trials(tuple(names), times, observed, held, Inputs(**given), resting, session)

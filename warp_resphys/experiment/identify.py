@@ -1,5 +1,6 @@
 """Stage: identifies the physical parameters from the training trials."""
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..io.errors import ConvergenceError
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
@@ -19,8 +21,10 @@ from ..learning.replay import Replay, Start
 from ..settings.learning import RangeSettings
 from ..settings.stages import IdentifyStage
 from .experiment import MODELS, Experiment
-from .files import IDENTIFICATION
+from .files import IDENTIFICATION, RESTING
 from .trials import evenly
+
+log = logging.getLogger(__name__)
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
 _LANDSCAPE = "landscape"
@@ -45,7 +49,7 @@ def identify(context: StageContext) -> None:
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
     ranges = {model: _bounds(experiment, search, names) for model, search in searches.items() if search}
     kinds = {model: MODELS[model][0] for model in ranges}
-    estimated = ("released", "rest") if settings.release.delay > 0.0 else ("released",)
+    estimated = ("released", *RESTING) if settings.release.delay > 0.0 else ("released",)
     released = any(experiment.begins(name) in estimated for name in names)
     evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
     kept = {
@@ -83,6 +87,13 @@ def identify(context: StageContext) -> None:
         at = {**found["parameters"], **found.get("own", {})}
         identified[_LANDSCAPE] = _landscape(identifier, counts, at, kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, identified)
+    for model in ranges:
+        values, deviations = _of_first_frames(experiment, model, searches[model], names)
+        if values:
+            own = {"own": identified[model]["own"] | values}
+            own["own_deviation"] = identified[model].get("own_deviation", {}) | deviations
+            identified[model] = identified[model] | own
+    write_json(context.run_dir / IDENTIFICATION, identified)
     for part in kept.values():
         forget_checkpoint(part.path)
 
@@ -106,7 +117,7 @@ def _guess(name: str, bounds: Bounds, known: Mapping[str, float]) -> float:
 def _separated(found: Mapping[str, Any], search: Mapping[str, RangeSettings]) -> dict[str, Any]:
     """An identification with the values of trials and sessions in `own`, apart from those of all trials.
 
-    Other trials have the mean of the prior, and its deviation as their uncertainty.
+    Other trials have the mean of the prior, and its deviation as their uncertainty, before `_of_first_frames`.
     """
     held = {name: limits.prior for name, limits in search.items() if limits.per != "all" and limits.prior is not None}
     if not held:
@@ -129,6 +140,33 @@ def _separated(found: Mapping[str, Any], search: Mapping[str, RangeSettings]) ->
         "uncertainty": {**uncertainty, **changed},
         "own_deviation": {name: uncertainty["deviation"][name] for name in own},
     }
+
+
+def _of_first_frames(
+    experiment: Experiment, model: str, search: Mapping[str, RangeSettings], learned: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Own values of validation and test trials, from their first frames (`release.window`), and their deviations.
+
+    Everything else is as identified. Values that these frames do not show stay near the mean of their prior.
+    """
+    settings, values, deviations = experiment.settings, dict[str, float](), dict[str, float]()
+    assert isinstance(settings, IdentifyStage)
+    wanted = {name: bounds_of(limits) for name, limits in search.items() if limits.per == "trial"}
+    names = [name for name in settings.split.names if name not in learned and experiment.begins(name) in RESTING]
+    known = experiment.identification(model)["parameters"]
+    for name in names if wanted else ():
+        replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
+        bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
+        guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
+        identifier = Identifier(replays, bounds, settings.release.window, known=known)
+        try:
+            found = identifier.run([guess], settings.identify.max_evaluations)
+        except ConvergenceError as error:
+            log.warning("identify: the first frames of %s show none of its own values: %s", name, error)
+            continue
+        values |= found.parameters
+        deviations |= {} if found.uncertainty is None else found.uncertainty.deviation
+    return values, deviations
 
 
 def bounds_of(settings: RangeSettings) -> Bounds:

@@ -24,7 +24,7 @@ from ..settings.stages import ImportStage
 from ..settings.trials import ReadingSettings
 from .actuators import Drive
 from .build import bound_markers
-from .files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET, Dataset, read_dataset
+from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, Dataset, read_dataset
 from .observing import Observed, Observer
 from .reading import vertical
 from .trials import evenly
@@ -149,7 +149,7 @@ def _dataset(
     settings, drive = observer.settings, observer.drive
     cutoff, steps = settings.data.cutoff, settings.data.steps
     frames = max(len(x.moving.positions) if x.settings.is_released else 1 for x in observed)
-    if any(x.settings.begins == "rest" for x in observed):
+    if any(x.settings.begins in RESTING for x in observed):
         assert steps is not None
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(observer.tracked), 3)
@@ -168,7 +168,7 @@ def _dataset(
         held[row, has] = trial.to_body(trial.still[: len(has)], shift)
         if trial.settings.is_released:
             times[row] = np.pad(trial.moving.time, (0, frames - len(seen)), mode="edge")
-        elif trial.settings.begins == "rest":
+        elif trial.settings.begins in RESTING:
             times[row] = np.minimum(np.arange(frames), steps or 0) * settings.time_step
             held[row] = np.where(np.isfinite(markers[row, 0]), markers[row, 0], held[row])
         else:
@@ -189,7 +189,7 @@ def _dataset(
         gravity=gravity,
         time_step=settings.time_step,
         bound=bound,
-        smoothed=smoothed if cutoff is not None or all(x.settings.begins == "rest" for x in observed) else None,
+        smoothed=smoothed if cutoff is not None or all(x.settings.begins in RESTING for x in observed) else None,
         inputs=inputs,
         channels={} if drive is None else {drive.quantity.name: drive.parts},
         base=base,

@@ -34,7 +34,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_simulator
-from .files import STATIC, TRUTH, payload_inputs
+from .files import RESTING, STATIC, TRUTH, payload_inputs
 from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
 from .simulate import base_of, distributed, fixed_positions
@@ -226,7 +226,7 @@ def _frame_count(settings: PlayedSettings, begins: str) -> int:
     """Number of simulated frames, or of states of released bodies, of trials that begin in a given way."""
     if begins == STATIC:
         return max(int(_POSE_SECONDS * _rate_of(settings)), 5)
-    if begins == "rest":
+    if begins in RESTING:
         assert settings.data.steps is not None
         return settings.data.steps + 1
     laboratory = settings.laboratory
@@ -300,7 +300,7 @@ class _Played(ResumableRollout):
         for i in range(1, self._substeps + 1):
             # Inputs are taken at the end of a substep, or in its middle.
             share = (i - 0.5 * (self._simulator.integrator == "midpoint")) / self._substeps
-            inputs = self._inputs(number - 1, share) if begins == "rest" else self._inputs(0)
+            inputs = self._inputs(number - 1, share) if begins in RESTING else self._inputs(0)
             if self._fixed is not None:
                 inputs = inputs.replace(fixed_positions=self._fixed[(number - 1) * self._substeps + i - 1])
             state, _ = self._simulator.step(state, inputs, self._constants)

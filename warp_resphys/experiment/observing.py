@@ -24,7 +24,7 @@ from ..settings.stages import ImportStage
 from ..settings.trials import BaseMotion, MotionSettings, Trial
 from .actuators import Drive, drive_of
 from .build import build_simulator
-from .files import STATIC
+from .files import STATIC, UNDER_INPUTS
 from .reading import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)
@@ -266,10 +266,11 @@ class Observer:
             assert self.data.steps is not None
             check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
-        loaded = driven is not None and not self._is_at_rest(driven[:1])[0]
+        under_inputs = trial.begins == UNDER_INPUTS
+        loaded = under_inputs or (driven is not None and not self._is_at_rest(driven[:1])[0])
         unloaded = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
-        still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven)
+        still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven, under_inputs)
         # The reference markers show where the unloaded body is.
         only_reference = not unloaded and len(self.markers.reference) >= self.reader.enough
         registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
@@ -288,15 +289,16 @@ class Observer:
         """(T,) whether inputs (T, C) are zero up to the noise of a gauge."""
         return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self._limit)
 
-    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
-        """(M', 3) mean positions of the markers before the inputs begin [m], NaN for markers that are not seen."""
-        acts = np.zeros(0, dtype=np.int64) if driven is None else np.flatnonzero(~self._is_at_rest(driven))
+    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None, under_inputs: bool) -> FloatArray:
+        """(M', 3) mean positions of the markers before the inputs change [m], NaN for markers that are not seen."""
+        before = None if driven is None else driven - driven[0] if under_inputs else driven
+        acts = np.zeros(0, dtype=np.int64) if before is None else np.flatnonzero(~self._is_at_rest(before))
         until = int(acts[0]) if len(acts) else len(recording.positions)
         if until < 1:
             assert self.drive is not None
             raise DataFileError(
                 f"{recording.source} begins under {self.drive.quantity.words}: its first frame must show the body at "
-                "rest."
+                f"rest without, or give data.trials.{trial.name}.begins: driven if it is at rest under it."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
         return _central(resting, self.reader.tracked_in(trial), np.mean, "rests")

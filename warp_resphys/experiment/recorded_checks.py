@@ -15,7 +15,7 @@ from ..settings.trials import MarkerSettings, RecordedData, Trial
 from .actuators import Drive, drive_of
 from .body_checks import check_target, naming
 from .build import build_material, marker_view_of
-from .files import STATIC, payload_inputs
+from .files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from .laboratory import input_sequences
 from .reading import standing_enough
 from .target import substeps_of
@@ -36,12 +36,12 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     payload_inputs(body, data.payload_at, np.array([trial.payload for trial in trials]))
     if begins & {"held", "released"} and data.seconds is None:
         raise InputError("data.seconds is not set: give the time after the release of each trial that is used, in s.")
-    if "rest" in begins and data.steps is None:
+    if begins & {*RESTING} and data.steps is None:
         raise InputError("data.steps is not set: give the number of time steps that are read from each recording.")
     drive = drive_of(run, body)
     if drive is not None:
         _check_inputs(data, drive)
-    if "rest" in begins and data.steps is not None and data.horizons:
+    if begins & {*RESTING} and data.steps is not None and data.horizons:
         length = data.steps * run.time_step
         if data.horizons[-1] > length + 1e-9:
             raise InputError(
@@ -80,6 +80,11 @@ def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings
         raise InputError(
             f"markers.labels is assigned, but markers.reference names {standing}: static poses need {enough} "
             "reference markers" + (", or data.axes and one." if data.axes is None else ".")
+        )
+    if UNDER_INPUTS in begins and standing < enough and markers.frame != "own":
+        raise InputError(
+            f"trials that begin driven are bent from the first frame on, and markers.reference names {standing}: "
+            f"registration needs {enough} markers on what the body is fixed to, or markers.frame own."
         )
     if markers.bind_to is not None:
         select_vertices(body.mesh, **markers.bind_to.arguments())
@@ -163,7 +168,7 @@ def _check_laboratory(
                 "least as long as the data are used."
             )
     played = PlayedSettings.of(run, files={})
-    if "rest" in begins and data.steps is not None:
+    if begins & {*RESTING} and data.steps is not None:
         substeps_of(run.time_step, laboratory, "laboratory")
         if drive is not None:
             random = np.random.default_rng(0)

@@ -4,11 +4,13 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
 from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
+from ..learning.parameters import split_name
 from .experiment import Experiment
 
 log = logging.getLogger(__name__)
@@ -23,7 +25,8 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
     of these, so that it grows with the distance from the trials that determine them. In a session without identified
-    trials, the prior of the marker places adds its variance. The ranges of the parameters limit their covariance.
+    trials, the prior of the marker places adds its variance; values of single trials add theirs. The ranges of the
+    parameters limit their covariance.
 
     Args:
         experiment: the experiment; trials that cannot be simulated have no spread, which a warning says.
@@ -39,9 +42,12 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
         return None
     values, parameters = identified["parameters"], [*uncertainty["deviation"]]
     own, placement = identified.get("own", {}), identified.get("placement") or {}
+    own_deviation = identified.get("own_deviation", {})
+    apart = [*dict.fromkeys(split_name(name)[0] for name in own_deviation)]  # of which trials have their own values
     deviation = np.array([uncertainty["deviation"][name] for name in parameters])
     ranges = uncertainty.get("ranges", {})
     root = _root(np.array(uncertainty["correlation"]), deviation / [ranges.get(name, np.inf) for name in parameters])
+    root = scipy.linalg.block_diag(root, np.eye(len(apart)))
     spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
     with Progress("evaluate: uncertainty of the parameters", len(names), "trials") as progress, torch.no_grad():
         for whole in experiment.batches(names):
@@ -49,8 +55,14 @@ def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -
             for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
                 replay = experiment.replay(experiment.model_simulator(model), batch, model)
                 start = experiment.start(replay, model)
-                steps = np.concatenate([np.zeros((1, len(parameters))), _DIFFERENCE * np.diag(deviation)])
-                sets = {name: replay.simulator.tensor([value]).expand(len(steps)) for name, value in own.items()}
+                steps = np.zeros((1 + len(root), len(parameters)))
+                steps[1 : 1 + len(parameters)] = _DIFFERENCE * np.diag(deviation)
+                sets = {}
+                for name, value in own.items():
+                    moves = np.zeros(len(steps))
+                    if name in own_deviation:
+                        moves[1 + len(parameters) + apart.index(split_name(name)[0])] = _DIFFERENCE
+                    sets[name] = replay.simulator.tensor(value + moves * own_deviation.get(name, 0.0))
                 sets |= {
                     name: replay.simulator.tensor(np.full(len(steps), values[name]) + steps[:, column])
                     for column, name in enumerate(parameters)

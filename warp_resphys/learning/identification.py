@@ -52,6 +52,7 @@ class Identifier:
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         labels: names of the markers, where `accuracy` is given.
         centre: (3,) about which recordings may be rotated [m].
+        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
@@ -65,8 +66,9 @@ class Identifier:
         accuracy: Accuracy | None = None,
         labels: Sequence[str] = (),
         centre: Sequence[float] = (0.0, 0.0, 0.0),
+        known: Mapping[str, float] | None = None,
     ) -> None:
-        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre)
+        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre, known)
         self._labels = tuple(labels)
 
     @property

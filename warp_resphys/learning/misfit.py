@@ -45,6 +45,7 @@ class Misfit:
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         centre: (3,) about which recordings may be rotated [m].
+        known: values of further parameters, which are not identified.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -62,6 +63,7 @@ class Misfit:
         seconds: float | None = None,
         accuracy: Accuracy | None = None,
         centre: Sequence[float] = (0.0, 0.0, 0.0),
+        known: Mapping[str, float] | None = None,
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -71,7 +73,7 @@ class Misfit:
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
-        self.prior_weight = 0.0
+        self.prior_weight, self._known = 0.0, {} if known is None else dict(known)
         self._accuracy, self._centre = accuracy, self.simulator.tensor(list(centre))
         self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
         self._replays: list[tuple[Replay, Start]] = []
@@ -79,11 +81,12 @@ class Misfit:
         count = sum(len(replay.trials.names) for replay, _ in replays)
         for replay, start in replays:
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
-            for name, moved in zip(trials.names, trials.amplitude.tolist(), strict=True):
+            amplitude = replay.trials.amplitude if self._known else trials.amplitude
+            for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
             self._replays.append(self._prepared(replay, start, trials))
-            self._weights.append(trials.loss_weight * (len(trials.names) / count))
+            self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
         self._moves = _moves_of(self.bounds)
         self.forget()
 
@@ -285,7 +288,8 @@ class Misfit:
         """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
         values = {name: range_.from_unit(unit[:, i]) for i, (name, range_) in enumerate(self.bounds.items())}
         common = {split_name(name)[0]: range_ for name, range_ in self.bounds.items() if split_name(name)[1]}
-        return {n: torch.full_like(unit[:, 0], r.prior.mean) for n, r in common.items() if r.prior is not None} | values
+        others = {name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None} | self._known
+        return {name: torch.full_like(unit[:, 0], value) for name, value in others.items()} | values
 
     def _simulated(self, unit: torch.Tensor, varied: bool = False) -> list[torch.Tensor]:
         """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m], alike if they are `varied`."""

@@ -80,9 +80,9 @@ class Replay:
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
             body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
-            time [s] of its response, its reciprocal slew rate, its dead band and the slopes of its characteristic
-            curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew``,
-            ``pressure_dead_band`` and ``pressure_slope_1``.
+            time [s] of its response, its reciprocal slew rate, its dead band, its zero and the slopes of its
+            characteristic curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew``,
+            ``pressure_dead_band``, ``pressure_zero`` and ``pressure_slope_1``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:
@@ -110,15 +110,12 @@ class Replay:
         sets = _count(parameters)
         spread = self._spread(parameters, sets)
         constants = constants_of(sim, spread)
-        inputs = self.trials.inputs.repeat(sets)
-        changed = self._acting(inputs, spread)
+        inputs, resting = self.trials.inputs.repeat(sets), self.trials.resting.repeat(sets)
         hung = {name: weight for name, weight in inputs.fields.items() if name in HUNG}
         if MASS_FACTOR in spread:
             hung = {name: weight * spread[MASS_FACTOR][:, None] for name, weight in hung.items()}
-        inputs = inputs.replace(**changed, **hung)
-        resting = self.trials.resting.repeat(sets)
-        resting = resting.replace(**self._acting(resting, spread), **hung)
-        return sim.prepare(constants), inputs, resting
+        acting, before = self._acting(inputs, resting, spread)
+        return sim.prepare(constants), inputs.replace(**acting, **hung), resting.replace(**before, **hung)
 
     def _spread(self, parameters: Parameters, sets: int) -> dict[str, torch.Tensor]:
         """(E R,) values in all environments, from (E,) values; those of trials and sessions replace the common ones."""
@@ -134,15 +131,21 @@ class Replay:
                 spread[parameter] = torch.where(rows, value.repeat_interleave(count, 0), spread[parameter])
         return spread
 
-    def _acting(self, inputs: Inputs, spread: Parameters) -> dict[str, torch.Tensor]:
-        """Inputs that act on the body under the commanded ones, with parameters (E R,) of their response."""
-        acting = {}
+    def _acting(
+        self, inputs: Inputs, resting: Inputs, spread: Parameters
+    ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """Inputs that act under the commanded ones, during and before the trials, with parameters (E R,)."""
+        acting, before = {}, {}
         for name, commands in inputs.actuation.items():
-            if name not in HUNG:
-                response = InputResponse(self.simulator.time_step, *response_of(self.simulator.inputs[name], spread))
-                throughout = commands.ndim == 2
-                acting[name] = response.scaled(commands) if throughout else response.from_rest(commands)[0]
-        return acting
+            if name in HUNG:
+                continue
+            response = InputResponse(self.simulator.time_step, *response_of(self.simulator.inputs[name], spread))
+            throughout = commands.ndim == 2
+            first = resting.actuation.get(name, 0.0 * (commands if throughout else commands[0]))
+            acting[name] = response.scaled(commands) if throughout else response(response.steady(first), commands)[0]
+            if name in resting.actuation or f"{name}_zero" in spread:
+                before[name] = response.scaled(first)
+        return acting, before
 
     def initial_state(
         self, start: Start, constants: Constants, resting: Inputs, sets: int = 1, force: StepForce | None = None

@@ -34,10 +34,11 @@ _COMMANDS: Final[Mapping[str, Wording]] = {
     "rise": ("Time constant", "ms", 1e3),
     "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
     "dead_band": ("Dead band", "", 1.0),
+    "zero": ("Zero", "", 1.0),
     "slope": ("Slope", "", 1.0),
 }
 _COMMAND: Final = re.compile(
-    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|slope)(?:_([1-8]))?"
+    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|zero|slope)(?:_([1-8]))?"
 )
 _BANDS: Final = {
     "pressure": ("kPa", 1e-3),
@@ -158,7 +159,7 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
             cells.append(Cell(digits(own.get(name), factor, deviation), beside=beside))
         rows.append(Row(owner, cells))
     columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]
-    note = "Identified for each by itself, near the mean of the prior, which all other trials have."
+    note = "Identified with the prior; of validation and test trials, from their first frames."
     return PageTable("Trial or session", columns, rows, note)
 
 
@@ -167,7 +168,7 @@ def parameter_wording(parameter: str) -> Wording:
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]
-        if word == "dead_band":
+        if word in ("dead_band", "zero"):
             unit, factor = _BANDS["muscle_contraction" if parameter.startswith("muscle_contraction") else words]
         kind += f" {octave} of the characteristic" if octave else ""
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor

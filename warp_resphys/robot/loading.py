@@ -14,6 +14,8 @@ from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..experiment.files import STATIC
 from ..io.errors import DataFileError, InputError, listed
+from ..learning.parameters import own_name
+from ..stepping.state import State
 from .description import Description, describe, finished_experiment
 from .inputs import BASE
 from .motion import Motion
@@ -119,10 +121,10 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:
-            begun, steps = (
-                robot.state(replay.initial_state(start, constants, resting).q, start.state.v[0]),
-                replay.steps(start),
-            )
+            state = State(replay.initial_state(start, constants, resting).q, start.state.v)
+            inputs = _commands(experiment, robot, name, inputs)
+            first = {key: value[0] for key, value in inputs.items() if key in replay.trials.resting.actuation}
+            begun, steps = RobotState(state, robot.begin_memory(first)), replay.steps(start)
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]
@@ -131,6 +133,21 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
     since = (trials.times - start.delay[:, None]).clamp_min(0.0)[0].cpu().numpy()
     shift = None if start.shift is None else start.shift[0].cpu().numpy()
     return RecordedTrial(name, begun, steps, inputs, since, trials.observed[0].cpu().numpy(), shift)
+
+
+def _commands(
+    experiment: Experiment, robot: Robot, name: str, inputs: Mapping[str, torch.Tensor]
+) -> dict[str, torch.Tensor]:
+    """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
+    values, commands = experiment.parameters(robot.description.model), dict(inputs)
+    for key, given in inputs.items():
+        zero, factor = f"{key}_zero", f"{key}_factor"
+        if zero in values and (own := values.get(own_name(zero, name))) is not None:
+            commands[key] = (given - own + values[zero]).clamp_min(robot.simulator.inputs[key].lower)
+        if factor in values and (own := values.get(own_name(factor, name))) is not None:
+            origin = values.get(zero, torch.zeros_like(own))
+            commands[key] = origin + (commands[key] - origin) * own / values[factor]
+    return commands
 
 
 def _experiment(robot: Robot) -> Experiment:

@@ -8,8 +8,9 @@ from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings,
 from .body import TargetSettings
 from .mesh import Direction, LengthUnit, PlaceSettings
 
-# Held at rest until the release; released with the first frame; at rest until inputs are applied; a static pose.
-Begins = Literal["held", "released", "rest", "static"]
+# Held at rest until the release; released with the first frame; at rest until inputs are applied; at rest under the
+# inputs of the first frame; a static pose.
+Begins = Literal["held", "released", "rest", "driven", "static"]
 Axis = Literal["x", "y", "z"]
 SignedAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 

@@ -20,7 +20,7 @@ from .energies.law_files import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
-from .experiment.evaluate import check_mesh, evaluate, intervals_of_folds, time_models
+from .experiment.evaluate import check_mesh, evaluate, time_models
 from .experiment.experiment import LEARNED
 from .experiment.files import (
     CONTROL,
@@ -52,6 +52,7 @@ from .experiment.laboratory import run_laboratory
 from .experiment.learn import refine, train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
+from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes

@@ -132,3 +132,13 @@ def test_commands_within_the_dead_band_have_no_effect():
     np.testing.assert_allclose(result[-1, :, 0].detach(), [4.0, 3.0, 0.0])
     (slope,) = torch.autograd.grad(result[-1].sum(), bands)
     np.testing.assert_allclose(slope, [-1.0, -1.0, 0.0])
+
+
+def test_what_acts_counts_from_the_zero_and_not_below_the_least_input():
+    commands = np.array([0.0, 0.5, 1.0, 3.0])[:, None]
+    acting = InputResponse(STEP, 2.0, zero=0.5, lower=0.0).scaled(commands)
+    np.testing.assert_array_equal(acting[:, 0], [0.0, 0.0, 1.0, 5.0])
+    signed = InputResponse(STEP, 2.0, dead_band=0.25, zero=torch.tensor([0.5, -1.0], dtype=torch.float64))
+    of_each = signed.scaled(torch.as_tensor(commands)[:, None].repeat(1, 2, 1))
+    np.testing.assert_array_equal(of_each[:, 0, 0], [-0.5, 0.0, 0.5, 4.5])
+    np.testing.assert_array_equal(of_each[:, 1, 0], [1.5, 2.5, 3.5, 7.5])

@@ -10,8 +10,10 @@ from support.configured import check, composed
 from support.main_job import IN_RUN, run
 from support.played_run import check_robots
 from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.robot.description import finished_experiment
 
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 TINY = [
@@ -95,3 +97,52 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
 def test_wrong_tendons_are_refused_before_anything_runs(override, said):
     with pytest.raises(InputError, match=said):
         check(composed("experiment=tendon_rod", override))
+
+
+def test_inputs_with_a_zero_that_differs_from_trial_to_trial(tmp_path, monkeypatch):
+    """Recordings begin under tensions that are logged with an error, which first frames show also of a test trial."""
+    monkeypatch.chdir(tmp_path)
+    deviation = 0.15  # N
+    zero = f"{{lower: -0.6, upper: 0.6, per: trial, prior: {{mean: 0.0, deviation: {deviation}}}}}"
+    parameters = f"{{youngs_modulus: {{lower: 1e5, upper: 5e5, logarithmic: true}}, tendon_tension_zero: {zero}}}"
+    code, err = run(
+        *TINY,
+        *("data.begins=driven", f"laboratory.zero_noise={deviation}", "identify.trials=null"),
+        *("laboratory.noise=1e-5", "laboratory.placement_noise=0.0", "laboratory.tilt=0.0"),
+        *(f"laboratory.material.{key}" for key in ("model=corotated", "poissons_ratio=0.45", "density=1070")),
+        *(f"laboratory.material.{key}" for key in ("mass_damping=0", "stiffness_damping=5e-3", "prony_ratio_1=0")),
+        *("laboratory.mesh.layers=3", "laboratory.mesh.nodes=20"),
+        *(f"++identify.parameters={parameters}", "identify.elastic=null", "identify.max_evaluations=12"),
+    )
+    assert (code, err[-500:] if code else "") == (0, "")
+    found, truth = (json.loads(Path(f"run/{name}.json").read_text()) for name in ("identification", "truth"))
+    zeros = {name.split("@")[1]: value for name, value in found["sysid"]["own"].items()}
+    assert zeros.keys() == truth["zeros"].keys()
+    errors = {name: abs(zeros[name] - value) for name, value in truth["zeros"].items()}
+    assert max(errors.values()) < 0.4 * deviation
+    later = [name for name in errors if name not in ("t000", "t001")]  # of which the first frames show it
+    assert max(errors[name] for name in later) < 0.1 * deviation
+    assert max(errors[name] / found["sysid"]["own_deviation"][f"tendon_tension_zero@{name}"] for name in errors) < 4.0
+    page = Path("run/report.html").read_text()
+    assert "Zero of the tensions [N]" in page
+    assert "Where the rest comes from" in page
+    check_sensitivities(finished_experiment(Path("run")), later)
+
+
+def check_sensitivities(experiment, names):
+    """Derivatives of the markers are differences of roll-outs, by the zero of the trial where it has its own."""
+    found = sensitivities(experiment, "sysid", names)
+    parameters, step = experiment.parameters("sysid"), 1e-4
+    for name in names:
+        replay = experiment.replay(experiment.model_simulator("sysid"), [name], "sysid")
+        start = experiment.start(replay, "sysid")
+        for key, moved in (
+            ("tendon_tension_zero", f"tendon_tension_zero@{name}"),
+            ("youngs_modulus", "youngs_modulus"),
+        ):
+            size = step * (float(parameters[moved]) if key == "youngs_modulus" else 1.0)
+            ends = [replay(start, {**parameters, moved: parameters[moved] + sign * size})[0, 0] for sign in (1, -1)]
+            slopes = ((ends[0] - ends[1]) / (2.0 * size)).numpy()
+            np.testing.assert_allclose(found[name].by_parameter[key], slopes, atol=2e-2 * np.abs(slopes).max())
+        moved = replay(start, parameters)[0, 0].numpy()
+        np.testing.assert_allclose(found[name].points, moved, atol=1e-9)

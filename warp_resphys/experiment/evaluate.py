@@ -3,10 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from itertools import chain, product
-from pathlib import Path
 from statistics import mean, pstdev
 from typing import Any
 
@@ -20,25 +17,21 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.baselines import BASELINES
-from ..learning.intervals import LEVEL, Covered, Intervals, Predicted, coverage
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
 from ..learning.replay import Start
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
 from ..stepping.state import State
 from .build import finer
-from .driving import since_change
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, read_dataset, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
-from .spread import parameter_spread
+from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
 from .without_physics import without_physics
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals, beside the baselines
 _FILM_FRAMES = 256  # maximum
 _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
@@ -58,7 +51,9 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     rows = [order.index(name) for name in names]
     observed, plain = without_physics(experiment, names)
     observed |= {model: _all_observed(experiment, model, its_parts)[rows] for model, its_parts in parts.items()}
-    spreads = _spreads(experiment, settings.groups["1"])
+    test = settings.groups["1"]
+    linear = linearised(experiment, test)
+    spreads = spreads_of(experiment, test, linear)
     shown = _film_steps(int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6))
     attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
@@ -78,8 +73,11 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         if model in LEARNED and settings.range_guard
     }
     errors = summary(context, experiment, settings.groups, observed, left) | {"baselines": plain}
+    errors |= remaining(experiment, test, linear, observed)
     if settings.calibration:
-        errors |= _intervals(experiment, calibrating, observed, spreads)
+        calibrated = [*chain(*experiment.batches(settings.calibration))]
+        known = {model: _all_observed(experiment, model, own) for model, own in calibrating.items()}
+        errors |= intervals_of(experiment, calibrated, known, observed, spreads)
     write_json(context.run_dir / ERRORS, errors)
     remove_parts(context)
 
@@ -110,67 +108,6 @@ def _all_observed(experiment: Experiment, model: str, parts: Sequence[TrialPart]
     return padded([_observed(experiment, model, part) for part in parts], experiment.dataset.observed.shape[1])
 
 
-def _spreads(experiment: Experiment, names: Sequence[str]) -> dict[str, FloatArray]:
-    """Variances (R, T, M) of markers due to the identified parameters [m^2], by model, see `parameter_spread`."""
-    if experiment.dataset.bound is None:
-        return {}
-    made: dict[str, FloatArray | None] = {}
-    own: dict[str, FloatArray] = {}
-    for model in INTERVAL_MODELS:
-        if model in experiment.models and model != SIMFREE:
-            kind = experiment.sources(model)[0]
-            made[kind] = made[kind] if kind in made else parameter_spread(experiment, model, names)
-            own |= {} if (spread := made[kind]) is None else {model: spread}
-    return own
-
-
-def _intervals(
-    experiment: Experiment,
-    calibrating: Mapping[str, Sequence[TrialPart]],
-    tested: Mapping[str, FloatArray],
-    spreads: Mapping[str, FloatArray],
-) -> dict[str, Any]:
-    """Prediction intervals by model and their coverage of the test trials, see `learning.intervals`.
-
-    Those of a robot, which does not know the variance due to the parameters, are `without_spread`.
-    """
-    settings, rest = experiment.settings, experiment.dataset.bound
-    assert isinstance(settings, EvaluateStage)
-    assert rest is not None
-    names = [*chain(*experiment.batches(settings.calibration))]
-    observed = experiment.dataset.observed[experiment.dataset.rows(names)]
-    test = settings.groups["1"]
-    target = _counted(experiment, test)
-    predicted = partial(_predicted, experiment.dataset)
-    learned = [row for row, name in enumerate(names) if name in settings.split.train]
-    observed[learned, experiment.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
-    models: dict[str, Any] = {}
-    simulated, _ = without_physics(experiment, names, left_out=True)
-    simulated |= {model: _all_observed(experiment, model, parts) for model, parts in calibrating.items()}
-    calibrating_spreads = _spreads(experiment, names)
-    for model in (model for model in simulated if model in tested):
-        trials = predicted(names, [*simulated[model]], [*observed], calibrating_spreads.get(model))
-        intervals = Intervals.calibrated(trials, rest)
-        if intervals is None:
-            continue
-        new = predicted(test, [*tested[model]], [*target], spreads.get(model))
-        covered = [intervals.covered(trial, rest) for trial in new]
-        models[model] = {**intervals.plain(), **coverage(covered), "by_trial": _by_trial(test, covered)}
-        alone = Intervals.calibrated([replace(trial, spread=None) for trial in trials], rest)
-        models[model] |= {"without_spread": alone.plain()} if model in spreads and alone is not None else {}
-    split = "training" if learned else "validation"
-    return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
-
-
-def _counted(experiment: Experiment, names: Sequence[str]) -> FloatArray:
-    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training."""
-    observed = experiment.dataset.observed[experiment.dataset.rows(names)]
-    for row, name in enumerate(names):
-        if name in experiment.settings.split.train:
-            observed[row, : experiment.learned_steps(observed.shape[1] - 1) + 1] = np.nan
-    return observed
-
-
 def _rolled_out(part: TrialPart) -> ModelRollout:
     """Makes the roll-out of a part."""
     experiment = Experiment(part.context.settings, part.context.run_dir, "count")
@@ -185,54 +122,6 @@ def _observed(experiment: Experiment, model: str, part: TrialPart) -> FloatArray
     start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
     series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
     return np.asarray(replay.at_frames(series, start).cpu().numpy())
-
-
-def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, Any]:
-    """Prediction intervals of a cross-validation; each fold is calibrated on the test trials of the other folds.
-
-    Args:
-        dataset: path of the dataset.
-        folders: folders of the folds, by the trial that a fold leaves out.
-    """
-    data, names = read_dataset(dataset), list(folders)
-    if data.bound is None or len(names) < 3:
-        return {}
-    target = list(data.observed[data.rows(names)])
-    models: dict[str, Any] = {}
-    for model in (*BASELINES, *INTERVAL_MODELS):
-        simulated, spreads = list[FloatArray](), list[FloatArray]()
-        for folder in folders.values():
-            with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-                simulated += [read_array(file, f"{model}_observed")[0]] if f"{model}_observed" in file else []
-                spreads += [read_array(file, f"{model}_spread")[0]] if f"{model}_spread" in file else []
-        if len(simulated) < len(names):
-            continue
-        trials = _predicted(data, names, simulated, target, spreads if len(spreads) == len(names) else None)
-        covered = list[Covered]()
-        for out, trial in enumerate(trials):
-            intervals = Intervals.calibrated(trials[:out] + trials[out + 1 :], data.bound)
-            covered += [] if intervals is None else [intervals.covered(trial, data.bound)]
-        if len(covered) == len(names):
-            models[model] = {**coverage(covered), "by_trial": _by_trial(names, covered)}
-    return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
-
-
-def _predicted(
-    dataset: Dataset,
-    names: Sequence[str],
-    simulated: Sequence[FloatArray],
-    observed: Sequence[FloatArray],
-    spreads: Sequence[FloatArray] | NDArray[np.float64] | None = None,
-) -> list[Predicted]:
-    """Trials as they were predicted and observed."""
-    rows = zip(simulated[: len(names)], observed, since_change(dataset, names), strict=True)
-    known = [None] * len(names) if spreads is None else spreads
-    return [Predicted(*row, spread) for row, spread in zip(rows, known, strict=True)]
-
-
-def _by_trial(names: Sequence[str], covered: Sequence[Covered]) -> dict[str, float]:
-    """Share of the coordinates inside their interval, by trial in which a marker was seen."""
-    return {n: float(own.inside.mean()) for n, own in zip(names, covered, strict=True) if len(own.inside)}
 
 
 def _film_trial(experiment: Experiment, names: Sequence[str]) -> str:
@@ -274,7 +163,7 @@ def summary(
     assert isinstance(settings, EvaluateStage)
     names, every = groups["1"], [name for group in groups.values() for name in group]
     count, step = len(names), settings.time_step
-    observed = _counted(experiment, every)
+    observed = counted(experiment, every)
     first = [first_frame(experiment, [name]) for name in every]
     models = dict(simulated)
     if dataset.bound is None:

@@ -103,6 +103,7 @@ class Dataset:
         inputs: (R, K, C) inputs during each step, by name, such as ``pressure`` [Pa]; see
             `actuators.DRIVING_QUANTITIES`.
         channels: names of the C channels, by input.
+        resting: (R, C) inputs before time zero, by name, of trials that begin under inputs; empty if none does.
         base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
         sessions: session in which each trial was recorded; empty if there is one.
     """
@@ -121,6 +122,7 @@ class Dataset:
     velocity: FloatArray | None = None
     inputs: Mapping[str, FloatArray] = field(default_factory=dict)
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    resting: Mapping[str, FloatArray] = field(default_factory=dict)
     base: FloatArray | None = None
     sessions: tuple[str, ...] = ()
 
@@ -157,6 +159,8 @@ class Dataset:
                     create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
                 create(file, name, values, units=DRIVING_QUANTITIES[name].unit or "1", time_axis=1)
+            for name, values in self.resting.items():
+                create(file, f"{name}_resting", values, units=DRIVING_QUANTITIES[name].unit or "1")
 
     def joined(self, other: "Dataset") -> "Dataset":
         """Returns a dataset with these trials followed by others of the same body with the same number of frames."""
@@ -165,8 +169,9 @@ class Dataset:
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
+        resting = {name: np.concatenate([values, other.resting[name]]) for name, values in self.resting.items()}
         words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
-        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs}
+        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting}
         return replace(self, **changed)
 
     def rows(self, names: Sequence[str]) -> list[int]:
@@ -215,8 +220,10 @@ class Dataset:
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
             given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
-        before = {STATIC: -1, UNDER_INPUTS: 0}.get(self.begins[rows[0]])
-        resting = Inputs() if before is None else Inputs(**{key: given[key][before] for key in self.inputs})
+        before = {key: given[key][-1] for key in self.inputs} if static else {}
+        if self.begins[rows[0]] == UNDER_INPUTS:
+            before = {key: torch.from_numpy(values[rows]) for key, values in self.resting.items()}
+        resting = Inputs(**before)
         times, observed = (torch.from_numpy(x[rows][:, frames]) for x in (self.times, self.observed))
         held, session = torch.from_numpy(self.held[rows]), self.session(names[0])
         return Trials(tuple(names), times, observed, held, Inputs(**given), resting, session)
@@ -250,6 +257,7 @@ def read_dataset(path: Path) -> Dataset:
             time_step=float(file.attrs["time_step"]),
             base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
             inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
+            resting={n: read_array(file, f"{n}_resting", (r, None)) for n in inputs if f"{n}_resting" in file},
             channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
             sessions=tuple(map(str, file.attrs.get("sessions", ()))),
             **optional,

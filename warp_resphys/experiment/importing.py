@@ -24,7 +24,7 @@ from ..settings.stages import ImportStage
 from ..settings.trials import ReadingSettings
 from .actuators import Drive
 from .build import bound_markers
-from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, Dataset, read_dataset
+from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, UNDER_INPUTS, Dataset, read_dataset
 from .observing import Observed, Observer
 from .reading import vertical
 from .trials import evenly
@@ -155,9 +155,11 @@ def _dataset(
     shape = (len(observed), frames, len(observer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
     times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
-    inputs = {}
+    inputs, resting = {}, dict[str, FloatArray]()
     if drive is not None:
         inputs[drive.quantity.name] = np.zeros((len(observed), steps if steps else 1, len(drive.parts)))
+        if any(x.settings.begins == UNDER_INPUTS for x in observed):
+            resting[drive.quantity.name] = np.array([x.driven[0] for x in observed if x.driven is not None])
     for row, trial in enumerate(observed):
         limit = frames if trial.settings.is_released or steps is None else steps + 1
         seen = trial.moving.positions[:limit]
@@ -192,6 +194,7 @@ def _dataset(
         smoothed=smoothed if cutoff is not None or all(x.settings.begins in RESTING for x in observed) else None,
         inputs=inputs,
         channels={} if drive is None else {drive.quantity.name: drive.parts},
+        resting=resting,
         base=base,
         sessions=sessions if any(sessions) else (),
     )

@@ -34,7 +34,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_simulator
-from .files import RESTING, STATIC, TRUTH, payload_inputs
+from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
 from .simulate import base_of, distributed, fixed_positions
@@ -44,6 +44,7 @@ FloatArray = NDArray[np.float64]
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
 _POSE_SECONDS = 0.25  # duration of the recording of a static pose
+_FURTHEST_ZERO = 3.0  # standard deviations, of recorded inputs
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,10 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     poses = base_of(common, trial, times)
     positions = setup.recorded(series, poses)
     noise = laboratory.noise * draw.standard_normal(positions.shape)
-    actuation = None if trial.sequence is None else _inputs_of(settings, trial)
+    actuation = None
+    if trial.sequence is not None:
+        least = getattr(driving_quantity(laboratory), "lower", -np.inf)
+        actuation = np.maximum(_inputs_of(settings, trial) + _zero_of(settings, trial), least)
     if actuation is not None and len(actuation) != len(positions):
         actuation = np.repeat(actuation[-1:], len(positions), axis=0)
     rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
@@ -137,6 +141,12 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
 
 def _random_of(settings: PlayedSettings, trial: Trial) -> np.random.Generator:
     return np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
+
+
+def _zero_of(settings: PlayedSettings, trial: Trial) -> float:
+    """Recorded value of a trial's inputs where nothing acts."""
+    draw = np.random.default_rng([settings.seed, 2, zlib.crc32(trial.name.encode())])
+    return float(settings.laboratory.zero_noise * np.clip(draw.standard_normal(), -_FURTHEST_ZERO, _FURTHEST_ZERO))
 
 
 def _released_at(settings: PlayedSettings, trial: Trial, draw: np.random.Generator) -> float | None:
@@ -166,6 +176,7 @@ def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], nois
         "translation": setup.translation,
         "bound": dict(zip(settings.binding.tracked, setup.tracked, strict=True)),
         "noise_mm": 1e3 * noise,
+        **({"zeros": {t.name: _zero_of(settings, t) for t in trials}} if settings.laboratory.zero_noise else {}),
         "released_s": {name: at for name, at in released.items() if at is not None},
     }
 
@@ -203,18 +214,19 @@ def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simul
 
 
 def input_sequences(settings: PlayedSettings) -> InputSequences:
-    """Distribution of the laboratory's random inputs."""
+    """Distribution of the laboratory's random inputs, so that recorded ones stay within the limit."""
     assert settings.data.input_limit is not None
-    return InputSequences(limit=settings.data.input_limit, **dict(settings.laboratory.sequences))
+    limit = settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
+    return InputSequences(limit=limit, **dict(settings.laboratory.sequences))
 
 
 def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     """(K + 1, C) inputs of a trial at the frames, drawn from the seed and the number of its sequence."""
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
     assert settings.data.steps is not None
-    drawn = input_sequences(settings).draw(
-        settings.data.steps, settings.time_step, driven_parts(settings.laboratory), draw
-    )
+    before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
+    steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
+    drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)[before:]
     if trial.is_released:
         drawn = np.zeros_like(drawn)
     elif trial.begins == STATIC:

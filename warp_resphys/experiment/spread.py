@@ -1,83 +1,58 @@
 """How uncertain predicted markers are because the identified parameters are."""
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.linalg
-import torch
 from numpy.typing import NDArray
 
-from ..io.errors import ConvergenceError, listed
-from ..io.progress import Progress
-from ..learning.parameters import split_name
+from ..learning.parameters import own_name
 from .experiment import Experiment
-
-log = logging.getLogger(__name__)
+from .sensitivity import Sensitivity
 
 FloatArray = NDArray[np.float64]
 
-_DIFFERENCE = 1e-3  # of a parameter, for derivatives, over its standard deviation
 
-
-def parameter_spread(experiment: Experiment, model: str, names: Sequence[str]) -> FloatArray | None:
+def parameter_spread(
+    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity]
+) -> FloatArray | None:
     """Returns the variance of predicted markers under the posterior of a model's identified parameters.
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
     of these, so that it grows with the distance from the trials that determine them. In a session without identified
-    trials, the prior of the marker places adds its variance; values of single trials add theirs. The ranges of the
-    parameters limit their covariance.
+    trials, the prior of the marker places adds its variance. The ranges of the parameters limit their covariance.
 
     Args:
-        experiment: the experiment; trials that cannot be simulated have no spread, which a warning says.
+        experiment: the experiment.
         model: with identified parameters.
-        names: names of the R trials.
+        names: names of the R trials; those without derivatives have no spread.
+        linear: derivatives by trial, from `sensitivities`.
 
     Returns:
         Means (R, T, M) over the coordinates [m^2]; None if the uncertainty of the parameters is not known.
     """
     identified = experiment.identification(model)
-    uncertainty = identified.get("uncertainty")
+    uncertainty, placement = identified.get("uncertainty"), identified.get("placement") or {}
     if uncertainty is None:
         return None
-    values, parameters = identified["parameters"], [*uncertainty["deviation"]]
-    own, placement = identified.get("own", {}), identified.get("placement") or {}
-    own_deviation = identified.get("own_deviation", {})
-    apart = [*dict.fromkeys(split_name(name)[0] for name in own_deviation)]  # of which trials have their own values
-    deviation = np.array([uncertainty["deviation"][name] for name in parameters])
-    ranges = uncertainty.get("ranges", {})
-    root = _root(np.array(uncertainty["correlation"]), deviation / [ranges.get(name, np.inf) for name in parameters])
-    root = scipy.linalg.block_diag(root, np.eye(len(apart)))
+    parameters, own = [*uncertainty["deviation"]], identified.get("own_deviation", {})
+    ranges = [uncertainty.get("ranges", {}).get(name, np.inf) for name in parameters]
     spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
-    with Progress("evaluate: uncertainty of the parameters", len(names), "trials") as progress, torch.no_grad():
-        for whole in experiment.batches(names):
-            size = experiment.settings.batch or len(whole)
-            for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
-                replay = experiment.replay(experiment.model_simulator(model), batch, model)
-                start = experiment.start(replay, model)
-                steps = np.zeros((1 + len(root), len(parameters)))
-                steps[1 : 1 + len(parameters)] = _DIFFERENCE * np.diag(deviation)
-                sets = {}
-                for name, value in own.items():
-                    moves = np.zeros(len(steps))
-                    if name in own_deviation:
-                        moves[1 + len(parameters) + apart.index(split_name(name)[0])] = _DIFFERENCE
-                    sets[name] = replay.simulator.tensor(value + moves * own_deviation.get(name, 0.0))
-                sets |= {
-                    name: replay.simulator.tensor(np.full(len(steps), values[name]) + steps[:, column])
-                    for column, name in enumerate(parameters)
-                }
-                try:
-                    points = (replay if replay.is_static else replay.varied)(start, sets).double().cpu().numpy()
-                except ConvergenceError as error:
-                    log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
-                    points = np.zeros((len(steps), *spread[: len(batch)].shape, 3))
-                moved = np.einsum("erTmc,ei->irTmc", (points[1:] - points[:1]) / _DIFFERENCE, root)
-                rows = [names.index(name) for name in batch]
-                spread[rows, : points.shape[2]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
-                if "sessions" in placement and experiment.dataset.session(batch[0]) not in placement["sessions"]:
-                    spread[rows] += sum(size**2 for size in placement["prior"])
-                progress.advance(len(batch))
+    for row, name in enumerate(names):
+        if name in linear:
+            deviation = np.array([uncertainty["deviation"][parameter] for parameter in parameters])
+            correlation = np.array(uncertainty["correlation"])
+            session = experiment.dataset.session(name)
+            for at, parameter in enumerate(parameters):
+                of_trial = (own.get(own_name(parameter, owner)) for owner in (name, session))
+                if (known := next((value for value in of_trial if value is not None), None)) is not None:
+                    deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
+                    correlation[at, at] = 1.0
+            root = deviation[:, None] * _root(correlation, deviation / ranges)
+            slopes = np.stack([linear[name].by_parameter[parameter] for parameter in parameters])
+            moved = np.einsum("eTmc,ei->iTmc", slopes, root)
+            spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
+        if "sessions" in placement and experiment.dataset.session(name) not in placement["sessions"]:
+            spread[row] += sum(size**2 for size in placement["prior"])
     return spread
 
 

@@ -223,7 +223,7 @@ def estimate_placement(
             root, where = weight.sqrt()[:, None, None, None] * visible[..., None], placements[session]
             placed = where.apply(nominal + (rotation @ where.offsets[..., None])[..., 0])
             slopes = error.new_zeros(*error.shape, len(scale))
-            jacobian = _jacobian(where, placed, rotation) * root[..., None]
+            jacobian = by_placement(where, placed, rotation) * root[..., None]
             for block in (0, 1 + names.index(session)) if further else (0,):
                 columns = slice(block * size, (block + 1) * size)
                 slopes[..., columns] = jacobian * scale[columns]
@@ -241,10 +241,15 @@ def estimate_placement(
     return Placed(placement(scale[:size] * solution[:size]), placements, solution, [c for _, c in columns(placements)])
 
 
-def _jacobian(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
-    """(R, T, M, 3, P) derivatives of placed markers by the offsets, the shift and the rotation vector.
+def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+    """Returns derivatives (R, T, M, 3, P) of placed markers by the offsets, the shift and the rotation vector.
 
     R(w + dw) = R(J dw) R(w), with J the left Jacobian of SO(3).
+
+    Args:
+        placement: at which they are taken.
+        placed: (R, T, M, 3) markers with it [m].
+        rotations: (R, T, M, 3, 3) of the body at the markers.
     """
     count, eye = placed.shape[-2], torch.eye(3, dtype=placed.dtype, device=placed.device)
     turn = replace(placement, shift=torch.zeros_like(placement.shift), centre=torch.zeros_like(placement.centre))

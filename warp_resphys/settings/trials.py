@@ -371,6 +371,7 @@ class PlaySettings(TargetSettings):
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
     noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")
     placement_noise: NotNegative = setting(description="of each coordinate of a marker's place", unit="m")
+    zero_noise: NotNegative = setting(0.0, "of the zero of a trial's recorded inputs, in the unit of the input")
     tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "of the body from level", "degrees")
     held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "before the release", "s")
     seconds: Positive | None = setting(None, "recorded after the release", "s")

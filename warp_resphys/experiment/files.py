@@ -49,7 +49,8 @@ REPORT: Final = "report.html"
 GIVEN: Final = "given"  # beginning of simulated trials, whose initial state is known
 STATIC: Final = "static"
 UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the first frame
-RESTING: Final = ("rest", UNDER_INPUTS)  # of motions that inputs begin, read at the time steps
+SLACK: Final = "slack"  # the same, where these do not act; as UNDER_INPUTS in a dataset
+RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, read at the time steps
 _KIND = "dataset"
 _UNITS = {
     **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),

@@ -21,10 +21,10 @@ from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
 from ..io.stages import StageContext
 from ..settings.stages import ImportStage
-from ..settings.trials import ReadingSettings
+from ..settings.trials import ReadingSettings, Trial
 from .actuators import Drive
 from .build import bound_markers
-from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, UNDER_INPUTS, Dataset, read_dataset
+from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from .observing import Observed, Observer
 from .reading import vertical
 from .trials import evenly
@@ -158,7 +158,7 @@ def _dataset(
     inputs, resting = {}, dict[str, FloatArray]()
     if drive is not None:
         inputs[drive.quantity.name] = np.zeros((len(observed), steps if steps else 1, len(drive.parts)))
-        if any(x.settings.begins == UNDER_INPUTS for x in observed):
+        if any(_begins(x.settings) == UNDER_INPUTS for x in observed):
             resting[drive.quantity.name] = np.array([x.driven[0] for x in observed if x.driven is not None])
     for row, trial in enumerate(observed):
         limit = frames if trial.settings.is_released or steps is None else steps + 1
@@ -183,7 +183,7 @@ def _dataset(
     return Dataset(
         names=tuple(x.settings.name for x in observed),
         labels=tuple(observer.tracked),
-        begins=tuple("released" if x.settings.is_released else x.settings.begins for x in observed),
+        begins=tuple(_begins(x.settings) for x in observed),
         times=times,
         observed=markers,
         held=held,
@@ -198,6 +198,11 @@ def _dataset(
         base=base,
         sessions=sessions if any(sessions) else (),
     )
+
+
+def _begins(trial: Trial) -> str:
+    """How a trial begins in a dataset."""
+    return "released" if trial.is_released else UNDER_INPUTS if trial.begins == SLACK else trial.begins
 
 
 def _bases(observed: Sequence[Observed], times: FloatArray, time_step: float, points: FloatArray) -> FloatArray | None:

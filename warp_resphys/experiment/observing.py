@@ -24,7 +24,7 @@ from ..settings.stages import ImportStage
 from ..settings.trials import BaseMotion, MotionSettings, Trial
 from .actuators import Drive, drive_of
 from .build import build_simulator
-from .files import STATIC, UNDER_INPUTS
+from .files import SLACK, STATIC, UNDER_INPUTS
 from .reading import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)
@@ -266,8 +266,8 @@ class Observer:
             assert self.data.steps is not None
             check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
-        under_inputs = trial.begins == UNDER_INPUTS
-        loaded = under_inputs or (driven is not None and not self._is_at_rest(driven[:1])[0])
+        under_inputs = trial.begins in (UNDER_INPUTS, SLACK)
+        loaded = driven is not None and not self._is_at_rest(driven[:1])[0] and trial.begins != SLACK
         unloaded = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
         still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven, under_inputs)
@@ -298,7 +298,8 @@ class Observer:
             assert self.drive is not None
             raise DataFileError(
                 f"{recording.source} begins under {self.drive.quantity.words}: its first frame must show the body at "
-                f"rest without, or give data.trials.{trial.name}.begins: driven if it is at rest under it."
+                f"rest without, or give data.trials.{trial.name}.begins: driven if it is at rest under it, slack if it "
+                "does not act yet."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
         return _central(resting, self.reader.tracked_in(trial), np.mean, "rests")

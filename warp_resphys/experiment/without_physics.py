@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, predictions
 from .driving import driving
 from .experiment import Experiment
-from .files import GIVEN
+from .files import GIVEN, RESTING
 
 FloatArray = NDArray[np.float64]
 
@@ -37,9 +37,9 @@ def without_physics(
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
     for batch in _batches(experiment, names, left_out):
-        begins, without = experiment.begins(batch[0]), batch if left_out else ()
+        begins, without = _kind(experiment.begins(batch[0])), batch if left_out else ()
         train = [name for name in experiment.settings.split.train if name not in without]
-        learned = [name for name in train if experiment.begins(name) == begins]
+        learned = [name for name in train if _kind(experiment.begins(name)) == begins]
         if not learned:
             continue
         trials, asked = _motions(experiment, learned, batch)
@@ -56,6 +56,11 @@ def without_physics(
     seen = np.isfinite(experiment.dataset.observed[experiment.dataset.rows(names)])
     whole = [model for model in BASELINES if model in values and np.isfinite(values[model][seen]).all()]
     return {model: values[model] for model in whole}, {model: settings[model] for model in whole}
+
+
+def _kind(begins: str) -> str:
+    """Ways of beginning from which trials can be predicted from each other."""
+    return RESTING[0] if begins in RESTING else begins
 
 
 def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:

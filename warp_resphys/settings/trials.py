@@ -9,8 +9,8 @@ from .body import TargetSettings
 from .mesh import Direction, LengthUnit, PlaceSettings
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; at rest under the
-# inputs of the first frame; a static pose.
-Begins = Literal["held", "released", "rest", "driven", "static"]
+# inputs of the first frame; at rest as those do not act, such as of a slack tendon; a static pose.
+Begins = Literal["held", "released", "rest", "driven", "slack", "static"]
 Axis = Literal["x", "y", "z"]
 SignedAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 

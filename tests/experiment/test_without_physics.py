@@ -8,6 +8,7 @@ import pytest
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.experiment.without_physics import without_physics
+from warp_resphys.settings.learning import ReleaseSettings
 
 FRAMES, STEP = 40, 0.01
 TIMES = 2.0 * STEP * np.arange(FRAMES)  # of every second step
@@ -34,7 +35,8 @@ def experiment(levels, begins, learned, **changes):
         "inputs": {"pressure": pressure},
     }
     dataset = Dataset(**given | changes)
-    fake = SimpleNamespace(dataset=dataset, settings=SimpleNamespace(split=SimpleNamespace(train=learned)))
+    settings = SimpleNamespace(split=SimpleNamespace(train=learned), release=ReleaseSettings())
+    fake = SimpleNamespace(dataset=dataset, settings=settings)
     fake.begins = lambda name: dataset.begins[dataset.names.index(name)]
     fake.learned_steps = lambda steps: steps
     fake.batches = lambda names: Experiment.batches(fake, names)
@@ -50,6 +52,21 @@ def test_trials_are_predicted_from_training_trials_that_begin_in_the_same_way():
     for model in ("interpolation", "regression", "linear"):
         np.testing.assert_allclose(values[model][0], truth[0], atol=1e-2)
     np.testing.assert_array_equal(values["rest"][0], np.broadcast_to(fake.dataset.held[4], (FRAMES, 2, 3)))
+
+
+def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
+    fake = experiment([1.0, 2.0, 3.0, 1.5, 2.5], ("rest",) * 5, ["a", "b", "c"])
+    late = 1.0 - np.exp(-np.maximum(TIMES - 0.013, 0.0) / 0.1)
+    fake.dataset.observed[3] = fake.dataset.held[3] + (1.5 * late)[:, None, None] * SHAPE
+    fake.dataset.observed[3, 30:] = np.nan
+    before = without_physics(fake, ["e", "d"])[0]["interpolation"]
+    fake.settings.release = ReleaseSettings(delay=0.01, window=0.3, noise=1e-3)
+    after = without_physics(fake, ["e", "d"])[0]["interpolation"]
+    np.testing.assert_allclose(after[0], before[0], atol=1e-6)
+    seen, expected = slice(0, 30), fake.dataset.observed[3, :30]
+    assert np.abs(before[1, seen] - expected).max() > 0.1
+    assert np.abs(after[1, seen] - expected).max() < 0.1 * np.abs(before[1, seen] - expected).max()
+    assert np.isfinite(after).all()
 
 
 def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():

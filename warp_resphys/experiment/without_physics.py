@@ -5,9 +5,12 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..learning.baselines import BASELINES, REST, PlainTrials, predictions
+from ..learning.release import least_delays
+from ..learning.replay import sample
 from .driving import driving
 from .experiment import Experiment
 from .files import GIVEN, RESTING
@@ -23,7 +26,8 @@ def without_physics(
     """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
 
     Coordinates that no training trial shows stay at rest. A model that does not predict all frames of all trials, such
-    as interpolation after the end of the training, is left out.
+    as interpolation after the end of the training, is left out. Where simulators estimate the delay of a trial's inputs
+    from its first frames (`learning.release.begin_inputs`), so do these.
 
     Args:
         experiment: the experiment.
@@ -50,8 +54,10 @@ def without_physics(
         made = predictions(trials, asked)
         for model, own in made.items():
             shown = np.isfinite(own.values).any(1, keepdims=True)
-            known = np.where(shown, own.values, made[REST].values)
-            values.setdefault(model, np.full(shape, np.nan))[rows] = known.reshape(-1, *shape[1:])
+            known = np.where(shown, own.values, made[REST].values).reshape(-1, *shape[1:])
+            if begins == RESTING[0] and experiment.settings.release.delay > 0.0:
+                known = _on_time(experiment, batch, known)
+            values.setdefault(model, np.full(shape, np.nan))[rows] = known
             settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
     seen = np.isfinite(experiment.dataset.observed[experiment.dataset.rows(names)])
     whole = [model for model in BASELINES if model in values and np.isfinite(values[model][seen]).all()]
@@ -61,6 +67,22 @@ def without_physics(
 def _kind(begins: str) -> str:
     """Ways of beginning from which trials can be predicted from each other."""
     return RESTING[0] if begins in RESTING else begins
+
+
+def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray) -> FloatArray:
+    """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
+    dataset, settings = experiment.dataset, experiment.settings.release
+    rows, series = dataset.rows(names), torch.from_numpy(predicted)
+    times, observed = torch.from_numpy(dataset.times[rows]), torch.from_numpy(dataset.observed[rows])
+    first = times[:, : int((times <= settings.window + 1e-9).any(0).sum())]
+
+    def delayed(times: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
+        return sample(series, (times - delay).clamp_min(0.0), float(times[0, 1]))
+
+    def errors(delay: torch.Tensor) -> torch.Tensor:
+        return (delayed(first, delay) - observed[:, : first.shape[1]]).nan_to_num()
+
+    return np.asarray(delayed(times, least_delays(errors, settings, first)[:, None]).numpy())
 
 
 def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:

@@ -6,6 +6,7 @@ happens between two frames, may push the body, and the body may have been bent s
 slow modes, and a sideways displacement are estimated from the first frames.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -77,15 +78,30 @@ def begin_inputs(
     if settings.delay == 0.0:
         return start
     first = Replay(replay.simulator, replay.observe, replay.trials.first(settings.window))
-    delays = settings.delay * torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(start.delay)
+    furthest = torch.full_like(start.delay, -_FURTHEST * settings.delay)
     with torch.no_grad():
-        series = first.series(replace(start, delay=delays[:1].expand_as(start.delay)), parameters)
-        costs = []
-        for delay in delays:
-            shown = first.at_frames(series, replace(start, delay=delay.expand_as(start.delay)))
-            squares = (first.errors(shown[None])[0] / settings.noise).square().flatten(1).sum(1)
-            costs.append(squares + (delay / settings.delay).square())
-    return replace(start, delay=delays[torch.stack(costs).argmin(0)])
+        series = first.series(replace(start, delay=furthest), parameters)
+
+        def errors(delay: torch.Tensor) -> torch.Tensor:
+            return first.errors(first.at_frames(series, replace(start, delay=delay.expand_as(start.delay)))[None])[0]
+
+        return replace(start, delay=least_delays(errors, settings, start.delay))
+
+
+def least_delays(
+    errors: Callable[[torch.Tensor], torch.Tensor], settings: ReleaseSettings, like: torch.Tensor
+) -> torch.Tensor:
+    """Delays (R,) of inputs with the least squared error of the first frames over their noise, and of the prior [s].
+
+    Args:
+        errors: of a motion delayed by a number [s], (R, T, M, 3) in the first frames [m].
+        settings: the expected delay and the noise.
+        like: a tensor with the device and type of the result.
+    """
+    delays = settings.delay * torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(like)
+    squares = [(errors(delay) / settings.noise).square().flatten(1).sum(1) for delay in delays]
+    costs = [square + (delay / settings.delay).square() for square, delay in zip(squares, delays, strict=True)]
+    return delays[torch.stack(costs).argmin(0)]
 
 
 def hold(replay: Replay, modes: int, parameters: Parameters | None = None) -> torch.Tensor:

@@ -49,8 +49,7 @@ def identify(context: StageContext) -> None:
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
     ranges = {model: _bounds(experiment, search, names) for model, search in searches.items() if search}
     kinds = {model: MODELS[model][0] for model in ranges}
-    estimated = ("released", *RESTING) if settings.release.delay > 0.0 else ("released",)
-    released = any(experiment.begins(name) in estimated for name in names)
+    released = any(experiment.begins(name) == "released" for name in names)
     evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
     kept = {
         part: Checkpoint(context, part)
@@ -61,15 +60,15 @@ def identify(context: StageContext) -> None:
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
             replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
-            placed = _placement(experiment) if model == "sysid" else {}
-            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
+            nuisances = {"delay": settings.release.delay} | (_placement(experiment) if model == "sysid" else {})
+            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
             known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
             guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
             found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
             for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
-                identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **placed)
+                identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
                 found = _search(settings, identifier, values, kept[again], progress, 1)
                 if not changes(before, found["loss"]):
                     break
@@ -82,7 +81,8 @@ def identify(context: StageContext) -> None:
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
         axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
-        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **_placement(experiment))
+        nuisances = {"delay": settings.release.delay} | _placement(experiment)
+        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **nuisances)
         counts, found = {name: axis.points for name, axis in grid.items()}, identified["sysid"]
         at = {**found["parameters"], **found.get("own", {})}
         identified[_LANDSCAPE] = _landscape(identifier, counts, at, kept[_LANDSCAPE])
@@ -158,7 +158,7 @@ def _of_first_frames(
         replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
-        identifier = Identifier(replays, bounds, settings.release.window, known=known)
+        identifier = Identifier(replays, bounds, settings.release.window, known=known, delay=settings.release.delay)
         try:
             found = identifier.run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:

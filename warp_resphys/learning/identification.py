@@ -53,6 +53,7 @@ class Identifier:
         labels: names of the markers, where `accuracy` is given.
         centre: (3,) about which recordings may be rotated [m].
         known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
+        delay: standard deviation of the delay of motions that their inputs begin, fitted to each [s]; zero for none.
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
@@ -67,8 +68,9 @@ class Identifier:
         labels: Sequence[str] = (),
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
+        delay: float = 0.0,
     ) -> None:
-        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre, known)
+        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre, known, delay)
         self._labels = tuple(labels)
 
     @property

@@ -23,8 +23,9 @@ from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from .bounds import Bounds
+from .nuisance import NuisanceFit
 from .parameters import check_names, split_name
-from .placement import Accuracy, DisplacedMarkers, Placed, estimate_placement
+from .placement import Accuracy, DisplacedMarkers, Placed
 from .replay import Replay, Start
 from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
 
@@ -46,6 +47,7 @@ class Misfit:
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         centre: (3,) about which recordings may be rotated [m].
         known: values of further parameters, which are not identified.
+        delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisance.NuisanceFit`.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -64,6 +66,7 @@ class Misfit:
         accuracy: Accuracy | None = None,
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
+        delay: float = 0.0,
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -74,7 +77,7 @@ class Misfit:
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
         self.prior_weight, self._known = 0.0, {} if known is None else dict(known)
-        self._accuracy, self._centre = accuracy, self.simulator.tensor(list(centre))
+        self._accuracy = accuracy
         self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
@@ -87,6 +90,8 @@ class Misfit:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
             self._replays.append(self._prepared(replay, start, trials))
             self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
+        at = self.simulator.tensor(list(centre))
+        self._fit = NuisanceFit(self._replays, self._weights, accuracy, at, delay)
         self._moves = _moves_of(self.bounds)
         self.forget()
 
@@ -160,14 +165,9 @@ class Misfit:
         except ConvergenceError:
             return None
         self._keep_equilibria(points)
-        if self._accuracy is None:
-            placed = [replay.errors(own) for (replay, _), own in zip(self._replays, series, strict=True)]
-            placing = _Placing.none()
-        else:
-            with torch.no_grad():
-                placed, placing = self._at_best_placement(series)
+        fitted, nuisances = self._fit(series, self.prior_weight)
         trials, columns = list[Linearised](), list[FloatArray]()
-        for number, (errors, weight) in enumerate(zip(placed, self._weights, strict=True)):
+        for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             flat = weighted.reshape(*weighted.shape[:2], -1)
@@ -175,10 +175,10 @@ class Misfit:
             seen = observed.observed.shape[-1] * observed.seen.sum((1, 2)).cpu().numpy()
             trials += zip(weighted[0].reshape(*weighted.shape[1:3], -1), slopes, seen.tolist(), strict=True)
             columns.append(slopes)
-        jacobians, placing_slopes = placing.projected(columns, math.sqrt(self.prior_weight))
+        jacobians, nuisance_slopes = nuisances.projected(columns, math.sqrt(self.prior_weight))
         trials = [(rows, own, seen) for (rows, _, seen), own in zip(trials, jacobians, strict=True)]
         prior, slopes = self._prior_rows(unit)
-        return LinearMisfit(trials, np.concatenate([prior, placing.rows]), np.concatenate([slopes, placing_slopes]))
+        return LinearMisfit(trials, np.concatenate([prior, nuisances.rows]), np.concatenate([slopes, nuisance_slopes]))
 
     def _slopes(
         self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials
@@ -203,7 +203,7 @@ class Misfit:
     def update_prior_weight(self, unit: FloatArray) -> float:
         """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
         before = self.prior_weight
-        if self._accuracy is None and not any(self._priors):
+        if self._fit.is_empty and not any(self._priors):
             return 1.0
         linearised = self.linearise(unit, derivatives=False)
         if linearised is None:
@@ -229,7 +229,7 @@ class Misfit:
             x = self.simulator.tensor(unit)[None]
             series = self._simulated(x)
             self._keep_equilibria(x)
-            return self._at_best_placement(series)[1].placed
+            return self._fit(series, self.prior_weight)[1].placed
 
     def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
@@ -238,51 +238,13 @@ class Misfit:
         priors = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
         columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in priors]
         rows = torch.stack(columns, 1) if columns else unit.new_zeros(len(unit), 0)
-        replays = [replay for replay, _ in self._replays]
-        if self._accuracy is None:
-            return [replay.errors(points) for replay, points in zip(replays, series, strict=True)], rows
-        placed, placement_rows = [], []
+        fitted, nuisance_rows = [], []
         for row in range(len(unit)):
-            own, placing = self._at_best_placement([points[row : row + 1] for points in series])
-            placed.append(own)
-            placement_rows.append(unit.new_tensor(placing.rows))
-        errors = [torch.cat(parts) for parts in zip(*placed, strict=True)]
-        return errors, torch.cat([rows, torch.stack(placement_rows)], 1)
-
-    def _at_best_placement(self, series: Sequence[torch.Tensor]) -> tuple[list[torch.Tensor], "_Placing"]:
-        """Residuals with the best placement for the first set of parameters, at which the loss is stationary in it.
-
-        While the weight of its prior is not known, the placement is nominal.
-
-        Args:
-            series: (E, R, T, 4 M, 3) simulated points and their displaced copies, by replay [m].
-
-        Returns:
-            (E, R, T, M, 3) by replay [m], and the placement.
-        """
-        assert self._accuracy is not None
-        parts = [DisplacedMarkers.split(points) for points in series]
-        replays, weight = [replay for replay, _ in self._replays], math.sqrt(self.prior_weight)
-        if not weight:
-            return [r.errors(points) for r, (points, _) in zip(replays, parts, strict=True)], _Placing.none()
-        sessions, errors = [replay.trials.session for replay in replays], list(series)
-        with torch.no_grad():
-            result = estimate_placement(
-                self._accuracy,
-                self._centre,
-                [r.errors(points[:1])[0] for r, (points, _) in zip(replays, parts, strict=True)],
-                [replay.trials.seen for replay in replays],
-                [points[0] for points, _ in parts],
-                [rotations[0] for _, rotations in parts],
-                self._weights,
-                self.prior_weight,
-                sessions,
-            )
-        for number, (points, rotations) in enumerate(parts):
-            own = result.sessions[sessions[number]]
-            errors[number] = replays[number].errors(own.apply(points + (rotations @ own.offsets[..., None])[..., 0]))
-        columns = [slopes.flatten(1, 3).double().cpu().numpy() for slopes in result.columns]
-        return errors, _Placing(result, columns, weight * result.deviations.double().cpu().numpy())
+            own, nuisances = self._fit([points[row : row + 1] for points in series], self.prior_weight)
+            fitted.append(own)
+            nuisance_rows.append(unit.new_tensor(nuisances.rows))
+        errors = [torch.cat(parts) for parts in zip(*fitted, strict=True)]
+        return errors, torch.cat([rows, torch.stack(nuisance_rows)], 1)
 
     def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
         """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
@@ -338,44 +300,6 @@ def _moves_of(names: Iterable[str]) -> list[list[int]]:
         parameter, owner = split_name(name)
         moves.setdefault(parameter if owner else name, []).append(number)
     return [*moves.values()]
-
-
-@dataclass(frozen=True)
-class _Placing:
-    """The best placements for one set of parameters.
-
-    Attributes:
-        placed: these; None if they are exact.
-        columns: (R, D, K) derivatives of the weighted residuals of each replay by the placements.
-        rows: (K,) weighted residuals of their prior.
-    """
-
-    placed: Placed | None
-    columns: list[FloatArray]
-    rows: FloatArray
-
-    @classmethod
-    def none(cls) -> "_Placing":
-        return cls(None, [], np.zeros(0))
-
-    def projected(self, jacobians: Sequence[FloatArray], weight: float) -> tuple[list[FloatArray], FloatArray]:
-        """Derivatives of the residuals, and of those of the prior, where the placement follows the parameters.
-
-        To first order it follows as in a linear problem (Kaufman, BIT 15 (1975) 49).
-
-        Args:
-            jacobians: (R, D, P) of each replay, at a constant placement.
-            weight: root of the weight of the prior.
-
-        Returns:
-            (D, P) of each trial, and (K, P).
-        """
-        if not self.columns:
-            return [own for jacobian in jacobians for own in jacobian], np.zeros((0, jacobians[0].shape[-1]))
-        pairs = [*zip(self.columns, jacobians, strict=True)]
-        rows, slopes = (np.concatenate([x.reshape(-1, x.shape[-1]) for x in of]) for of in zip(*pairs, strict=True))
-        follows = np.linalg.solve(rows.T @ rows + weight**2 * np.eye(rows.shape[1]), rows.T @ slopes)
-        return [own for a, j in pairs for own in j - a @ follows], -weight * follows
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
     )  # Places are held by a prior.
     assert result.parameters["stiffness_damping"] == pytest.approx(0.004, rel=0.05)
     on_time = Identifier([pair], RANGES, **more).run([first], 40)
-    assert result.loss < 0.02 * on_time.loss
+    assert result.loss < (0.2 if placed else 0.02) * on_time.loss
 
 
 @pytest.mark.parametrize("accuracy", [None, ACCURACY])

@@ -278,7 +278,7 @@ class RecordedData(ReadingSettings):
     begins: Begins = setting(
         "held",
         "held at rest, for 0.2 s or more, until the release; released with the first frame; rest, until inputs are "
-        "applied; static, a pose",
+        "applied; driven, at rest under the first inputs; slack, where those do not act; static, a pose",
     )
     train_fraction: Share = setting(1.0, "of each trial, from its start, that is used for training")
     horizons: Annotated[Many[Positive], AfterValidator(rising)] = setting(

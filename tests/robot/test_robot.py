@@ -312,6 +312,22 @@ class TestBadInput:
         with pytest.raises(DataFileError, match=sentence):
             warp_resphys.load(folder)
 
+    def test_a_simulator_can_be_loaded_before_the_run_is_evaluated(self, arm, tmp_path):
+        folder = Path(shutil.copytree(arm, tmp_path / "run"))
+        for name in ("stages/evaluate.json", "errors.json", "rollouts.h5", "stages/train_resphys.json"):
+            (folder / name).unlink()
+        early, late = warp_resphys.load(folder, "sysid"), warp_resphys.load(arm, "sysid")
+        assert early.description.parameters == late.description.parameters
+        assert early.description.errors_mm == {}
+        name = warp_resphys.trial_names(early)[0]
+        one, other = (warp_resphys.recorded_trial(robot, name) for robot in (early, late))
+        torch.testing.assert_close(one.start.q, other.start.q)
+        with pytest.raises(DataFileError, match="was not completed"):
+            warp_resphys.load(folder)
+        (folder / "stages/identify.json").unlink()
+        with pytest.raises(DataFileError, match="was not completed"):
+            warp_resphys.load(folder, "sysid")
+
     def test_a_package_that_is_not_there(self, robot, monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, "pxr", None)
         with pytest.raises(InputError, match=r"warp-resphys\[usd\]"):

@@ -273,7 +273,7 @@ class Experiment:
     @property
     def has_law(self) -> bool:
         """Whether a law was identified, and helps on the validation trials."""
-        return self.settings.with_law and bool(read_json(self.folder / LAW_FILE)["accepted"])
+        return self.settings.with_law and bool(read_if_there(self.folder / LAW_FILE).get("accepted"))
 
     def sources(self, model: str) -> tuple[str, str | None]:
         """Returns the entry of `MODELS`; a force corrects the law, if there is one."""

@@ -27,6 +27,7 @@ from .memory import WorkersMemory, peak_memory_gib
 
 log = logging.getLogger(__name__)
 
+_PLANNED = "stages.json"  # settings of all stages of the last command
 _PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
 
 
@@ -93,6 +94,7 @@ def run_stages(
     """
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
+        write_json(Path(run_dir) / _PLANNED, {stage.name: to_plain(stage.settings) for stage in stages})
         for stage, context in _contexts(stages, Path(run_dir)):
             begins(stage.name)
             took = _valid_seconds(stage, context)
@@ -163,6 +165,13 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
             "machine": made_on(),
         },
     )
+
+
+def planned_settings(run_dir: str | Path, name: str) -> dict[str, Any] | None:
+    """Returns the settings of a stage of the last command that worked in a run folder; None if it has no such stage."""
+    path = Path(run_dir) / _PLANNED
+    planned: dict[str, Any] = read_json(path) if path.is_file() else {}
+    return planned.get(name)
 
 
 def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:

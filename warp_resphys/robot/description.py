@@ -1,5 +1,6 @@
 """The description of a robot as plain data and tensors: read from a run folder, written to one safe file and back."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, parse
-from ..io.stages import finished_record
+from ..io.stages import finished_record, planned_settings
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
@@ -29,8 +30,12 @@ from ..settings.mesh import PlaceSettings
 from ..settings.stages import EvaluateStage
 from ..settings.trials import MarkerSettings
 
+log = logging.getLogger(__name__)
+
 _KIND: Final = "robot"
 _EVALUATE: Final = "evaluate"
+# By simulator: the stage after which it can be loaded.
+_NEEDED: Final = {"simulation": "identify", "sysid": "identify", "sysid_elastic": "identify", "law": "identify_law"}
 _NETWORK: Final = "network."
 _REGION: Final = "region."
 _PLAIN: Final = (  # fields that are written unchanged
@@ -175,8 +180,12 @@ class Description:
         )
 
 
-def finished_experiment(folder: Path) -> Experiment:
+def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
     """Returns the experiment of a finished run.
+
+    Args:
+        folder: of the run, or of one of its folds.
+        model: a simulator without a network, for which the run only has to have finished its identification.
 
     Raises:
         DataFileError: the run is missing, unfinished or changed, or it is a cross-validation.
@@ -188,6 +197,11 @@ def finished_experiment(folder: Path) -> Experiment:
             raise DataFileError(
                 f"{folder} is a cross-validation, which has a robot for each fold: name one of {listed(folds)}."
             )
+        needed, settings = _NEEDED.get(model or ""), planned_settings(folder, _EVALUATE)
+        if needed is not None and settings is not None and (folder / "stages" / f"{needed}.json").is_file():
+            finished_record(folder, needed)
+            log.info("%s is not evaluated yet: errors and prediction intervals of %s are not known", folder, model)
+            return Experiment(parse(EvaluateStage, settings), folder)
     return Experiment(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)
 
 
@@ -203,7 +217,7 @@ def describe(folder: Path, model: str) -> Description:
         InputError: the experiment has no such model.
         MeshError: the file with its mesh is missing.
     """
-    experiment = finished_experiment(folder)
+    experiment = finished_experiment(folder, model)
     settings = experiment.settings
     assert isinstance(settings, EvaluateStage)
     models = experiment.models

@@ -34,7 +34,8 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
         on_failure: ``raise``, or ``count``, see `Robot`.
 
     Raises:
-        DataFileError: there is no such run, it is unfinished, of another version, or a file of it has changed.
+        DataFileError: there is no such run, it has not identified or trained the model, it is of another version, or
+            a file of it has changed.
         InputError: the experiment has no such model, or the device is unknown.
     """
     place = Path(path).expanduser()
@@ -153,4 +154,4 @@ def _commands(
 def _experiment(robot: Robot) -> Experiment:
     if robot.folder is None:
         raise InputError("the robot was loaded from a file, which has no trials: load its run folder instead.")
-    return finished_experiment(robot.folder)
+    return finished_experiment(robot.folder, robot.description.model)

@@ -413,6 +413,22 @@ def test_a_residual_above_the_threshold_names_file_and_marker(shelf):
     refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
 
 
+def test_chosen_markers_register(shelf):
+    whole = shelf.bring_in()
+    for name in shelf.recordings:
+        shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
+    for label in ("Base - 3", "Base - 2"):
+        shelf.config["markers"]["reference"].pop(label)
+    shelf.config["markers"]["register_with"] = ["Base - 1", "Tip - 1", "Tip - 2"]
+    results = shelf.bring_in()
+    off = np.linalg.norm(results["bound"] - whole["bound"], axis=1)
+    assert off[:2].max() < 2e-3
+    assert off[2] == pytest.approx(0.012, abs=2e-3)
+    shelf.config["markers"]["register_with"] = ["Base - 1", "Base - 2"]
+    with pytest.raises(InputError, match="register_with names 'Base - 2', which is in neither tracked nor reference"):
+        shelf.bring_in()
+
+
 def test_one_outlier_among_six_is_left_out_and_named(shelf):
     whole = shelf.bring_in()
     for name in shelf.recordings:

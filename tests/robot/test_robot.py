@@ -254,6 +254,7 @@ class TestBadInput:
             (lambda r, s: r.step(s, pressure=[1.0, 2.0, 3.0]), r"pressure has shape \(1, 3\)"),
             (lambda r, s: r.step(s, pressure=[float("nan"), 0.0]), "pressure has values that are not finite"),
             (lambda r, s: r.step(s, external_force=[0.0, 0.0, 1.0]), r"external_force has shape \(3,\)"),
+            (lambda r, s: r.step(s, base=[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]), "base moves by 500 mm in a step of"),
             (lambda r, s: r.rollout(s, pressure=[0.0, 0.0]), "steps"),
             (lambda r, s: r.with_parameters(youngs=1.0), "'youngs'.*youngs_modulus"),
             (lambda r, s: r.with_parameters(youngs_modulus=-1.0), "youngs_modulus is -1"),

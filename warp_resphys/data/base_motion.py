@@ -15,7 +15,7 @@ from ..io.errors import DataFileError
 from ..settings.trials import MotionSettings
 from .rigid import FloatArray, RigidTransform, kabsch
 
-_LARGEST_STEP = 0.2  # of the size of a body
+LARGEST_STEP = 0.2  # of the size of a body
 _MILLI = 1e3
 
 
@@ -153,7 +153,7 @@ def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> No
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
     moved = rigid(poses).apply(np.broadcast_to(corners, (len(poses), *corners.shape)))
     steps = np.linalg.norm(np.diff(moved, axis=0), axis=-1).max(axis=1, initial=0.0)
-    if len(steps) and steps.max() > _LARGEST_STEP * float((high - low).max()):
+    if len(steps) and steps.max() > LARGEST_STEP * float((high - low).max()):
         raise DataFileError(
             f"{source}: the base jumps by {_MILLI * steps.max():.0f} mm in step {int(steps.argmax()) + 1}, more than a "
             "body follows without being torn: check the unit of the motion, or take a smaller time_step."

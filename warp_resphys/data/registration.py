@@ -81,11 +81,14 @@ def register_markers(
     if turned is not None:
         near, motion = _shifted(a, b, used, turned, largest_residual)
         if not 2 * np.count_nonzero(near) > np.count_nonzero(used):
-            off = _MILLI * float(np.linalg.norm((motion.apply(a) - b)[used], axis=1).max())
+            off = np.linalg.norm(motion.apply(a) - b, axis=1)
+            farthest = int(np.where(used, off, 0.0).argmax())
             raise DataFileError(
                 f"{source}: the markers at rest do not fit their nominal positions to "
-                f"{_MILLI * largest_residual:.1f} mm with the axes that are given: one is {off:.1f} mm off; check the "
-                "axes, and the markers' names, nominal positions and unit."
+                f"{_MILLI * largest_residual:.1f} mm with the axes that are given: {names[farthest]!r} is "
+                f"{_MILLI * off[farthest]:.1f} mm off, the median is {_MILLI * np.median(off[used]):.1f} mm; check the "
+                "axes, and the markers' names, nominal positions and unit, or name those that stand where they should "
+                "in markers.register_with."
             )
         return _registration(a, b, names, motion, used, near)
     if vertical is not None and _distance_from_line(b[used]) <= largest_residual:

@@ -221,7 +221,10 @@ class Observer:
         expected: FloatArray,
         only_reference: bool = False,
     ) -> Registration:
-        use = list(self.markers.reference) if only_reference else None
+        chosen = self.markers.register_with
+        use = list(self.markers.reference) if only_reference else recording.labels if chosen is not None else None
+        if use is not None and chosen is not None:
+            use = [label for label in use if label in chosen]
         return register_markers(
             *(self._turned_back(places, self.reader.view(trial)), expected, recording.labels),
             source=recording.source,

@@ -7,11 +7,13 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from ..data.base_motion import LARGEST_STEP
 from ..data.input_response import InputResponse, response_of, with_means
 from ..dynamics.frames import base_movement, rotations
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD, Strings
 from ..experiment.files import payload_inputs
+from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
@@ -92,6 +94,8 @@ class Commands:
             before = given[BASE].new_zeros(2, *given[BASE].shape) if base is None else base
             base = torch.cat([before, given.get(BASE, before[1])[None]])
             fields["fixed_positions"] = self._fixed(base[2])
+            if BASE in given:
+                self._check_base(base)
             if description.told_of_base is not None:
                 gravity = self._simulator.tensor(self._simulator.gravity)
                 moved = base_movement(base, self._simulator.time_step, gravity)[1]
@@ -115,6 +119,19 @@ class Commands:
         if any(isinstance(energy, Strings) for energy in self._simulator.body.energies):
             return {PAYLOAD.name: mass}
         return {"attached_mass": mass * self._payload_share}
+
+    def _check_base(self, base: torch.Tensor) -> None:
+        """Refuses poses (3, B, 6) of the base of which the last step moves fixed vertices too far."""
+        moved = (self._fixed(base[2]) - self._fixed(base[1])).detach().norm(dim=2)
+        rest = self._simulator.rest_positions
+        furthest, size = float(moved.max()), float((rest.amax(0) - rest.amin(0)).max())
+        milliseconds = 1e3 * self._simulator.time_step
+        if furthest > LARGEST_STEP * size:
+            raise InputError(
+                f"base moves by {1e3 * furthest:.4g} mm in a step of {milliseconds:g} ms, and a body "
+                f"of {1e3 * size:.4g} mm follows up to {1e3 * LARGEST_STEP * size:.4g} mm: give poses in m and rad, or "
+                "move it in smaller steps."
+            )
 
     def _fixed(self, pose: torch.Tensor) -> torch.Tensor:
         """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""

@@ -335,6 +335,7 @@ class MarkerSettings(BindingSettings):
     labels: Literal["recorded", "assigned"] = setting(
         "recorded", "names of the files; assigned: names are assigned by position"
     )
+    register_with: Labels | None = setting(None, "markers that register the recordings; null: all of a body at rest")
     largest_residual: Positive = setting(0.004, "of the registration, due to errors of the nominal positions", "m")
     largest_distortion: Positive = setting(
         0.001, "largest motion of a reference marker relative to the others between trials", "m"
@@ -345,6 +346,11 @@ class MarkerSettings(BindingSettings):
     def _are_bound(self) -> Self:
         if both := [label for label in self.tracked if label in self.reference]:
             raise ValueError(f"tracked and markers.reference both have '{both[0]}': it moves or is fixed.")
+        if unknown := [label for label in self.register_with or () if label not in (*self.tracked, *self.reference)]:
+            raise ValueError(
+                f"register_with names '{unknown[0]}', which is in neither tracked nor reference: choose from "
+                f"{', '.join((*self.tracked, *self.reference))}."
+            )
         if not self.tracked:
             raise ValueError("tracked is empty: name the markers that errors are measured on, with their places.")
         if self.bind == "rigid" and self.bind_to is None:

@@ -158,7 +158,14 @@ def test_folds_and_splits(tmp_path):
     assert folds_of(run) is None
     assert [trial.name for trial in trials_of(run)] == ["load101", "bare", "load52"] == list(split_of(run).names)
     assert trials_of(run)[1].file == str(tmp_path / "beam_gravity_V2_a.c3d")
-    config["data"]["train"] = []
+    config["data"]["test"] = "others"
+    assert split_of(parse(RunSettings, config)) == Split(train=["load101", "bare"], validation=[], test=["load52"])
+    config["data"] |= {"train": "others", "test": ["bare"]}
+    assert split_of(parse(RunSettings, config)) == Split(train=["load52", "load101"], validation=[], test=["bare"])
+    config["data"]["validation"] = "others"
+    with pytest.raises(InputError, match=r"data\.train is others, .* give these as lists"):
+        check(config)
+    config["data"] |= {"train": [], "validation": []}
     with pytest.raises(InputError, match=r"data\.train is empty: .* or set data\.folds to leave_one_out"):
         check(config)
 

@@ -23,6 +23,7 @@ from ..settings.trials import (
 T = TypeVar("T")
 
 SPLITS: Final = ("train", "validation", "test")
+OTHERS: Final = "others"
 _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
 
 
@@ -118,9 +119,9 @@ def _recordings(folder: Path) -> dict[str, TrialSettings]:
 def split_of(run: RunSettings) -> Split:
     """Splits the trials into training, validation and test.
 
-    Each split is configured as a list of names or as a number of trials; numbered trials are assigned in order,
-    training first. The split of a laboratory takes precedence. Validation may be empty if the force is trained on whole
-    motions.
+    Each split is configured as a list of names, as a number of trials, or as ``others``; numbered trials are assigned
+    in order, training first. The split of a laboratory takes precedence. Validation may be empty if the force is
+    trained on whole motions.
 
     Raises:
         InputError: an unknown trial, a trial in two splits, too few trials, or an empty training or test split.
@@ -170,6 +171,13 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
             f"{group}.train, {group}.validation and {group}.test ask for {asked} trials, but there are {len(names)}."
         )
     rest, lists = iter(names), dict[str, list[str]]()
+    if open_ends := [name for name, members in wanted.items() if members == OTHERS]:
+        taken = [member for members in wanted.values() if not isinstance(members, int | str) for member in members]
+        if len(open_ends) > 1 or asked:
+            raise InputError(
+                f"{group}.{open_ends[0]} is others, the trials that the other two do not name: give these as lists."
+            )
+        wanted[open_ends[0]] = [name for name in names if name not in taken]
     for name, members in wanted.items():
         lists[name] = [*islice(rest, members)] if isinstance(members, int) else list(members)
         unknown = [trial for trial in lists[name] if trial not in names]

@@ -30,7 +30,7 @@ def rising(values: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Labels = Annotated[Some[Word], AfterValidator(different)]
-Trials = Count | Many[Word]
+Trials = Count | Literal["others"] | Many[Word]
 
 
 class SwingSettings(Settings):
@@ -288,9 +288,9 @@ class RecordedData(ReadingSettings):
         (), "factors of the inputs, for additional simulated test trials"
     )
     folds: Literal["leave_one_out"] | None = setting(None, "cross-validation over the trials; null: the split")
-    train: Trials = setting((), "names of trials, or how many")
-    validation: Trials = setting((), "names of trials, or how many")
-    test: Trials = setting((), "names of trials, or how many")
+    train: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
+    validation: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
+    test: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
     limit: LimitSettings | None = setting(None, "fewer trials, evenly chosen")
 
     @model_validator(mode="after")

@@ -36,6 +36,7 @@ BEAM = [
     "identify.max_evaluations=4",
     "identify.substeps=1",
     "identify.elastic=null",
+    "identify.landscape=true",
     "identify.grid={youngs_modulus:{lower:1.5e5,upper:4.5e5,logarithmic:true,points:2}}",
     "in_the_loop.epochs=2",
     "network.width=4",

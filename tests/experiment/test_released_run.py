@@ -40,6 +40,7 @@ TINY = [
     "~identify.first_guess.mass_damping",
     "identify.starts=1",
     "identify.max_evaluations=6",
+    "identify.landscape=true",
     "identify.grid.youngs_modulus.points=2",
     "identify.grid.poissons_ratio.points=1",
     "in_the_loop.epochs=2",
@@ -120,7 +121,7 @@ class TestCompleteRun:
         expected |= {"rollouts.h5", "errors.json", "metrics.json", "report.html"}
         expected |= {name for model in LEARNED for name in (f"{model}.safetensors", f"training_{model}.json")}
         expected |= {f"reconstruction_{model}.h5" for model in LEARNED if model != "simfree"}
-        expected |= {f"stages/{stage}.json" for stage in ("laboratory", "import", *STAGES)}
+        expected |= {"stages.json", *(f"stages/{stage}.json" for stage in ("laboratory", "import", *STAGES))}
         assert names - {".lock"} == expected
         for model in LEARNED:
             kind, name = (NextState, "next state") if model == "simfree" else (ResidualForce, "residual force")
@@ -299,7 +300,12 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
 def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, tmp_path, monkeypatch, capsys):
     """The searches are left out; the losses of the landscape count its points, and the second is a failure."""
     shutil.copy(finished / "dataset.h5", tmp_path)
-    grid = ["identify.starts=2", "identify.grid.youngs_modulus.points=5", "identify.grid.poissons_ratio.points=2"]
+    grid = [
+        "identify.starts=2",
+        "identify.landscape=true",
+        "identify.grid.youngs_modulus.points=5",
+        "identify.grid.poissons_ratio.points=2",
+    ]
     wanted = settings(*SYNTHETIC, *grid)
     (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
     calls, moduli, interrupt_at = [], [], [6]

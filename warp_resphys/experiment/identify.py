@@ -76,7 +76,7 @@ def identify(context: StageContext) -> None:
                 prior = [where.between_sessions * size for size in (where.markers, where.shift) if size is not None]
                 found = {**found, "placement": {**found["placement"], "prior": prior}}
             identified[model] = _separated(found, searches[model]) | {"first_guess": guess}
-    if wanted.grid is not None:
+    if wanted.landscape and wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
         axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}

@@ -117,7 +117,8 @@ class IdentifySettings(IdentifiedSettings):
     candidates: Count = setting(4, "random candidates")
     max_evaluations: Natural = setting(10, "of the loss and its gradient, for each start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
-    grid: GridTable | None = setting(None, "loss landscape of the report")
+    landscape: bool = setting(False, "whether the report shows the loss on the grid, which takes a while")
+    grid: GridTable | None = setting(None, "of the loss landscape")
 
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:

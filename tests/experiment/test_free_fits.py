@@ -70,7 +70,10 @@ def test_what_a_pose_does_not_determine_is_left_out():
     linear = {"a_1": sensitivity(frames=1)}
     errors = {"a_1": -0.03 * linear["a_1"].by_parameter["pressure_factor"]}
     errors["a_1"][0, 1, 2] = np.nan  # not seen
-    entry = fitted(errors, linear)["a_1"]
+    more = np.full((3, MARKERS, 3), np.nan)  # frames of motions in the same experiment
+    observed = {"a_1": np.concatenate([linear["a_1"].points - errors["a_1"], more])}
+    simulated = {"a_1": np.concatenate([linear["a_1"].points, more])}
+    (entry,) = free_fits(EXPERIMENT, observed, simulated, linear)
     assert entry["left_mm"].keys() == {"scale", "zero"}
     (table,) = rest_table(
         {"sysid": [entry], "resphys": []}, Quantity("pressure", "Pa", shown_unit="kPa", shown_factor=1e-3)

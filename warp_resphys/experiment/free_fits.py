@@ -35,7 +35,8 @@ def free_fits(
         simulated: (T, M, 3) predicted markers by trial [m].
         linear: derivatives by trial; those without are left out.
     """
-    errors = {name: simulated[name] - seen for name, seen in observed.items() if name in linear}
+    frames = {name: slice(len(own.points)) for name, own in linear.items()}  # one of a pose
+    errors = {n: (simulated[n] - seen)[frames[n]] for n, seen in observed.items() if n in linear}
     errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
     words = responses(experiment)
     columns = {name: _columns(linear[name], words) for name in errors}

@@ -55,7 +55,7 @@ class TestCompleteRun:
             "times.json",
             "reconstruction.json",
         }
-        assert names == data | {"errors.json", "metrics.json", "report.html"}
+        assert names == data | {"errors.json", "metrics.json", "report.html", "stages.json"}
 
     def test_metrics(self, finished):
         results = metrics(finished[0])

@@ -44,7 +44,11 @@ def free_fits(
     for session in dict.fromkeys(map(experiment.dataset.session, errors)):
         members = [name for name in errors if experiment.dataset.session(name) == session]
         if all("places" in columns[name] for name in members):
-            fit = _least([errors[name] for name in members], [columns[name]["places"] for name in members])
+            sizes = {name: float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members}
+            parts = (
+                [own[n] / sizes[n] for n in members] for own in (errors, {n: columns[n]["places"] for n in members})
+            )
+            fit = _least(*parts)  # Trials count alike.
             shared |= {} if fit is None else dict.fromkeys(members, fit)
     return [_fitted(name, error, columns[name], shared.get(name)) for name, error in errors.items()]
 

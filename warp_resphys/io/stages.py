@@ -94,12 +94,21 @@ def run_stages(
     """
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
-        write_json(Path(run_dir) / _PLANNED, {stage.name: to_plain(stage.settings) for stage in stages})
+        _plan(stages, Path(run_dir) / _PLANNED)
         for stage, context in _contexts(stages, Path(run_dir)):
             begins(stage.name)
             took = _valid_seconds(stage, context)
             seconds[stage.name] = _run_stage(stage, context, [*seconds]) if took is None else took
     return seconds
+
+
+def _plan(stages: Sequence[Stage], path: Path) -> None:
+    """Writes the settings of all stages, unless the file has them."""
+    planned = {stage.name: to_plain(stage.settings) for stage in stages}
+    with suppress(DataFileError):
+        if path.is_file() and read_json(path) == planned:
+            return
+    write_json(path, planned)
 
 
 def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:

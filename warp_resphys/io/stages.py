@@ -103,12 +103,13 @@ def run_stages(
 
 
 def _plan(stages: Sequence[Stage], path: Path) -> None:
-    """Writes the settings of all stages, unless the file has them."""
-    planned = {stage.name: to_plain(stage.settings) for stage in stages}
+    """Adds the settings of all stages to a file, unless it has them."""
+    before = dict[str, Any]()
     with suppress(DataFileError):
-        if path.is_file() and read_json(path) == planned:
-            return
-    write_json(path, planned)
+        before = read_json(path) if path.is_file() else {}
+    planned = {**before, **{stage.name: to_plain(stage.settings) for stage in stages}}
+    if planned != before:
+        write_json(path, planned)
 
 
 def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:

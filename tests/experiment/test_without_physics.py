@@ -69,6 +69,17 @@ def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
     assert np.isfinite(after).all()
 
 
+def test_frames_that_are_not_predicted_leave_the_others_alone():
+    """Beside longer motions, the frames of a trial end early, and so do those of interpolation."""
+    fake = experiment([1.0, 2.0, 3.0, 2.5], ("rest",) * 4, ["a", "b", "c"])
+    fake.dataset.observed[:, 30:] = np.nan
+    before = without_physics(fake, ["d"])[0]
+    fake.settings.release = ReleaseSettings(delay=0.01, window=0.3, noise=1e-3)
+    after = without_physics(fake, ["d"])[0]
+    assert before.keys() == after.keys() == {"rest", "interpolation", "regression", "linear"}
+    np.testing.assert_allclose(after["interpolation"][0, :30], before["interpolation"][0, :30], atol=1e-3)
+
+
 def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.learned_steps = lambda steps: steps // 2

@@ -231,6 +231,7 @@ class Experiment:
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.prepare(values)
                 guess = simulator.static_equilibrium(resting, constants).q
+        if begins == STATIC:
             return Start.resting(guess)
         return begin_inputs(replay, Start.resting(guess), self.settings.release, values)
 
@@ -254,8 +255,9 @@ class Experiment:
         identified = read_if_there(self.folder / IDENTIFICATION)
         if key != LAW:
             return dict(identified[key])
-        placement = identified.get("sysid", {}).get("placement")
-        return {"parameters": read_json(self.folder / LAW_FILE)["parameters"], "placement": placement}
+        sysid, parameters = identified.get("sysid", {}), read_json(self.folder / LAW_FILE)["parameters"]
+        own = {name: value for name, value in sysid.get("own", {}).items() if split_name(name)[0] in parameters}
+        return {"parameters": parameters, "own": own, "placement": sysid.get("placement")}
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""

@@ -170,7 +170,12 @@ class Dataset:
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
         inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
-        resting = {name: np.concatenate([values, other.resting[name]]) for name, values in self.resting.items()}
+        resting = {
+            name: np.concatenate(
+                [own.resting.get(name, np.zeros_like(own.inputs[name][:, 0])) for own in (self, other)]
+            )
+            for name in {**self.resting, **other.resting}
+        }
         words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
         changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting}
         return replace(self, **changed)

@@ -153,13 +153,14 @@ def _of_first_frames(
     assert isinstance(settings, IdentifyStage)
     wanted = {name: bounds_of(limits) for name, limits in search.items() if limits.per == "trial"}
     names = [name for name in settings.split.names if name not in learned and experiment.begins(name) in RESTING]
-    known = experiment.identification(model)["parameters"]
+    found_in_training = experiment.identification(model)
+    known = {**found_in_training["parameters"], **found_in_training.get("own", {})}
     for name in names if wanted else ():
-        replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
-        identifier = Identifier(replays, bounds, settings.release.window, known=known, delay=settings.release.delay)
         try:
+            replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
+            identifier = Identifier(replays, bounds, settings.release.window, known=known, delay=settings.release.delay)
             found = identifier.run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:
             log.warning("identify: the first frames of %s show none of its own values: %s", name, error)

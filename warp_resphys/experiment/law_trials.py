@@ -179,7 +179,8 @@ class LawTrials:
     def score_below(self) -> "Score":
         """Returns the error of the identified simulator, or of the uncorrected one."""
         simulator = self.experiment.model_simulator("sysid" if self.sysid else "simulation")
-        return self.errors(simulator, self.experiment.parameters("sysid"), 1)[0]
+        shared = {name: simulator.tensor([value]) for name, value in self.sysid.items()}  # as laws have them
+        return self.errors(simulator, shared, 1)[0]
 
     def validation(self, law: Score, below: Score) -> dict[str, Any]:
         """Returns the errors of a law and of the simulator below it on the trials that laws are tested on."""

@@ -28,14 +28,24 @@ Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and tri
 INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals, beside the baselines
 
 
-def linearised(experiment: Experiment, names: Sequence[str]) -> dict[str, dict[str, Sensitivity]]:
-    """Derivatives of trials by the parameters of each model's simulator, see `sensitivities`; empty without markers."""
+def linearised(
+    experiment: Experiment, names: Sequence[str], uncertain: bool = False
+) -> dict[str, dict[str, Sensitivity]]:
+    """Derivatives of trials by the parameters of each model's simulator, see `sensitivities`; empty without markers.
+
+    Args:
+        experiment: the experiment.
+        names: names of the trials.
+        uncertain: whether models are left out whose parameters have no uncertainty.
+    """
     own: dict[str, dict[str, Sensitivity]] = {}
     if experiment.dataset.bound is None:
         return own
     made: dict[str, dict[str, Sensitivity]] = {}
     for model in [model for model in INTERVAL_MODELS if model in experiment.models and model != SIMFREE]:
         kind = experiment.sources(model)[0]
+        if uncertain and not experiment.identification(model).get("uncertainty"):
+            continue
         made[kind] = made[kind] if kind in made else sensitivities(experiment, model, names)
         own[model] = made[kind]
     return own
@@ -82,7 +92,7 @@ def intervals_of(
     models: dict[str, Any] = {}
     simulated, _ = without_physics(experiment, names, left_out=True)
     simulated |= calibrating
-    calibrating_spreads = spreads_of(experiment, names, linearised(experiment, names))
+    calibrating_spreads = spreads_of(experiment, names, linearised(experiment, names, uncertain=True))
     for model in (model for model in simulated if model in tested):
         trials = predicted(names, [*simulated[model]], [*observed], calibrating_spreads.get(model))
         intervals = Intervals.calibrated(trials, rest)

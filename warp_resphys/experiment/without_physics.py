@@ -72,7 +72,10 @@ def _kind(begins: str) -> str:
 def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray) -> FloatArray:
     """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
     dataset, settings = experiment.dataset, experiment.settings.release
-    rows, series = dataset.rows(names), torch.from_numpy(predicted)
+    rows = dataset.rows(names)
+    shown: NDArray[np.bool_] = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
+    last = np.maximum.accumulate(np.where(shown, np.arange(shown.shape[1]), 0), axis=1)  # held after the prediction
+    series = torch.from_numpy(np.take_along_axis(predicted, last[..., None, None], 1))
     times, observed = torch.from_numpy(dataset.times[rows]), torch.from_numpy(dataset.observed[rows])
     first = times[:, : int((times <= settings.window + 1e-9).any(0).sum())]
 
@@ -82,7 +85,8 @@ def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray
     def errors(delay: torch.Tensor) -> torch.Tensor:
         return (delayed(first, delay) - observed[:, : first.shape[1]]).nan_to_num()
 
-    return np.asarray(delayed(times, least_delays(errors, settings, first)[:, None]).numpy())
+    moved = delayed(times, least_delays(errors, settings, first)[:, None]).numpy()
+    return np.where(shown[..., None, None], moved, np.nan)
 
 
 def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:

@@ -178,7 +178,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
 
 
 def planned_settings(run_dir: str | Path, name: str) -> dict[str, Any] | None:
-    """Returns the settings of a stage of the last command that worked in a run folder; None if it has no such stage."""
+    """Returns the settings of a stage of the last command with this stage in a run folder; None if there was none."""
     path = Path(run_dir) / _PLANNED
     planned: dict[str, Any] = read_json(path) if path.is_file() else {}
     return planned.get(name)

@@ -81,7 +81,8 @@ class NuisanceFit:
     ) -> None:
         self._replays, self._weights = [*replays], [*weights]
         self._accuracy, self._centre, self._delay = accuracy, centre, delay
-        self._late = [delay > 0.0 and start.at_rest and not replay.is_static for replay, start in replays]
+        frames = [replay.trials.observed.shape[1] for replay, _ in replays]
+        self._late = [delay > 0.0 and own[1].at_rest and count > 2 for own, count in zip(replays, frames, strict=True)]
 
     @property
     def is_empty(self) -> bool:
@@ -104,7 +105,7 @@ class NuisanceFit:
         if self.is_empty or not prior_weight:
             errors = [self._errors(n, own, delays[n], None) for n, own in enumerate(series)]
             return errors, Nuisances(None, delays, [], np.zeros(0))
-        first, placed = [own[:1] for own in series], None
+        first, placed = [own[:1].detach() for own in series], None
         with torch.no_grad():
             for turn in range(_ROUNDS if any(self._late) and self._accuracy is not None else 1):
                 placed = self._placed(first, delays, prior_weight)
@@ -119,8 +120,10 @@ class NuisanceFit:
         if not self._late[number]:
             return points
         times = self._replays[number][0].trials.times
-        late = (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
-        return sample(points.flatten(0, 1), late, float(times[0, 1])).unflatten(0, points.shape[:2])
+        step, late = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
+        series, beyond = points.flatten(0, 1), (late - times.max()).clamp_min(0.0)[..., None, None]
+        ahead = beyond * (series[:, -1:] - series[:, -2:-1]) / step  # straight on after the last frame
+        return (sample(series, late, step) + ahead).unflatten(0, points.shape[:2])
 
     def _errors(self, number: int, points: torch.Tensor, delay: torch.Tensor, placed: Placed | None) -> torch.Tensor:
         """(E, R, T, M, 3) residuals of a group with places and delays (R,) [m]."""

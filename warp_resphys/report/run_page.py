@@ -193,7 +193,7 @@ def _what_is_measured(data: RunReport) -> str:
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
     release = data.settings.release
-    if trials is not None and "rest" in trials.begins and release.delay > 0.0:
+    if trials is not None and {"rest", "driven"} & {*trials.begins} and release.delay > 0.0:
         text += (
             " The instant at which the inputs of a trial act is estimated with each model, from the markers of its "
             f"first {release.window:g} s and within an expected {1e3 * release.delay:g} ms of the detected one, also "

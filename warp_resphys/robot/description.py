@@ -199,7 +199,10 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
             )
         needed, settings = _NEEDED.get(model or ""), planned_settings(folder, _EVALUATE)
         if needed is not None and settings is not None and (folder / "stages" / f"{needed}.json").is_file():
-            finished_record(folder, needed)
+            if finished_record(folder, needed)["settings"] != planned_settings(folder, needed):
+                raise DataFileError(
+                    f"{folder} is unfinished: the settings of '{needed}' changed; run its command again."
+                )
             log.info("%s is not evaluated yet: errors and prediction intervals of %s are not known", folder, model)
             return Experiment(parse(EvaluateStage, settings), folder)
     return Experiment(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)

@@ -114,6 +114,7 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         start = experiment.start(replay, model)
         constants, _, resting = replay.prepare(experiment.parameters(model))
         inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
+        inputs = _commands(experiment, robot, name, inputs)
         load = float(experiment.dataset.payload[experiment.dataset.rows([name])[0]])
         if load:
             inputs[PAYLOAD.name] = simulator.tensor([load])
@@ -123,9 +124,10 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             begun, steps = robot.settle(1, **inputs), 0
         else:
             state = State(replay.initial_state(start, constants, resting).q, start.state.v)
-            inputs = _commands(experiment, robot, name, inputs)
-            first = {key: value[0] for key, value in inputs.items() if key in replay.trials.resting.actuation}
-            begun, steps = RobotState(state, robot.begin_memory(first)), replay.steps(start)
+            before = {key: 0.0 * value[0] for key, value in inputs.items() if key in robot.driven}
+            before |= {key: value.to(state.q) for key, value in replay.trials.resting.actuation.items()}
+            memory = robot.begin_memory(_commands(experiment, robot, name, before))
+            begun, steps = RobotState(state, memory), replay.steps(start)
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]
@@ -141,13 +143,19 @@ def _commands(
 ) -> dict[str, torch.Tensor]:
     """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
     values, commands = experiment.parameters(robot.description.model), dict(inputs)
+    owners = (name, experiment.dataset.session(name))
     for key, given in inputs.items():
-        zero, factor = f"{key}_zero", f"{key}_factor"
-        if zero in values and (own := values.get(own_name(zero, name))) is not None:
-            commands[key] = (given - own + values[zero]).clamp_min(robot.simulator.inputs[key].lower)
-        if factor in values and (own := values.get(own_name(factor, name))) is not None:
-            origin = values.get(zero, torch.zeros_like(own))
-            commands[key] = origin + (commands[key] - origin) * own / values[factor]
+        zero, factor = (values.get(f"{key}_{word}") for word in ("zero", "factor"))
+        own_zero, own_factor = (
+            next((values[own] for owner in owners if (own := own_name(f"{key}_{word}", owner)) in values), common)
+            for word, common in (("zero", zero), ("factor", factor))
+        )
+        if own_zero is not None and zero is not None:
+            commands[key] = (given - own_zero + zero).clamp_min(robot.simulator.inputs[key].lower)
+        if own_factor is not None and factor is not None:
+            origin = sum(x for x in (zero, values.get(f"{key}_dead_band")) if x is not None)
+            beyond = (commands[key] - origin).clamp_min(0.0) if f"{key}_dead_band" in values else commands[key] - origin
+            commands[key] = commands[key] + beyond * (own_factor / factor - 1.0)
     return commands
 
 

@@ -47,7 +47,7 @@ def test_every_fold_is_run_once(tmp_path, processes):
     results = written(tmp_path)
     assert {name: fold["name"] for name, fold in results.items()} == dict(zip("abcd", "abcd", strict=True))
     others = {fold["process"] for fold in results.values()} - {os.getpid()}
-    assert len(others) == (2 if processes > 1 else 0)
+    assert len(others) in ((1, 2) if processes > 1 else (0,))  # One may do all while the other one still starts.
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")}
     run_folds(folds(tmp_path), Workers(processes))
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.json")} == before

@@ -78,7 +78,7 @@ def test_what_a_pose_does_not_determine_is_left_out():
     (table,) = rest_table(
         {"sysid": [entry], "resphys": []}, Quantity("pressure", "Pa", shown_unit="kPa", shown_factor=1e-3)
     )
-    assert table.columns == ["As it is", "Own scale of its inputs", "Own zero"]
+    assert table.columns == ["As it is [mm]", "Own scale of its inputs", "Own zero"]
     assert [row.head for row in table.rows] == ["a_1", "Mean"]
     assert table.rows[0].cells[1].small == "+3.0 %"
     assert table.rows[0].cells[2].small.endswith("kPa")

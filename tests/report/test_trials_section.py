@@ -24,8 +24,8 @@ def test_a_trial_has_its_best_model_its_coverage_and_where_its_error_sits():
     )
     assert table.columns == [
         "Amplitude [mm]",
-        "Best",
-        "Worse than a simpler one",
+        "Best [mm]",
+        "Worse than a simpler one [mm]",
         "Thirds of the time [mm]",
         "Coverage",
     ]

@@ -64,7 +64,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quanti
     averages = [_mean_left(rows, key) for key in shown]
     body.append(Row("Mean", [Cell(number_text(means[model])), *map(Cell, averages)]))
     note = f"Mean error of {MODELS[model][0]} [mm] as it is, {_FIT}"
-    return [PageTable("Where the rest comes from", ["As it is", *(_FREE[key] for key in shown)], body, note)]
+    return [PageTable("Where the rest comes from", ["As it is [mm]", *(_FREE[key] for key in shown)], body, note)]
 
 
 def _left(row: Mapping[str, Any], key: str, quantity: Quantity | None) -> Cell:
@@ -99,7 +99,7 @@ def trial_table(
     covered = next((intervals[m] for m in reversed(_CHAIN) if "by_trial" in intervals.get(m, {})), {})
     by_trial = covered.get("by_trial", {})
     with_thirds = any("thirds_mm" in row for row in rows)
-    columns = ["Amplitude [mm]", "Best", "Worse than a simpler one"]
+    columns = ["Amplitude [mm]", "Best [mm]", "Worse than a simpler one [mm]"]
     columns += [*(["Thirds of the time [mm]"] if with_thirds else []), *(["Coverage"] if by_trial else [])]
     body = []
     for row in rows:

@@ -196,7 +196,7 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
     )
     if with_law:
         note += " Where there is a law of the material, it is compared with SysID, and ResPhys with the law."
-    columns = ["Without physics", *(_COLUMNS[model] for model in models)]
+    columns = [f"{words} [mm]" for words in ("Without physics", *(_COLUMNS[model] for model in models))]
     columns += [*(f"Less error by {_COLUMNS[model]}" for model in gained), "Coverage", "Time"]
     return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
 

@@ -25,7 +25,7 @@ def free_fits(
 ) -> list[dict[str, Any]]:
     """Returns what would remain of the errors of trials if something were free, by trial.
 
-    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (a factor), their ``zero`` (in their unit) and
+    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change), their ``zero`` (in their unit) and
     ``delay`` [s], common to all of a trial's inputs; the ``places`` of the trial's markers and the frame of its
     recording, and those that all tested trials of a ``session`` share. What the trial does not determine is left out.
 

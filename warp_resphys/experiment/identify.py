@@ -87,7 +87,7 @@ def identify(context: StageContext) -> None:
         at = {**found["parameters"], **found.get("own", {})}
         identified[_LANDSCAPE] = _landscape(identifier, counts, at, kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, identified)
-    for model in ranges:
+    for model in ranges:  # First frames are compared with the identified simulator, as later stages read it.
         values, deviations = _of_first_frames(experiment, model, searches[model], names)
         if values:
             own = {"own": identified[model]["own"] | values}
@@ -153,20 +153,20 @@ def _of_first_frames(
     assert isinstance(settings, IdentifyStage)
     wanted = {name: bounds_of(limits) for name, limits in search.items() if limits.per == "trial"}
     names = [name for name in settings.split.names if name not in learned and experiment.begins(name) in RESTING]
-    found_in_training = experiment.identification(model)
-    known = {**found_in_training["parameters"], **found_in_training.get("own", {})}
+    shared = experiment.identification(model)
+    known = {**shared["parameters"], **shared.get("own", {})}
     for name in names if wanted else ():
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
         try:
             replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
             identifier = Identifier(replays, bounds, settings.release.window, known=known, delay=settings.release.delay)
-            found = identifier.run([guess], settings.identify.max_evaluations)
+            result = identifier.run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:
             log.warning("identify: the first frames of %s show none of its own values: %s", name, error)
             continue
-        values |= found.parameters
-        deviations |= {} if found.uncertainty is None else found.uncertainty.deviation
+        values |= result.parameters
+        deviations |= {} if result.uncertainty is None else result.uncertainty.deviation
     return values, deviations
 
 

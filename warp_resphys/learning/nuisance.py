@@ -29,14 +29,12 @@ class Nuisances:
 
     Attributes:
         placed: places of the markers; None if they are exact.
-        delays: (R,) of each group of trials [s].
         columns: (R, D, K) derivatives of the weighted residuals of each group, in standard deviations of the prior;
             empty if nothing was fitted.
         rows: (K,) weighted residuals of the prior.
     """
 
     placed: Placed | None
-    delays: list[torch.Tensor]
     columns: list[FloatArray]
     rows: FloatArray
 
@@ -104,7 +102,7 @@ class NuisanceFit:
         delays = [torch.zeros_like(start.delay) for _, start in self._replays]
         if self.is_empty or not prior_weight:
             errors = [self._errors(n, own, delays[n], None) for n, own in enumerate(series)]
-            return errors, Nuisances(None, delays, [], np.zeros(0))
+            return errors, Nuisances(None, [], np.zeros(0))
         first, placed = [own[:1].detach() for own in series], None
         with torch.no_grad():
             for turn in range(_ROUNDS if any(self._late) and self._accuracy is not None else 1):
@@ -205,4 +203,4 @@ class NuisanceFit:
             places = [own.flatten(1, 3).double().cpu().numpy() for own in placed.columns]
             blocks = [np.concatenate(pair, 2) for pair in zip(places, blocks, strict=True)]
             rows.insert(0, weight * placed.deviations.double().cpu().numpy())
-        return Nuisances(placed, delays, blocks, np.concatenate(rows))
+        return Nuisances(placed, blocks, np.concatenate(rows))

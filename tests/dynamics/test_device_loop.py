@@ -3,7 +3,17 @@
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, Tendons, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    Tendons,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.energies.potential import IncrementalPotential
 from warp_resphys.io.errors import ConvergenceError
@@ -101,6 +111,19 @@ def test_a_failure_is_said_and_mends_itself(device):
     with pytest.raises(ConvergenceError, match="environment 1 of 3"):
         s.step(State(calm.q, wild))
     torch.testing.assert_close(s.step(calm)[0].q, expected.q, rtol=0.0, atol=1e-9)
+
+
+def test_a_rollout_says_which_of_its_steps_failed_first(device):
+    """Also on a GPU, where the host looks only after the last step."""
+    s = simulator("quasi_newton", device, max_iterations=25)
+    start = bent(s)
+    expected = s.rollout(start, 3).q
+    force = torch.zeros(4, *start.q.shape, device=start.q.device, dtype=start.q.dtype)
+    force[1, 2] = force[3, 0] = 1e5
+    with pytest.raises(ConvergenceError, match="environment 2 of 3") as caught:
+        s.rollout(start, 4, Inputs(external_force=force))
+    assert list(caught.value.report.converged) == [True, True, False]
+    torch.testing.assert_close(s.rollout(start, 3).q, expected, rtol=0.0, atol=1e-9)
 
 
 def test_tendons_have_the_host_in_the_loop(device):

@@ -25,13 +25,15 @@ from .assembly import BlockPattern
 from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
-from .nonlinear_solver import SolveReport, SolverSettings
+from .nonlinear_solver import SolveReport, SolverSettings, check_converged
 from .potential_terms import PotentialTerms
 from .statics import MOST_ITERATIONS, find_equilibrium
 from .trajectory import Trajectory
 
 GRAVITY = (0.0, 0.0, -9.80709)
 _NO_INPUTS = Inputs()
+# Steps of a roll-out on a GPU after which the host checks their convergence: it waits for the GPU only then.
+_STEPS_TO_CHECK = 32
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
@@ -221,10 +223,12 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: the solver failed, if `SolverSettings.on_failure` is ``raise``.
         """
-        return self._advance(state, *self._checked(state, inputs, parameters))
+        new, report, x = self._advance(state, *self._checked(state, inputs, parameters))
+        check_converged(self.settings, report, x)
+        return new, report
 
-    def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport]:
-        """Advances a batch by one time step, with checked arguments."""
+    def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport, torch.Tensor]:
+        """Returns the next state, and report and solution (B, N, 3) of its solve [m]."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms.of_step(state, stage, inputs, constants, workspace.potential.energies)
@@ -234,7 +238,7 @@ class Simulator:
         x = self._coordinates.expand(x)
         new = self._finish(state, stage, inputs, constants, x)
         workspace.record_positions(new.q)
-        return new, report
+        return new, report, x
 
     def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
         """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
@@ -340,6 +344,7 @@ class Simulator:
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
         terms = self._terms.at_rest(rest, inputs, constants, share)
         x, report = equilibrium(workspace, "statics", settings, terms, start, at)
+        check_converged(settings, report, x)
         return self._coordinates.expand(x), report
 
     def rollout(
@@ -368,16 +373,22 @@ class Simulator:
         inputs = _NO_INPUTS if inputs is None else inputs
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
-        states, reports = [state], []
+        states, reports, unchecked = [state], [], []
+        together = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK
         for t in range(steps):
             current = inputs.at(t)
             if t == 0:
                 self._checked(state, current, constants)
             elif current is not inputs:
                 self._check_inputs(current, state.batch)
-            state, report = self._advance(state, current, constants)
+            state, report, x = self._advance(state, current, constants)
             states.append(state)
             reports.append(report)
+            unchecked.append((report, x))
+            if len(unchecked) == together or t == steps - 1:
+                for solved in unchecked:
+                    check_converged(self.settings, *solved)
+                unchecked.clear()
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
         return Trajectory(q, v, reports, state, self.body, self.time_step)
 

@@ -42,7 +42,7 @@ def test_every_case_is_measured_and_stands_on_the_page(folder, device):
         assert 0.0 < row["fastest_forward_ms"] <= row["forward_ms"]
         assert 0.0 < row["fastest_backward_ms"] <= row["backward_ms"]
         assert row["solver"] != "newton" or row["factorisations"] >= row["iterations"]
-        times = [f"{row['forward_ms']:.2f}", f"{row['backward_ms']:.2f}"]
+        times = [f"{row[name]:.2f}" for name in ("plain_ms", "forward_ms", "backward_ms")]
         for shown in (text, ended.out):
             assert any(all(cell in line for cell in (row["solver"], *times)) for line in shown.splitlines())
     assert [(p["refinement"], p["batch"]) for p in result["parts"]] == [(1, 1), (1, 2), (2, 1), (2, 2)]

@@ -119,7 +119,7 @@ def measure(values: dict[str, Any]) -> dict[str, Any]:
     timed = TimedRollout(simulator, simulator.rest_state(), study.steps)
     for _ in range(study.repeats):
         timed.measure()
-    forward, adjoint = timed.a_step(median)
+    _, forward, adjoint = timed.a_step(median)
     return {
         "unknowns": timed.unknowns,
         "forward_s": forward,

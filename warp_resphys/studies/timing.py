@@ -67,7 +67,8 @@ class TimedRollout:
     start: State
     steps: int
     inputs: Inputs = field(default_factory=Inputs)
-    forward: list[float] = field(default_factory=list)  # [s] of each roll-out
+    plain: list[float] = field(default_factory=list)  # [s] of each roll-out that keeps nothing for gradients
+    forward: list[float] = field(default_factory=list)  # [s] of each roll-out with gradients
     backward: list[float] = field(default_factory=list)  # [s] of each gradient
     iterations: float = 0.0  # mean over the steps of the last roll-out
     factorisations: float = 0.0  # mean over the steps of the last roll-out
@@ -76,6 +77,10 @@ class TimedRollout:
         """Times a roll-out and its gradient with respect to the start, and inputs and parameters that require one."""
         device, others = self.start.q.device, [*self.inputs.fields.values(), *(parameters or {}).values()]
         q, v = (tensor.clone().requires_grad_(True) for tensor in (self.start.q, self.start.v))
+        began = now(device)
+        with torch.no_grad():
+            self.simulator.rollout(self.start, self.steps, self.inputs, parameters)
+        self.plain.append(now(device) - began)
         began = now(device)
         trajectory = self.simulator.rollout(State(q, v), self.steps, self.inputs, parameters)
         self.forward.append(now(device) - began)
@@ -91,9 +96,15 @@ class TimedRollout:
         """Number of coordinates of the free vertices of one environment."""
         return 3 * (self.simulator.body.n_vertices - len(self.simulator.fixed))
 
-    def a_step(self, statistic: Callable[[list[float]], float]) -> tuple[float, float]:
-        """A statistic of the durations [s] of a step of the whole batch, forward and backward."""
-        return statistic(self.forward) / self.steps, statistic(self.backward) / self.steps
+    @property
+    def durations(self) -> tuple[list[float], list[float], list[float]]:
+        """``plain``, ``forward`` and ``backward``."""
+        return self.plain, self.forward, self.backward
+
+    def a_step(self, statistic: Callable[[list[float]], float]) -> tuple[float, float, float]:
+        """A statistic of the durations [s] of a step of the whole batch: plain, forward and backward."""
+        plain, forward, backward = (statistic(own) / self.steps for own in self.durations)
+        return plain, forward, backward
 
 
 def step_time(simulator: Simulator, start: State, inputs: Sequence[Inputs], repeats: int) -> dict[str, float]:

@@ -75,9 +75,9 @@ class EnergySet:
             self.parts |= dict.fromkeys(parameters, energy.names) if energy.names else {}
             self.memory |= item.named({m.name: replace(m, name=f"{item.prefix}{m.name}") for m in bound.memory})
         pairs = list(enumerate(self._pairs))
-        self._loading, self._stepping = (
+        self._loading, self._stepping, self._posing = (
             [(i, pair) for i, pair in pairs if getattr(type(pair[1]), name) is not getattr(BoundEnergy, name)]
-            for name in ("load", "begin_step")
+            for name in ("load", "begin_step", "at_pose")
         )
         self._remembering = [(i, pair) for i, pair in pairs if pair[1].memory]
 
@@ -123,6 +123,19 @@ class EnergySet:
     def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
         """Returns these values for a static equilibrium."""
         return {k: v for placed, bound in self._pairs for k, v in placed.named(bound.at_rest(batch)).items()}
+
+    @property
+    def follow_pose(self) -> bool:
+        """Whether values of a static equilibrium depend on its positions."""
+        return bool(self._posing)
+
+    def at_pose(self, q: torch.Tensor, values: Mapping[str, torch.Tensor | None]) -> dict[str, torch.Tensor | None]:
+        """Returns these values at positions (B, N, 3) [m], with the other values by name."""
+        posed: dict[str, torch.Tensor | None] = {}
+        for _, (placed, bound) in self._posing:
+            own = {name: value for name, value in placed.own(values).items() if value is not None}
+            posed |= placed.named(bound.at_pose(q, own))
+        return posed
 
     def end_step(
         self,

@@ -70,14 +70,26 @@ class PotentialTerms:
             values[f"{DEPENDENT}target"] = target[:, dependent]
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
-    def at_rest(self, rest: torch.Tensor, inputs: Inputs, constants: Constants, share: float) -> StepTerms:
-        """Returns the terms of a static equilibrium of the shape ``rest`` (B, N, 3), under a fraction of all loads."""
+    def at_rest(
+        self, rest: torch.Tensor, inputs: Inputs, constants: Constants, share: float, near: torch.Tensor | None = None
+    ) -> StepTerms:
+        """Returns the terms of a static equilibrium of the shape ``rest`` (B, N, 3), under a fraction of all loads.
+
+        Args:
+            rest: the undeformed shape [m].
+            inputs: constant inputs.
+            constants: prepared constants.
+            share: the fraction.
+            near: (B, N, 3) positions of forces that depend on the pose; without, these are left out [m].
+        """
         batch = len(rest)
         values = self._energies.values(constants, inputs, batch)
         for name in self._energies.inputs:
             value = values[name]
             values[name] = None if value is None else share * value
         values |= self._energies.at_rest(batch)
+        if near is not None:
+            values |= self._energies.at_pose(near, values)
         force = self._coordinates.reduce(self._loads(inputs, constants, batch, True).expand(batch, -1, -1))
         return StepTerms(rest, rest.new_zeros(rest.shape[:2]), share * force, values)
 

@@ -27,7 +27,7 @@ from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings, check_converged
 from .potential_terms import PotentialTerms
-from .statics import MOST_ITERATIONS, find_equilibrium
+from .statics import MOST_ITERATIONS, find_equilibrium, settle
 from .trajectory import Trajectory
 
 GRAVITY = (0.0, 0.0, -9.80709)
@@ -332,17 +332,28 @@ class Simulator:
         solve = partial(self._balance, inputs, constants, state.q)
         limited = self.settings.max_iterations < MOST_ITERATIONS
         x = find_equilibrium(solve, state.q, state.q if start is None else start.detach(), limited)
+        if self._energies.follow_pose:
+            x = settle(lambda near: self._balance(inputs, constants, state.q, 1.0, near.detach(), near)[0], x)
         return State(x, torch.zeros_like(x))
 
     def _balance(
-        self, inputs: Inputs, constants: Constants, rest: torch.Tensor, share: float, start: torch.Tensor
+        self,
+        inputs: Inputs,
+        constants: Constants,
+        rest: torch.Tensor,
+        share: float,
+        start: torch.Tensor,
+        near: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) under a fraction of all loads, inputs and motion of the clamp [m]."""
+        """Returns the equilibrium (B, N, 3) under a fraction of all loads, inputs and motion of the clamp [m].
+
+        Forces that depend on the pose without a potential are those ``near`` (B, N, 3); without, they are left out.
+        """
         workspace, clamp = self.workspace(len(rest)), rest[:, self.fixed]
         most = min(self.settings.max_iterations, MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        terms = self._terms.at_rest(rest, inputs, constants, share)
+        terms = self._terms.at_rest(rest, inputs, constants, share, near)
         x, report = equilibrium(workspace, "statics", settings, terms, start, at)
         check_converged(settings, report, x)
         return self._coordinates.expand(x), report

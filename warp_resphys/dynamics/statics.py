@@ -14,6 +14,8 @@ log = logging.getLogger(__name__)
 MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
+_MOST_SETTLINGS = 100
+_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 
@@ -70,3 +72,47 @@ def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None
         else:
             done = share
     return x
+
+
+def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor) -> torch.Tensor:
+    """Returns the fixed point x = solve(x), differentiable in everything that the function depends on.
+
+    The gradient g by the solution fulfils g = w + (d solve / dx)^T g, for that of the loss w, and is found like the
+    solution, by iteration.
+
+    Args:
+        solve: equilibrium (B, N, 3) under forces at given positions [m], near which it lies.
+        start: (B, N, 3) initial guess [m].
+
+    Raises:
+        ConvergenceError: the iteration does not converge.
+    """
+    with torch.no_grad():
+        x = _repeated(solve, start.detach(), "the equilibrium does not settle")
+    if not torch.is_grad_enabled():
+        return x
+    near = x.requires_grad_()
+    again = solve(near)
+    solution = solve(x.detach())
+    if not solution.requires_grad:
+        return solution
+
+    def through(gradient: torch.Tensor) -> torch.Tensor:
+        def more(total: torch.Tensor) -> torch.Tensor:
+            return gradient + torch.autograd.grad(again, near, total, retain_graph=True)[0]
+
+        return _repeated(more, gradient, "the gradient of the equilibrium does not settle")
+
+    solution.register_hook(through)
+    return solution
+
+
+def _repeated(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str) -> torch.Tensor:
+    """Returns the limit of repeated calls of a function, or raises ConvergenceError."""
+    for _ in range(_MOST_SETTLINGS):
+        previous, x = x, function(x)
+        if bool((x - previous).norm() <= _SETTLED * x.norm()):
+            return x
+    raise ConvergenceError(
+        f"{failure}: friction depends too strongly on the pose; lower the friction or the tension.", x, None
+    )

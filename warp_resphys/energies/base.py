@@ -257,6 +257,16 @@ class BoundEnergy:
         del batch
         return {}
 
+    def at_pose(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        """Returns these values for an equilibrium whose forces depend on its own positions in ways without a potential.
+
+        Args:
+            q: (B, N, 3) the equilibrium, or positions near it [m].
+            values: the other values of the term by name, such as inputs.
+        """
+        del q, values
+        return {}
+
     def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
         """Returns a dead load (1 or B, N, 3), independent of the positions [N], or None.
 

@@ -1,4 +1,4 @@
-r"""Tendons (cables) that slide without friction through guides in a body.
+r"""Tendons (cables) that slide through guides in a body, with or without friction.
 
 A tendon is straight between its guides, so that its length L is the sum of their distances; it ends at its first and
 last guide. A commanded tension T has the potential T L. A commanded contraction c acts through a tension-only spring of
@@ -9,8 +9,9 @@ stiffness k, relative to the length at rest L_0:
 with s(e) = max(e, 0)^2 / 2, smoothed over a short distance so that a slack tendon tightens smoothly. A tendon commanded
 by tension has k = 0, one commanded by length has T = 0, and a passive cable has T = 0 and c = 0.
 
-The tension is the same in all segments of a tendon: its change, k s'' g g^T with the gradient g of the length, couples
-all vertices near the tendon. It is a low-rank correction to a Hessian that stays as sparse as the mesh.
+Without friction the tension is the same in all segments of a tendon: its change, k s'' g g^T with the gradient g of the
+length, couples all vertices near the tendon. It is a low-rank correction to a Hessian that stays as sparse as the mesh.
+With friction (`tendon_friction`) there is such a correction for every guide.
 
 The routing may be a parameter, too: the guides move in the undeformed body along up to two given directions, from X to
 X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a are extrapolated linearly from X, so that
@@ -32,9 +33,10 @@ from ..kernels import tendons as kernels
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, Energy, PointSet, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
 from .part_terms import PartPoints, PartTerm
+from .tendon_friction import BRISTLE, FRICTION, STEP_VALUES, BoundTendons, beyond, friction_after
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,13 @@ OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) 
 class Tendons(Energy):
     """Tendons (energy in the module's docstring).
 
-    Inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m]; parameters are ``tendon_stiffness`` [N/m] and,
-    with directions, ``tendon_offset_1`` and ``tendon_offset_2`` [m], zero by default; all with one value per tendon.
+    Inputs are ``tendon_tension`` [N] and ``tendon_contraction`` [m]; parameters are ``tendon_stiffness`` [N/m], with
+    friction ``tendon_friction`` and ``tendon_bristle_length`` [m], and with directions ``tendon_offset_1`` and
+    ``tendon_offset_2`` [m], zero by default; all with one value per tendon.
 
     Raises:
-        InputError: no tendon, one with fewer than two guides, guides that are not finite, a negative stiffness, or
-            directions of offsets that do not fit the guides.
+        InputError: no tendon, one with fewer than two guides, guides that are not finite, a negative stiffness,
+            friction or angle, or directions of offsets that do not fit the guides.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = (TENSION, CONTRACTION)
@@ -77,6 +80,9 @@ class Tendons(Energy):
     # offset directions of each tendon, one or two for all tendons: (3,) for all guides of a tendon, or (G, 3) one per
     # guide; displacement of the guide per metre of offset
     directions: Sequence[Sequence[ArrayLike]] = ()
+    friction: Parameter | None = None  # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
+    bristle_length: Parameter = 1e-4  # slide over which friction turns [m]
+    entry_angle: ArrayLike = 0.0  # of contact before the first guide, such as around pulleys: one, or (T,) [rad]
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -95,6 +101,15 @@ class Tendons(Energy):
         if self.labels and len(self.labels) != len(self.routes):
             raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
         _STIFFNESS.check(self.stiffness)
+        if self.friction is not None:
+            FRICTION.check(self.friction)
+            BRISTLE.check(self.bristle_length)
+        angles = np.asarray(self.entry_angle, dtype=np.float64)
+        if angles.shape not in ((), (self.count,)) or not (np.isfinite(angles) & (angles >= 0.0)).all():
+            raise InputError(
+                f"the entry angle of tendons is {self.entry_angle}: give one angle, or {self.count}, of zero or more, "
+                "in rad."
+            )
         if len(set(self.names)) != self.count:
             raise InputError(f"tendons are called {', '.join(self.names)}: give each a name of its own.")
         if not len(self.directions):
@@ -136,10 +151,20 @@ class Tendons(Energy):
         """Number of offset directions per tendon."""
         return len(self.directions[0]) if len(self.directions) else 0
 
+    def offset_values(self, values: Mapping[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
+        """Returns the offsets (1 or B, T) among some values, by name [m]."""
+        return {offset.name: value_of(values, offset.name) for offset in OFFSETS}
+
+    def offset_vector(self, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the vectors c (1 or B, T, 3) of `kernels.tendons` for offsets by name."""
+        first, second = torch.broadcast_tensors(*(values[offset.name] / kernels.OFFSET_UNIT for offset in OFFSETS))
+        return torch.stack([torch.ones_like(first), first, second], -1)
+
     @property
     @override
     def parameters(self) -> tuple[Quantity, ...]:
-        return (_STIFFNESS, *OFFSETS[: self.offset_count])
+        friction = () if self.friction is None else (FRICTION, BRISTLE)
+        return (_STIFFNESS, *friction, *OFFSETS[: self.offset_count])
 
     @property
     def guides(self) -> list[NDArray[np.float64]]:
@@ -159,7 +184,10 @@ class Tendons(Energy):
     @property
     @override
     def constants(self) -> Mapping[str, Parameter]:
-        return {"tendon_stiffness": self.stiffness} | {offset.name: 0.0 for offset in OFFSETS[: self.offset_count]}
+        values: dict[str, Parameter] = {"tendon_stiffness": self.stiffness}
+        if self.friction is not None:
+            values |= {FRICTION.name: self.friction, BRISTLE.name: self.bristle_length}
+        return values | {offset.name: 0.0 for offset in OFFSETS[: self.offset_count]}
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -167,6 +195,10 @@ class Tendons(Energy):
         values = super().prepare(constants)
         zero = torch.zeros_like(values["tendon_stiffness"])
         return values | {offset.name: zero for offset in OFFSETS[self.offset_count :]}
+
+    @override
+    def bind(self, site: EnergySite) -> BoundEnergy:
+        return super().bind(site) if self.friction is None else BoundTendons(self, site)
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
@@ -235,12 +267,17 @@ class TendonTerm(PartTerm):
         assert isinstance(s.source, TendonPoints)
         numbers = s.source.part
         names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(offset.name for offset in OFFSETS))
-        super().__init__(launcher, sets, dict.fromkeys(names, (tendons.count,)), tendons.count)
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(names, (tendons.count,))
+        self._rubs = tendons.friction is not None
+        if self._rubs:
+            shapes |= {BRISTLE.name: (tendons.count,), **dict.fromkeys(STEP_VALUES, (s.n_points,))}
+        super().__init__(launcher, sets, shapes, tendons.count)
+        self._beyond = torch.as_tensor(beyond(numbers), device=launcher.device)
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
         self._rest = launcher.upload(s.source.rest, wp.mat33d)
-        self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(tendons.count)
-        self._spring = launcher.zeros(tendons.count, 3)
+        self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points)
+        self._spring, self._friction = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points, 3)
         self._direction = launcher.zeros(s.n_points, 3, 3)
         self._directions: Any = None  # the launch that fills it, made at its first use
         self._segment_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
@@ -252,23 +289,29 @@ class TendonTerm(PartTerm):
 
     @property
     def _pull(self) -> tuple[Any, Any]:
-        """Outputs of `before`: c and the tension of each tendon."""
+        """Outputs of `before`: c of each tendon and the tension of each segment."""
         return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
 
     @override
     def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
         (s,) = self.sets
-        tension, contraction, stiffness, *offsets = self.views(values)
-        runs = [s.nodes, s.gradients, self._first, self._rest, *offsets]
-        inputs = [active, *runs, tension, contraction, stiffness, self._toe, positions]
-        outputs = [*self._pull, warp_view(self._spring, wp.vec3d)]
+        tension, contraction, stiffness, first, second, *rubbing = self.views(values)
+        if self._rubs:
+            bristles, *friction = rubbing
+        else:
+            zeros, ones = self.launcher.zeros(s.n_points), self.launcher.zeros(self.count) + 1.0
+            bristles, *friction = (warp_view(own, wp.float64) for own in (ones, *(zeros,) * 4))
+        runs = [s.nodes, s.gradients, self._first, self._rest, first, second]
+        inputs = [active, *runs, tension, contraction, stiffness, self._toe, *friction, bristles, positions]
+        outputs = [*self._pull, warp_view(self._spring, wp.vec3d), warp_view(self._friction, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         tension, _, stiffness, *_ = self.views(values)
         runs = [s.nodes, s.gradients, self._first, self.part]
-        return [*runs, tension, stiffness, *self._pull, warp_view(self._spring, wp.vec3d), positions]
+        forces = [warp_view(own, wp.vec3d) for own in (self._spring, self._friction)]
+        return [*runs, tension, stiffness, *self._pull, *forces, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -276,8 +319,9 @@ class TendonTerm(PartTerm):
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        stiffness = value_of(values, "tendon_stiffness")
-        if not bool((stiffness > 0.0).any()):
+        stiffness, slopes = value_of(values, "tendon_stiffness"), self._friction[..., 2]
+        sprung, rubs = bool((stiffness > 0.0).any()), self._rubs and bool((slopes > 0.0).any())
+        if not (sprung or rubs):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
@@ -286,10 +330,14 @@ class TendonTerm(PartTerm):
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
         columns = self._direction.movedim(-1, 1)[:, : len(self._operator)]  # (B, .., P, 3)
-        by_column = columns[..., None] * self._one_hot[:, None]  # (B, .., P, 3, T)
-        gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 T)
-        gradient = gradient.unflatten(2, (3, self.count)).flatten(1, 2)
-        return gradient * (stiffness * self._spring[..., 2]).sqrt()[:, None]
+        weights = []  # (B, P, r) of the segments' lengths in the columns
+        if sprung:
+            weights.append(self._one_hot * (stiffness * self._spring[..., 2]).sqrt()[:, None])
+        if rubs:
+            weights.append(self._beyond * slopes.sqrt()[:, None])
+        by_column = columns[..., None] * torch.cat(weights, -1)[:, None, :, None]  # (B, .., P, 3, r)
+        gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 r)
+        return gradient.unflatten(2, (3, -1)).flatten(1, 2)
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -297,15 +345,20 @@ class TendonTerm(PartTerm):
         # |F c|^2 <= |c|^2 |F|^2, and the square of a sum of n lengths is at most n times the sum of their squares.
         columns = 1.0 + sum((value_of(values, o.name) / kernels.OFFSET_UNIT).square() for o in OFFSETS)
         stretching = (tension * columns)[:, self.part_of] / self._segment_length
+        if self._rubs:  # A guide's slope is at most the sum of its bounds over the bristle length.
+            _, drop, rise, _ = (value_of(values, name) for name in STEP_VALUES)
+            slopes = (drop + rise) / value_of(values, BRISTLE.name)[:, self.part_of] * self._beyond.sum(0)
+            stretching = stretching + columns[:, self.part_of] * (slopes @ self._beyond.mT)
         return stretching + (stiffness * columns * self._one_hot.sum(0))[:, self.part_of]
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, (s,) = self.launcher, self.sets
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        shorter, by_offset, longer = own.zeros(s.n_points), own.zeros(s.n_points, 2), own.zeros(s.n_points, 2)
+        shorter = own.zeros(s.n_points)
+        by_offset, longer, at_rest = (own.zeros(s.n_points, 2) for _ in range(3))
         inputs = [s.nodes, s.gradients, self.part, self._rest, *self._pull, *views]
-        outputs = [warp_view(shorter, wp.float64), warp_view(by_offset, wp.vec2d), warp_view(longer, wp.vec2d)]
+        outputs = [warp_view(shorter, wp.float64), *(warp_view(x, wp.vec2d) for x in (by_offset, longer, at_rest))]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),
             own.record(kernels.adjoint, (own.batch, s.n_points), inputs, outputs),
@@ -319,8 +372,27 @@ class TendonTerm(PartTerm):
             by_stiffness = self._spring[..., 1] * by_tension
             by_offsets = [
                 self.sum_parts(held) + by_contraction * self.sum_parts(taut)
-                for held, taut in zip(by_offset.unbind(-1), longer.unbind(-1), strict=True)
+                for held, taut in zip(by_offset.unbind(-1), (longer - at_rest).unbind(-1), strict=True)
             ]
-            return dict(zip(self.shapes, (by_tension, by_contraction, by_stiffness, *by_offsets), strict=True))
+            if not self._rubs:
+                return dict(zip(self.shapes, (by_tension, by_contraction, by_stiffness, *by_offsets), strict=True))
+            past = shorter @ self._beyond  # (B, P) of the tendon beyond each guide
+            by_length = -self._friction[..., 2] * past
+            by_offsets = [
+                sum_ - self.sum_parts((by_length @ self._beyond.mT) * taut)
+                for sum_, taut in zip(by_offsets, longer.unbind(-1), strict=True)
+            ]
+            by_friction = self._friction_slopes(values, past)
+            slopes = (by_tension, by_contraction, by_stiffness, *by_offsets, *by_friction, by_length)
+            return dict(zip(self.shapes, slopes, strict=True))
 
         return differentiate
+
+    def _friction_slopes(self, values: Values, past: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the derivatives by bristle length, hold, drop and rise; ``past`` (B, P) is -z . d length beyond."""
+        length, hold, drop, rise, _ = (value_of(values, name) for name in (BRISTLE.name, *STEP_VALUES))
+        with torch.enable_grad():
+            length, hold, drop, rise = leaves = [x.detach().requires_grad_() for x in (length, hold, drop, rise)]
+            slide = self._friction[..., 1].clone()
+            friction = friction_after(slide, hold, drop, rise, length[:, self.part_of])
+            return torch.autograd.grad(friction, leaves, past)

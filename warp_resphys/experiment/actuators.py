@@ -137,6 +137,9 @@ def build_tendons(settings: TendonSettings) -> Tendons:
         own = [np.broadcast_to(np.asarray(offset, dtype=np.float64), guides.shape) for offset in route.offsets]
         directions.append([_divided(offset, route.pieces) for offset in own])
     more: dict[str, Any] = {"directions": directions} if any(directions) else {}
+    if settings.friction is not None:
+        entry = [route.entry_angle for route in settings.routes.values()]
+        more |= {"friction": settings.friction, "bristle_length": settings.bristle_length, "entry_angle": entry}
     labels = tuple(settings.routes)
     return Tendons(routes, settings.stiffness, labels=labels, toe=settings.toe, reach=settings.reach, **more)
 

@@ -123,6 +123,7 @@ class RouteSettings(Settings):
 
     guides: Curve = setting(description="points through which it runs", unit="m")
     pieces: Divisions = setting(1, "pieces into which each straight part is divided")
+    entry_angle: NotNegative = setting(0.0, "of contact before the first guide, such as around pulleys", "rad")
     offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
         (), "directions of an identified offset of the route: three numbers each, or three for each guide"
     )
@@ -136,6 +137,10 @@ class TendonSettings(Settings):
     stiffness: NotNegative = setting(description="required for commanded contractions", unit="N/m")
     toe: Positive = setting(1.0e-4, "contraction over which a tendon becomes taut", "m")
     reach: Positive = setting(1.0e-3, "largest distance of a guide from the body", "m")
+    friction: NotNegative | None = setting(
+        None, "coefficient in the guides, by the angle of contact (`tendon_friction`); null: none"
+    )
+    bristle_length: Positive = setting(1.0e-4, "slide over which friction turns", "m")
 
     @model_validator(mode="after")
     def _pulls(self) -> Self:

@@ -1,0 +1,195 @@
+"""Friction of tendons against Euler's capstan, the play of a cable, and differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Simulator,
+    SolverSettings,
+    State,
+    Tendons,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.dynamics import statics
+from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.studies.gradient_check import central_difference, check_gradients
+
+SIZE = (0.12, 0.04, 0.02)
+BEAM = box_hexahedra(SIZE, (6, 2, 1))
+CLAMP, TIP = select_vertices(BEAM, x=0.0), select_vertices(BEAM, x=SIZE[0])
+SOFT, HARD = Corotated(264e3, 0.45, mass_damping=0.5, stiffness_damping=2e-3), Corotated(1e9, 0.3)
+TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+MU = 0.4
+STRAIGHT = np.column_stack([np.linspace(0.0, SIZE[0], 7), np.full(7, 0.02), np.full(7, 0.018)])
+# Around two corners of 90 degrees, and a straight one that ends earlier.
+CORNERS = np.array([[0.0, 0.01, 0.01], [0.08, 0.01, 0.01], [0.08, 0.03, 0.01], [0.12, 0.03, 0.01]])
+SHORT = STRAIGHT[:3]
+
+
+def simulator(*routes, material=SOFT, fixed=CLAMP, integrator="implicit_euler", **more):
+    body = Body(BEAM, fixed=fixed, energies=(Tendons(routes, **({"friction": MU} | more)),))
+    return Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=TIGHT, integrator=integrator)
+
+
+def tension(*newtons):
+    return Inputs(tendon_tension=torch.tensor([newtons], dtype=torch.float64))
+
+
+def segments(state):
+    return state.memory["tendon_segment_tension"][0].numpy()
+
+
+def test_the_tension_of_a_hard_body_is_the_play_of_a_capstan():
+    """It falls by exp(-mu pi/2) at every corner while it rises, stays while it turns, and rises by as much after."""
+    s = simulator(CORNERS, SHORT, material=HARD)
+    state, at, corner = s.rest_state(), np.zeros(3), math.exp(0.5 * math.pi * MU)
+    for pull in [1.0, 4.0, 3.0, 2.0, 1.0, 0.4, 1.0, 1.5, 2.5]:
+        state, _ = s.step(state, tension(pull, 1.0))
+        before = pull
+        for k, factor in enumerate((1.0, corner, corner)):
+            at[k] = before = np.clip(at[k], before / factor, before * factor)
+        np.testing.assert_allclose(segments(state), [*at, 1.0, 1.0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("entry", [0.0, 0.7])
+def test_at_rest_the_tension_falls_by_the_angles_of_the_pose(entry):
+    """The forces on the vertices of the solution are those of segments with Euler's tensions."""
+    pull = 5.0
+    s, free = simulator(STRAIGHT, entry_angle=entry), simulator(STRAIGHT, friction=0.0)
+    q = s.static_equilibrium(tension(pull)).q
+    assert float((q - free.static_equilibrium(tension(pull)).q).abs().max()) > 3e-4
+    guides = q[0].numpy()[
+        [int(np.argmin(np.linalg.norm(BEAM.vertices - [x, 0.02, 0.02], axis=1))) for x in STRAIGHT[:, 0]]
+    ]
+    below = q[0].numpy()[
+        [int(np.argmin(np.linalg.norm(BEAM.vertices - [x, 0.02, 0.0], axis=1))) for x in STRAIGHT[:, 0]]
+    ]
+    lines = np.diff(0.9 * guides + 0.1 * below, axis=0)
+    u = lines / np.linalg.norm(lines, axis=1)[:, None]
+    turns = np.arccos(np.clip((u[1:] * u[:-1]).sum(1), -1.0, 1.0))
+    assert turns.sum() > 0.3
+    tensions = pull * np.exp(-MU * np.cumsum([entry, *turns]))
+    # One tendon for every segment, without friction, holds the same pose under these tensions.
+    split = simulator(*(STRAIGHT[k : k + 2] for k in range(6)), friction=None)
+    np.testing.assert_allclose(split.static_equilibrium(tension(*tensions)).q, q, atol=5e-6)
+
+
+def test_a_step_from_rest_holds_the_pose():
+    s = simulator(STRAIGHT, entry_angle=0.3)
+    pose = s.static_equilibrium(tension(2.0))
+    trajectory = s.rollout(pose, 5, tension(2.0))
+    torch.testing.assert_close(trajectory.q[-1], pose.q, rtol=0.0, atol=1e-9)
+
+
+def test_a_slide_takes_the_tension_to_its_bound_over_the_bristle_length():
+    """The end is pulled away and back by a few bristle lengths: the cable slides through its corners."""
+    fixed = np.union1d(CLAMP, TIP)
+    s = simulator(CORNERS, material=Corotated(1e7, 0.45), fixed=fixed, bristle_length=2e-4)
+    rest, right = s.rest_positions[s.fixed], torch.as_tensor(np.isin(s.fixed.numpy(), TIP))[:, None]
+    state, ends = s.rest_state(), []
+    for slide in [0.0, *np.linspace(0.0, 8e-3, 17)[1:], *np.linspace(8e-3, -8e-3, 33)[1:]]:
+        moved = rest + slide * right * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+        state, _ = s.step(state, tension(2.0).replace(fixed_positions=moved[None]))
+        ends.append(segments(state))
+    out, back, corner = ends[16], ends[-1], math.exp(0.5 * math.pi * MU)
+    np.testing.assert_allclose(out[1] / out[0], corner, rtol=0.02)
+    np.testing.assert_allclose(back[1] / back[0], 1.0 / corner, rtol=0.02)
+    np.testing.assert_allclose(out[0], 2.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "routes", "more"),
+    [
+        ("implicit_euler", (STRAIGHT,), {"entry_angle": 0.5, "directions": [[[0.0, 0.0, -1.0]]], "stiffness": 300.0}),
+        ("bdf2", (CORNERS, SHORT), {"stiffness": 300.0}),
+        ("midpoint", (CORNERS,), {}),
+    ],
+)
+def test_gradients_of_a_rollout_equal_differences(integrator, routes, more):
+    """With long bristles, so that no difference takes a guide across the end of sticking."""
+    s = simulator(*routes, integrator=integrator, bristle_length=2e-2, **more)
+    rows = check_gradients(s, "bent", steps=3)
+    assert {"tendon_friction, each tendon", "tendon_bristle_length, each tendon"} <= {row.parameter for row in rows}
+    acting = [row for row in rows if row.adjoint != 0.0 or row.difference != 0.0]  # not the stiffness of a slack spring
+    assert {row.parameter: row.relative_error for row in acting if not row.relative_error <= 1e-6} == {}
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 400.0])
+def test_gradients_of_a_pose_equal_differences(stiffness):
+    s = simulator(STRAIGHT, stiffness=stiffness, entry_angle=0.2, directions=[[[0.0, 0.0, -1.0]]])
+    base = {"tendon_friction": MU, "youngs_modulus": 264e3, "tendon_offset_1": 0.0, "tension": 1.5, "shorter": 2e-3}
+    steps = {"tendon_friction": 0.1, "youngs_modulus": 2e4, "tendon_offset_1": 1e-3, "tension": 0.1, "shorter": 1e-3}
+    if not stiffness:
+        del base["shorter"]
+
+    def loss(values):
+        parameters = {name: value for name, value in values.items() if name not in ("tension", "shorter")}
+        pull, shorter = (
+            torch.as_tensor(values.get(name, 0.0), dtype=torch.float64).reshape(1, 1) for name in ("tension", "shorter")
+        )
+        q = s.static_equilibrium(Inputs(tendon_tension=pull, tendon_contraction=shorter), parameters).q
+        return (q[0] * torch.linspace(-1.0, 1.0, q[0].numel()).double().reshape(q[0].shape)).sum()
+
+    for name, value in base.items():
+        variable = torch.tensor([value], dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(loss(base | {name: variable}), variable)
+        difference, _ = central_difference(
+            lambda x, name=name: float(loss(base | {name: base[name] + x * steps[name]}))
+        )
+        assert float(gradient) * steps[name] == pytest.approx(difference, rel=1e-6), name
+
+
+def test_gradients_from_a_straight_rest_are_finite_and_right():
+    """Angles are zero there, where that of a chord has no derivative."""
+    s = simulator(STRAIGHT)
+    pull = torch.tensor([[0.5]], dtype=torch.float64, requires_grad=True)
+
+    def loss(pull):
+        return s.rollout(s.rest_state(), 4, Inputs(tendon_tension=pull)).q[-1].square().sum()
+
+    (gradient,) = torch.autograd.grad(loss(pull), pull)
+    difference, _ = central_difference(lambda x: float(loss(pull.detach() + 0.05 * x)))
+    assert 0.05 * float(gradient) == pytest.approx(difference, rel=1e-6)
+
+
+def test_without_friction_the_coefficient_of_zero_changes_nothing():
+    pull = tension(1.0)
+    with_zero, without = (simulator(STRAIGHT, friction=mu) for mu in (0.0, None))
+    expected = without.rollout(without.rest_state(), 4, pull).q
+    torch.testing.assert_close(with_zero.rollout(with_zero.rest_state(), 4, pull).q, expected, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"friction": -0.1}, "tendon_friction is -0.1"),
+        ({"bristle_length": 0.0}, "tendon_bristle_length is 0"),
+        ({"entry_angle": -1.0}, "the entry angle of tendons is -1.0"),
+        ({"entry_angle": [0.1, 0.2]}, "give one angle, or 1"),
+    ],
+)
+def test_bad_friction_is_refused(more, words):
+    with pytest.raises(InputError, match=words):
+        simulator(STRAIGHT, **more)
+
+
+def test_friction_that_no_pose_holds_is_said(monkeypatch):
+    monkeypatch.setattr(statics, "_MOST_SETTLINGS", 2)
+    s = simulator(STRAIGHT)
+    with pytest.raises(ConvergenceError, match="lower the friction or the tension"):
+        s.static_equilibrium(tension(6.0))
+
+
+def test_memory_of_another_body_is_refused():
+    s = simulator(STRAIGHT)
+    state = s.rest_state()
+    state = State(state.q, state.v, memory={"tendon_segment_tension": torch.zeros(1, 3).double()})
+    with pytest.raises(InputError, match="tendon_segment_tension"):
+        s.step(state)

@@ -1,0 +1,182 @@
+r"""Friction of tendons in their guides: capstans (Euler 1769) with bristles (Dahl 1968).
+
+A tendon that turns by the angle theta at a guide slides there only if its tension changes by the factor exp(mu theta):
+
+    T_before exp(-mu theta) <= T_beyond <= T_before exp(mu theta).
+
+Memory is the tension of every segment. At the start of a step the tension before each guide may have changed with the
+actuator; that beyond it stays unless a bound is passed. Then the guide's friction f = T_beyond - T_before changes with
+the slide s, the change in length of the tendon beyond it, over the bristle length z_c and towards the bound F in the
+direction of the slide,
+
+    f(s) = F + (f_0 - F) exp(-|s| / z_c),
+
+which derives from a convex potential of s, that of `energies.friction` with two bounds. Angles and bounds are those at
+the start of the step. The spring of a tendon counts as lying before its first guide.
+
+In a static equilibrium, and at the start of a roll-out without memory, tendons have been pulled from slack: the tension
+falls at every guide by the factor exp(-mu theta).
+
+L. Euler: Remarques sur l'effet du frottement dans l'equilibre. Memoires de l'academie de Berlin 18, 1769.
+P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)-1, 1968.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from ..stepping.quantity import Quantity
+from .base import BoundEnergy, EnergySite, EnergyStep, Memory
+
+if TYPE_CHECKING:
+    from .tendons import Tendons
+
+FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
+BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
+STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")
+_STRAIGHT = 1e-4  # rad: angles are rounded off below it, so that they have a derivative at zero
+
+
+def friction_after(
+    slide: torch.Tensor, hold: torch.Tensor, drop: torch.Tensor, rise: torch.Tensor, length: torch.Tensor
+) -> torch.Tensor:
+    """Returns the friction f(s) of guides (B, P) after a slide [N]; for the arguments, see ``kernels.tendons``."""
+    most = torch.where(slide < 0.0, -drop, rise)
+    return most + (hold - most) * torch.exp(-slide.abs() / length)
+
+
+class Geometry(NamedTuple):
+    """Tendons at some positions."""
+
+    turns: torch.Tensor  # (B, P) angle of contact at the guide before each segment [rad]
+    beyond: torch.Tensor  # (B, P) length of the tendon beyond that guide [m]
+    longer: torch.Tensor  # (B, T) elongation relative to rest [m]
+
+
+class BoundTendons(BoundEnergy):
+    """Tendons with friction in a simulator.
+
+    Memory is ``tendon_segment_tension`` (B, P) and ``tendon_spring_force`` (B, T) [N].
+    """
+
+    def __init__(self, tendons: "Tendons", site: EnergySite) -> None:
+        super().__init__(tendons, site)
+        (points,) = site.points
+        part, device = np.asarray(points.part), site.rest_positions.device  # type: ignore[attr-defined]
+        self._tendons = tendons
+        self._nodes = torch.as_tensor(points.nodes, device=device)
+        self._operators = site.tensor(points.gradients[:, 0])  # (P, K, 3)
+        self._rest = site.tensor(points.rest)  # type: ignore[attr-defined]  # (P, 3, 3)
+        self._part = torch.as_tensor(part, device=device)
+        self._one_hot = site.tensor(np.eye(tendons.count)[part])  # (P, T)
+        self._beyond = site.tensor(beyond(part))
+        first = np.searchsorted(part, np.arange(tendons.count + 1))
+        order = first[:-1, None] + np.arange(np.diff(first).max())
+        # Segments (S, T) in their order along the tendons; a shorter tendon repeats its last one, which is `ended`.
+        self._order = torch.as_tensor(np.minimum(order, first[1:, None] - 1).T.copy(), device=device)
+        self._ended = torch.as_tensor((order >= first[1:, None]).T.copy(), device=device)
+        self._first = torch.as_tensor(first[:-1], device=device)
+        entry = np.zeros(len(part))
+        entry[first[:-1]] = np.broadcast_to(np.asarray(tendons.entry_angle, dtype=np.float64), tendons.count)
+        self._entry = site.tensor(entry)
+        self.memory = (
+            Memory("tendon_segment_tension", "N", (len(part),), "segment"),
+            Memory("tendon_spring_force", "N", (tendons.count,), "tendon"),
+        )
+
+    def _geometry(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Geometry:
+        """Returns the tendons at positions (B, N, 3)."""
+        f = torch.einsum("pkw,bpki->bpiw", self._operators, q[:, self._nodes])
+        c = self._tendons.offset_vector(values)[:, self._part].to(q)  # (1 or B, P, 3)
+        line = (f * c[..., None, :]).sum(-1)
+        lengths = line.norm(dim=-1)
+        u = line / lengths.clamp_min(torch.finfo(q.dtype).tiny)[..., None]
+        chord = (u[:, 1:] - u[:, :-1]).square().sum(-1)
+        half = (0.5 * (chord + _STRAIGHT**2).sqrt()).clamp_max(1.0 - 1e-9)
+        turn = torch.nn.functional.pad(2.0 * (half.asin() - np.arcsin(0.5 * _STRAIGHT)), (1, 0))
+        turns = turn.index_fill(1, self._first, 0.0) + self._entry
+        rest = (self._rest * c[..., None, :]).sum(-1).norm(dim=-1)
+        return Geometry(turns, lengths @ self._beyond, (lengths - rest) @ self._one_hot)
+
+    def _spring(self, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the tensions (B, T) of the springs [N]."""
+        toe, excess = self._tendons.toe, geometry.longer + values["tendon_contraction"]
+        return values["tendon_stiffness"] * torch.where(
+            excess > toe, excess - 0.5 * toe, 0.5 * excess.clamp_min(0.0) ** 2 / toe
+        )
+
+    def _slack(self, tension: torch.Tensor, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the tensions (B, P) of segments that have been pulled from slack by (B, T) [N]."""
+        decay = values["tendon_friction"][:, self._part] * geometry.turns
+        return tension[:, self._part] * torch.exp(-(decay @ self._beyond.mT))
+
+    def _before(self, tension: torch.Tensor, segments: torch.Tensor) -> torch.Tensor:
+        """Returns the tension (B, P) before each guide [N]."""
+        before = torch.nn.functional.pad(segments[:, :-1], (1, 0))
+        return before.index_copy(1, self._first, tension)
+
+    def _values(self, step: EnergyStep) -> dict[str, torch.Tensor]:
+        """Returns parameters and inputs, (1 or B, T)."""
+        zeros = step.state.q.new_zeros(step.state.batch, self._tendons.count)
+        constants = dict(self._tendons.offset_values(step.constants.values))
+        for name in ("tendon_stiffness", FRICTION.name, BRISTLE.name):
+            constants[name] = step.constants.value(name)
+        inputs = ((q.name, step.inputs.actuation.get(q.name)) for q in self._tendons.inputs)
+        return constants | {name: zeros if given is None else given for name, given in inputs}
+
+    def _start(self, step: EnergyStep, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Returns the values of the step by name, and the tension ``before`` each guide at its start."""
+        here = self._geometry(step.state.q, values)
+        spring = step.state.memory.get("tendon_spring_force")
+        tension = values["tendon_tension"] + (self._spring(here, values) if spring is None else spring)
+        held = step.state.memory.get("tendon_segment_tension")
+        if held is None:
+            held = self._slack(tension, here, values)
+        growth = torch.exp(values[FRICTION.name][:, self._part] * here.turns)
+        lower, upper, segments = 1.0 / growth, growth, torch.zeros_like(held)
+        before = tension
+        for row, ended in zip(self._order, self._ended, strict=True):
+            own, least, most = held[:, row], before * lower[:, row], before * upper[:, row]
+            kept = torch.where((own > least) & (own < most), own, torch.where(own <= least, least, most))
+            before = torch.where(ended, before, kept)
+            segments = segments.index_copy(1, row, before)
+        before = self._before(tension, segments)
+        bounds = before - before * lower, before * upper - before
+        return dict(zip(STEP_VALUES, (segments - before, *bounds, here.beyond), strict=True))
+
+    @override
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
+        return dict(self._start(step, self._values(step)))
+
+    @override
+    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
+        return dict.fromkeys(STEP_VALUES, self._operators.new_zeros(batch, len(self._part)))
+
+    @override
+    def at_pose(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        """Returns friction that does not change with the slide, which makes both bounds equal to it."""
+        here = self._geometry(q, values)
+        tension = values["tendon_tension"] + self._spring(here, values)
+        segments = self._slack(tension, here, values)
+        friction = segments - self._before(tension, segments)
+        return dict(zip(STEP_VALUES, (friction, -friction, friction, here.beyond), strict=True))
+
+    @override
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        values = self._values(step)
+        start, end = self._start(step, values), self._geometry(q, values)
+        hold, drop, rise, before = (start[name] for name in STEP_VALUES)
+        length = values[BRISTLE.name][:, self._part]
+        friction = friction_after(end.beyond - before, hold, drop, rise, length)
+        spring = self._spring(end, values)
+        segments = (values["tendon_tension"] + spring)[:, self._part] + friction @ self._beyond.mT
+        return {"tendon_segment_tension": segments.clamp_min(0.0), "tendon_spring_force": spring}
+
+
+def beyond(part: np.ndarray) -> np.ndarray:
+    """Returns (P, P), one where segment p belongs to the tendon's part beyond the guide before segment q, at [p, q]."""
+    order = np.arange(len(part))
+    return ((part[:, None] == part) & (order[:, None] >= order)).astype(np.float64)

@@ -30,6 +30,19 @@ def direction_of(line: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
+def segment(
+    positions: wp.array2d[wp.vec3d],
+    nodes: wp.array2d[int],
+    gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
+    b: int,
+    p: int,
+) -> wp.mat33d:
+    """Returns F of a segment; ends that are fixed in the world are in ``anchors`` (P)."""
+    return deformation_gradient(positions, nodes, gradients, b, p, p) + anchors[p]
+
+
+@wp.func
 def bristle(slide: wp.float64, hold: wp.float64, drop: wp.float64, rise: wp.float64, length: wp.float64):
     """Returns energy, force and slope of a guide's friction after a slide (``energies.tendon_friction``)."""
     size, start, most, sign = slide, hold, rise, ONE
@@ -44,6 +57,7 @@ def pull(
     active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
     first: wp.array[int],  # (T + 1) first segment of each tendon
     rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
     first_offset: wp.array2d[wp.float64],  # (B, T) [m]
@@ -73,7 +87,7 @@ def pull(
     length = wp.float64(0.0)
     for k in range(first[t + 1] - first[t]):
         p = first[t + 1] - 1 - k  # from the end, as friction depends on the length beyond a guide
-        own = wp.length(deformation_gradient(positions, nodes, gradients, b, p, p) * c)
+        own = wp.length(segment(positions, nodes, gradients, anchors, b, p) * c)
         length += own
         longer += own - wp.length(rest[p] * c)
         slide = length - beyond[b, p]
@@ -93,6 +107,7 @@ def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
     first: wp.array[int],
     tendon: wp.array[int],  # (P)
     commanded: wp.array2d[wp.float64],
@@ -111,7 +126,7 @@ def local_step(
         return
     t = tendon[p]
     c = along[b, t]
-    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    line = segment(positions, nodes, gradients, anchors, b, p) * c
     energy = commanded[b, t] * wp.length(line) + friction[b, p][0]
     if p == first[t]:
         energy += stiffness[b, t] * spring[b, t][0]
@@ -125,6 +140,7 @@ def tangent(
     clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     along: wp.array2d[wp.vec3d],
     total: wp.array2d[wp.float64],
@@ -139,7 +155,7 @@ def tangent(
     if active[b] == 0:
         return
     c = along[b, tendon[p]]
-    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    line = segment(positions, nodes, gradients, anchors, b, p) * c
     length = wp.length(line)
     stiffness = ZERO
     if length > ZERO:
@@ -160,6 +176,7 @@ def tangent(
 def directions(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     along: wp.array2d[wp.vec3d],
     positions: wp.array2d[wp.vec3d],
@@ -168,7 +185,7 @@ def directions(
     """Derivative u c^T of the length of each segment by F, with the unit vector u along the segment."""
     b, p = wp.tid()
     c = along[b, tendon[p]]
-    line = deformation_gradient(positions, nodes, gradients, b, p, p) * c
+    line = segment(positions, nodes, gradients, anchors, b, p) * c
     direction_out[b, p] = wp.outer(direction_of(line), c)
 
 
@@ -176,6 +193,7 @@ def directions(
 def adjoint(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],
+    anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     rest: wp.array[wp.mat33d],
     along: wp.array2d[wp.vec3d],
@@ -191,7 +209,7 @@ def adjoint(
     b, p = wp.tid()
     t = tendon[p]
     c = along[b, t]
-    f = deformation_gradient(positions, nodes, gradients, b, p, p)
+    f = segment(positions, nodes, gradients, anchors, b, p)
     dz = deformation_gradient(direction, nodes, gradients, b, p, p)
     line, moved = f * c, dz * c
     u, u_rest = direction_of(line), direction_of(rest[p] * c)

@@ -193,3 +193,29 @@ def test_memory_of_another_body_is_refused():
     state = State(state.q, state.v, memory={"tendon_segment_tension": torch.zeros(1, 3).double()})
     with pytest.raises(InputError, match="tendon_segment_tension"):
         s.step(state)
+
+
+def test_guides_in_the_world_pull_as_a_cable_to_a_post():
+    """The force of a cable from the tip to a post, over a pulley above it, is its tension along the line."""
+    post, pulley, end = [0.3, 0.02, -0.1], [0.25, 0.02, 0.1], [SIZE[0], 0.02, 0.02]
+    s = simulator([post, pulley, end], fixed_guides=[[0, 1]], friction=0.3)
+    state = s.rest_state()
+    force = s.linearise(state, tension(2.0)).residual(state.q)[0].numpy()
+    corner = math.acos(np.dot(*(x / np.linalg.norm(x) for x in (np.subtract(pulley, post), np.subtract(end, pulley)))))
+    line = np.subtract(pulley, end)
+    expected = 2.0 * math.exp(-0.3 * corner) * line / np.linalg.norm(line)
+    tip = int(np.argmin(np.linalg.norm(BEAM.vertices - end, axis=1)))
+    np.testing.assert_allclose(-force[tip], expected, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(np.delete(force, tip, 0), 0.0, atol=1e-9)
+    rows = check_gradients(s, "bent", steps=2)
+    acting = [row for row in rows if row.adjoint != 0.0 or row.difference != 0.0]
+    assert {row.parameter: row.relative_error for row in acting if not row.relative_error <= 1e-6} == {}
+
+
+def test_fixed_guides_are_checked():
+    with pytest.raises(InputError, match="it has guides 0 to 3"):
+        simulator(CORNERS, fixed_guides=[[4]])
+    with pytest.raises(InputError, match="it does not pull on the body"):
+        simulator(SHORT, fixed_guides=[[0, 1, 2]])
+    with pytest.raises(InputError, match="name it among the fixed guides"):
+        simulator([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]])

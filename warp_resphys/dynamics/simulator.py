@@ -265,17 +265,18 @@ class Simulator:
         terms = self.workspace(state.batch).potential.energies
         return self._energies.end_step(state, stage, inputs, constants, terms, x, q)
 
-    def remember(self, state: State, q: torch.Tensor, constants: Constants) -> State:
+    def remember(self, state: State, q: torch.Tensor, constants: Constants, inputs: Inputs | None = None) -> State:
         """Returns a state at given positions, with the memory variables after a step to these positions.
 
         Args:
             state: state at the start of the step.
             q: (B, N, 3) positions at its end [m].
             constants: constants from `prepare`.
+            inputs: inputs during the step.
         """
         stage = self.method.stage(state, self.time_step)
         x = self.method.solution_for(state, q)
-        return State(q, state.v, memory=self._end_step(state, stage, _NO_INPUTS, constants, x, q))
+        return State(q, state.v, memory=self._end_step(state, stage, inputs or _NO_INPUTS, constants, x, q))
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None

@@ -22,17 +22,16 @@ P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..stepping.quantity import Quantity
-from .base import BoundEnergy, EnergySite, EnergyStep, Memory
-
-if TYPE_CHECKING:
-    from .tendons import Tendons
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
+from .tendon_routes import OFFSETS, TendonPoints, offset_vector
 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
 BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
@@ -60,16 +59,23 @@ class BoundTendons(BoundEnergy):
     """Tendons with friction in a simulator.
 
     Memory is ``tendon_segment_tension`` (B, P) and ``tendon_spring_force`` (B, T) [N].
+
+    Args:
+        tendons: the tendons.
+        site: the simulator as they see it.
+        toe: elongation at which a spring reaches its full stiffness [m].
+        entry_angle: of contact before the first guide, one or (T,) [rad].
     """
 
-    def __init__(self, tendons: "Tendons", site: EnergySite) -> None:
+    def __init__(self, tendons: Energy, site: EnergySite, toe: float, entry_angle: ArrayLike) -> None:
         super().__init__(tendons, site)
         (points,) = site.points
-        part, device = np.asarray(points.part), site.rest_positions.device  # type: ignore[attr-defined]
-        self._tendons = tendons
+        assert isinstance(points, TendonPoints)
+        part, device = points.part, site.rest_positions.device
+        self._toe = toe
         self._nodes = torch.as_tensor(points.nodes, device=device)
         self._operators = site.tensor(points.gradients[:, 0])  # (P, K, 3)
-        self._rest = site.tensor(points.rest)  # type: ignore[attr-defined]  # (P, 3, 3)
+        self._rest, self._anchors = site.tensor(points.rest), site.tensor(points.anchors)  # (P, 3, 3)
         self._part = torch.as_tensor(part, device=device)
         self._one_hot = site.tensor(np.eye(tendons.count)[part])  # (P, T)
         self._beyond = site.tensor(beyond(part))
@@ -80,7 +86,7 @@ class BoundTendons(BoundEnergy):
         self._ended = torch.as_tensor((order >= first[1:, None]).T.copy(), device=device)
         self._first = torch.as_tensor(first[:-1], device=device)
         entry = np.zeros(len(part))
-        entry[first[:-1]] = np.broadcast_to(np.asarray(tendons.entry_angle, dtype=np.float64), tendons.count)
+        entry[first[:-1]] = np.broadcast_to(np.asarray(entry_angle, dtype=np.float64), tendons.count)
         self._entry = site.tensor(entry)
         self.memory = (
             Memory("tendon_segment_tension", "N", (len(part),), "segment"),
@@ -89,8 +95,8 @@ class BoundTendons(BoundEnergy):
 
     def _geometry(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Geometry:
         """Returns the tendons at positions (B, N, 3)."""
-        f = torch.einsum("pkw,bpki->bpiw", self._operators, q[:, self._nodes])
-        c = self._tendons.offset_vector(values)[:, self._part].to(q)  # (1 or B, P, 3)
+        f = torch.einsum("pkw,bpki->bpiw", self._operators, q[:, self._nodes]) + self._anchors
+        c = offset_vector(values)[:, self._part].to(q)  # (1 or B, P, 3)
         line = (f * c[..., None, :]).sum(-1)
         lengths = line.norm(dim=-1)
         u = line / lengths.clamp_min(torch.finfo(q.dtype).tiny)[..., None]
@@ -103,7 +109,7 @@ class BoundTendons(BoundEnergy):
 
     def _spring(self, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Returns the tensions (B, T) of the springs [N]."""
-        toe, excess = self._tendons.toe, geometry.longer + values["tendon_contraction"]
+        toe, excess = self._toe, geometry.longer + values["tendon_contraction"]
         return values["tendon_stiffness"] * torch.where(
             excess > toe, excess - 0.5 * toe, 0.5 * excess.clamp_min(0.0) ** 2 / toe
         )
@@ -120,11 +126,10 @@ class BoundTendons(BoundEnergy):
 
     def _values(self, step: EnergyStep) -> dict[str, torch.Tensor]:
         """Returns parameters and inputs, (1 or B, T)."""
-        zeros = step.state.q.new_zeros(step.state.batch, self._tendons.count)
-        constants = dict(self._tendons.offset_values(step.constants.values))
-        for name in ("tendon_stiffness", FRICTION.name, BRISTLE.name):
-            constants[name] = step.constants.value(name)
-        inputs = ((q.name, step.inputs.actuation.get(q.name)) for q in self._tendons.inputs)
+        zeros = step.state.q.new_zeros(step.state.batch, self.energy.count)
+        names = ("tendon_stiffness", FRICTION.name, BRISTLE.name, *(offset.name for offset in OFFSETS))
+        constants = {name: step.constants.value(name) for name in names}
+        inputs = ((q.name, step.inputs.actuation.get(q.name)) for q in self.energy.inputs)
         return constants | {name: zeros if given is None else given for name, given in inputs}
 
     def _start(self, step: EnergyStep, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -176,7 +181,7 @@ class BoundTendons(BoundEnergy):
         return {"tendon_segment_tension": segments.clamp_min(0.0), "tendon_spring_force": spring}
 
 
-def beyond(part: np.ndarray) -> np.ndarray:
+def beyond(part: NDArray[np.int64]) -> NDArray[np.float64]:
     """Returns (P, P), one where segment p belongs to the tendon's part beyond the guide before segment q, at [p, q]."""
     order = np.arange(len(part))
     return ((part[:, None] == part) & (order[:, None] >= order)).astype(np.float64)

@@ -35,23 +35,9 @@ from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
-from .part_terms import PartPoints, PartTerm
+from .part_terms import PartTerm
 from .tendon_friction import BRISTLE, FRICTION, STEP_VALUES, BoundTendons, beyond, friction_after
-
-
-@dataclass(frozen=True)
-class TendonPoints(PartPoints):
-    """Segments of tendons between guides, tendon after tendon, with the operators of F (`kernels.tendons`)."""
-
-    rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
-
-
-TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
-CONTRACTION = Quantity(
-    *("tendon_contraction", "m"), per="tendon", typical=1e-3, words="contraction", shown_unit="mm", shown_factor=1e3
-)
-_STIFFNESS = Quantity("tendon_stiffness", "N/m", 0.0, closed=True, per="tendon")
-OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) for k in (1, 2))
+from .tendon_routes import CONTRACTION, OFFSETS, STIFFNESS, TENSION, TendonPoints
 
 
 @dataclass(frozen=True)
@@ -80,6 +66,7 @@ class Tendons(Energy):
     # offset directions of each tendon, one or two for all tendons: (3,) for all guides of a tendon, or (G, 3) one per
     # guide; displacement of the guide per metre of offset
     directions: Sequence[Sequence[ArrayLike]] = ()
+    fixed_guides: Sequence[Sequence[int]] = ()  # numbers of the guides of each tendon, from 0, that stay in the world
     friction: Parameter | None = None  # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
     bristle_length: Parameter = 1e-4  # slide over which friction turns [m]
     entry_angle: ArrayLike = 0.0  # of contact before the first guide, such as around pulleys: one, or (T,) [rad]
@@ -100,10 +87,18 @@ class Tendons(Energy):
                 raise InputError(f"the {name} of tendons is {value:g}: it must be positive, in m.")
         if self.labels and len(self.labels) != len(self.routes):
             raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
-        _STIFFNESS.check(self.stiffness)
+        STIFFNESS.check(self.stiffness)
         if self.friction is not None:
             FRICTION.check(self.friction)
             BRISTLE.check(self.bristle_length)
+        if len(self.fixed_guides) not in (0, self.count):
+            raise InputError(f"fixed guides are given for {len(self.fixed_guides)} of {self.count} tendons: give all.")
+        for number, (route, fixed) in enumerate(zip(self.guides, self.fixed_guides, strict=False), 1):
+            if not set(fixed) <= set(range(len(route))):
+                most = len(route) - 1
+                raise InputError(f"fixed guides of tendon {number} are {list(fixed)}: it has guides 0 to {most}.")
+            if len(set(fixed)) == len(route):
+                raise InputError(f"all guides of tendon {number} are fixed in the world: it does not pull on the body.")
         angles = np.asarray(self.entry_angle, dtype=np.float64)
         if angles.shape not in ((), (self.count,)) or not (np.isfinite(angles) & (angles >= 0.0)).all():
             raise InputError(
@@ -151,20 +146,11 @@ class Tendons(Energy):
         """Number of offset directions per tendon."""
         return len(self.directions[0]) if len(self.directions) else 0
 
-    def offset_values(self, values: Mapping[str, torch.Tensor | None]) -> dict[str, torch.Tensor]:
-        """Returns the offsets (1 or B, T) among some values, by name [m]."""
-        return {offset.name: value_of(values, offset.name) for offset in OFFSETS}
-
-    def offset_vector(self, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the vectors c (1 or B, T, 3) of `kernels.tendons` for offsets by name."""
-        first, second = torch.broadcast_tensors(*(values[offset.name] / kernels.OFFSET_UNIT for offset in OFFSETS))
-        return torch.stack([torch.ones_like(first), first, second], -1)
-
     @property
     @override
     def parameters(self) -> tuple[Quantity, ...]:
         friction = () if self.friction is None else (FRICTION, BRISTLE)
-        return (_STIFFNESS, *friction, *OFFSETS[: self.offset_count])
+        return (STIFFNESS, *friction, *OFFSETS[: self.offset_count])
 
     @property
     def guides(self) -> list[NDArray[np.float64]]:
@@ -198,7 +184,7 @@ class Tendons(Energy):
 
     @override
     def bind(self, site: EnergySite) -> BoundEnergy:
-        return super().bind(site) if self.friction is None else BoundTendons(self, site)
+        return super().bind(site) if self.friction is None else BoundTendons(self, site, self.toe, self.entry_angle)
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
@@ -207,15 +193,16 @@ class Tendons(Energy):
         Raises:
             InputError: a guide outside of the body.
         """
-        nodes, operators, tendon, rest = [], [], [], []
+        nodes, operators, tendon, rest, anchors = [], [], [], [], []
         for number, route in enumerate(self.guides):
-            places = locate(mesh, route)
+            held = np.isin(np.arange(len(route)), self.fixed_guides[number] if len(self.fixed_guides) else ())
+            places = locate(mesh, np.where(held[:, None], route[~held][:1], route))  # those in the world have no place
             worst = int(np.argmax(places.outside))
             if places.outside[worst] > self.reach:
                 raise InputError(
                     f"guide {worst + 1} of tendon {number + 1}, at {route[worst].tolist()} m, lies "
-                    f"{1e3 * places.outside[worst]:.3g} mm outside of the body: move it, or raise the reach of "
-                    f"{1e3 * self.reach:g} mm."
+                    f"{1e3 * places.outside[worst]:.3g} mm outside of the body: move it, raise the reach of "
+                    f"{1e3 * self.reach:g} mm, or name it among the fixed guides if it stays in the world."
                 )
             weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): position, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))
@@ -224,6 +211,7 @@ class Tendons(Energy):
                 step = kernels.OFFSET_UNIT * np.broadcast_to(self.directions[number][k], route.shape)
                 weights[..., 1 + k] = np.einsum("gki,gi->gk", places.gradients, step)
                 shape[..., 1 + k] = step
+            weights[held] = 0.0
             for first in range(len(route) - 1):
                 own_nodes, own_operators = _difference(
                     mesh, places.cells[first : first + 2], weights[first : first + 2]
@@ -232,13 +220,15 @@ class Tendons(Energy):
                 operators.append(own_operators)
             tendon += [number] * (len(route) - 1)
             rest.append(np.diff(shape, axis=0))
+            anchors.append(np.diff(np.where(held[:, None, None], shape, 0.0), axis=0))
         most = max(map(len, nodes))
         # Lists are padded with their first vertex and a zero operator.
         padded = np.array([np.pad(own, (0, most - len(own)), constant_values=own[0]) for own in nodes])
         operator = np.zeros((len(nodes), 1, most, 3))
         for row, own in enumerate(operators):
             operator[row, 0, : len(own)] = own
-        return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), np.concatenate(rest)),)
+        lines = (np.concatenate(rest), np.concatenate(anchors))
+        return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), *lines),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "TendonTerm":
@@ -253,6 +243,7 @@ def _difference(
     sums = np.zeros((len(vertices), 3))
     np.add.at(sums, inverse, np.concatenate([-weights[0], weights[1]]))
     used = np.abs(sums).max(axis=1) > 1e-14
+    used[0] |= not used.any()  # both guides are fixed in the world
     return vertices[used], sums[used]
 
 
@@ -276,6 +267,7 @@ class TendonTerm(PartTerm):
         self._toe = wp.float64(tendons.toe)
         self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
         self._rest = launcher.upload(s.source.rest, wp.mat33d)
+        self._anchors = launcher.upload(s.source.anchors, wp.mat33d)
         self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points)
         self._spring, self._friction = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points, 3)
         self._direction = launcher.zeros(s.n_points, 3, 3)
@@ -301,7 +293,7 @@ class TendonTerm(PartTerm):
         else:
             zeros, ones = self.launcher.zeros(s.n_points), self.launcher.zeros(self.count) + 1.0
             bristles, *friction = (warp_view(own, wp.float64) for own in (ones, *(zeros,) * 4))
-        runs = [s.nodes, s.gradients, self._first, self._rest, first, second]
+        runs = [s.nodes, s.gradients, self._anchors, self._first, self._rest, first, second]
         inputs = [active, *runs, tension, contraction, stiffness, self._toe, *friction, bristles, positions]
         outputs = [*self._pull, warp_view(self._spring, wp.vec3d), warp_view(self._friction, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
@@ -309,13 +301,13 @@ class TendonTerm(PartTerm):
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         tension, _, stiffness, *_ = self.views(values)
-        runs = [s.nodes, s.gradients, self._first, self.part]
+        runs = [s.nodes, s.gradients, self._anchors, self._first, self.part]
         forces = [warp_view(own, wp.vec3d) for own in (self._spring, self._friction)]
         return [*runs, tension, stiffness, *self._pull, *forces, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.nodes, s.gradients, self.part, *self._pull, positions]
+        return kernels.tangent, [s.nodes, s.gradients, self._anchors, self.part, *self._pull, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -325,7 +317,7 @@ class TendonTerm(PartTerm):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
-            inputs = [s.nodes, s.gradients, self.part, self._pull[0], positions]
+            inputs = [s.nodes, s.gradients, self._anchors, self.part, self._pull[0], positions]
             out = [warp_view(self._direction, wp.mat33d)]
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
@@ -357,7 +349,7 @@ class TendonTerm(PartTerm):
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         shorter = own.zeros(s.n_points)
         by_offset, longer, at_rest = (own.zeros(s.n_points, 2) for _ in range(3))
-        inputs = [s.nodes, s.gradients, self.part, self._rest, *self._pull, *views]
+        inputs = [s.nodes, s.gradients, self._anchors, self.part, self._rest, *self._pull, *views]
         outputs = [warp_view(shorter, wp.float64), *(warp_view(x, wp.vec2d) for x in (by_offset, longer, at_rest))]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),

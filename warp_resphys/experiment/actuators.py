@@ -130,13 +130,18 @@ def build_tendons(settings: TendonSettings) -> Tendons:
     Raises:
         InputError: see `Tendons`.
     """
-    routes, directions = [], []
+    routes, directions, fixed = [], [], []
     for route in settings.routes.values():
         guides = np.asarray(route.guides, dtype=np.float64)
-        routes.append(_divided(guides, route.pieces))
+        held = np.isin(np.arange(len(guides)), route.fixed_guides)
+        pieces = np.where(held[1:] | held[:-1], 1, route.pieces)  # Guides lie in the body alone.
+        routes.append(_divided(guides, pieces))
+        fixed.append(np.concatenate([[0], np.cumsum(pieces)])[held].tolist())
         own = [np.broadcast_to(np.asarray(offset, dtype=np.float64), guides.shape) for offset in route.offsets]
-        directions.append([_divided(offset, route.pieces) for offset in own])
+        directions.append([_divided(offset, pieces) for offset in own])
     more: dict[str, Any] = {"directions": directions} if any(directions) else {}
+    if any(fixed):
+        more["fixed_guides"] = fixed
     if settings.friction is not None:
         entry = [route.entry_angle for route in settings.routes.values()]
         more |= {"friction": settings.friction, "bristle_length": settings.bristle_length, "entry_angle": entry}
@@ -144,10 +149,10 @@ def build_tendons(settings: TendonSettings) -> Tendons:
     return Tendons(routes, settings.stiffness, labels=labels, toe=settings.toe, reach=settings.reach, **more)
 
 
-def _divided(values: NDArray[np.float64], pieces: int) -> NDArray[np.float64]:
-    """Interpolates values (G, 3) at guides linearly, with `pieces` intervals between neighbours."""
-    share = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
-    return np.concatenate([*(first + share * (last - first) for first, last in pairwise(values)), values[-1:]])
+def _divided(values: NDArray[np.float64], pieces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Interpolates values (G, 3) at guides linearly, with (G - 1,) intervals between neighbours."""
+    parts = [np.linspace(*ends, own, endpoint=False) for ends, own in zip(pairwise(values), pieces, strict=True)]
+    return np.concatenate([*parts, values[-1:]])
 
 
 def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:

@@ -160,7 +160,7 @@ class WindowLoss:
         taken to equal the one before. Empty for energies without internal variables.
         """
         if id(motion) not in self._memories:
-            constants, *_ = Replay(simulator, self._observe, motion.trials).prepare(self._parameters)
+            constants, inputs, _ = Replay(simulator, self._observe, motion.trials).prepare(self._parameters)
             memories, state = list[Mapping[str, torch.Tensor]](), simulator.rest_state(len(motion.q))
             began = torch.zeros(state.batch, dtype=torch.bool, device=state.q.device)
             for frame in range(motion.q.shape[1]):
@@ -169,7 +169,8 @@ class WindowLoss:
                 before = torch.where((known & ~began)[:, None, None], q, state.q)  # at rest in the first known state
                 q, began = torch.where(known[:, None, None], q, before), began | known
                 with torch.no_grad():
-                    state = simulator.remember(replace(state, q=before), q, constants)
+                    acting = inputs.at(max(frame - 1, 0))
+                    state = simulator.remember(replace(state, q=before), q, constants, acting)
                 if not state.memory:
                     break
                 if frame >= self._first_frame and (frame - self._first_frame) % self._window == 0:

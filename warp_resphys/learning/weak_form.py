@@ -128,7 +128,7 @@ class WeakForm:
                 x = simulator.method.solution_for(state, end.repeat(count, 1, 1))
                 rows.append(self._weighted(simulator.linearise(state, inputs, constants).residual(x), end))
             if carries:
-                memory = simulator.remember(state, end.repeat(count, 1, 1), constants).memory
+                memory = simulator.remember(state, end.repeat(count, 1, 1), constants, inputs).memory
                 memory = {name: value for name, value in memory.items() if name.endswith(VISCOUS_STRAIN)}
         return np.concatenate(rows)
 

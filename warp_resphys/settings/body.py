@@ -123,6 +123,7 @@ class RouteSettings(Settings):
 
     guides: Curve = setting(description="points through which it runs", unit="m")
     pieces: Divisions = setting(1, "pieces into which each straight part is divided")
+    fixed_guides: Many[int] = setting((), "numbers of guides, from 0, that stay in the world, such as pulleys")
     entry_angle: NotNegative = setting(0.0, "of contact before the first guide, such as around pulleys", "rad")
     offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
         (), "directions of an identified offset of the route: three numbers each, or three for each guide"
@@ -147,6 +148,13 @@ class TendonSettings(Settings):
         if self.commanded == "contraction" and not self.stiffness > 0.0:
             raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
         for name, route in self.routes.items():
+            if route.entry_angle and self.friction is None:
+                raise ValueError(f"routes.{name}.entry_angle acts by friction: set tendons.friction, or leave it out.")
+            if not set(route.fixed_guides) <= set(range(len(route.guides))):
+                raise ValueError(
+                    f"routes.{name}.fixed_guides is {list(route.fixed_guides)}: the route has guides 0 to "
+                    f"{len(route.guides) - 1}."
+                )
             for offset in route.offsets:
                 if isinstance(offset[0], tuple) and len(offset) != len(route.guides):
                     raise ValueError(

@@ -42,10 +42,14 @@ TINY = [
     ),  # hardly distinguishable from E
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
-TRIALS = [
-    "data.trials=null",
-    f"+data.trials={{{','.join(f'{n}: {{file: {n}.csv, inputs: {list(t)}}}' for n, t in POSES.items())}}}",
-]
+
+
+def trials(poses):
+    table = ",".join(f"{name}: {{file: {name}.csv, inputs: {list(tensions)}}}" for name, tensions in poses.items())
+    return ["data.trials=null", f"+data.trials={{{table}}}"]
+
+
+TRIALS = trials(POSES)
 
 
 def moved(tendons):
@@ -61,11 +65,16 @@ def moved(tendons):
 def poses():
     """(R, 5, 3) where the markers of the poses are in the frame of the body [m]."""
     run = settings(*TINY, *TRIALS)
-    simulator = build_simulator(run.changed(tendons=moved(run.tendons)), of_modulus(run, MODULUS))
+    return poses_of(run, moved(run.tendons))
+
+
+def poses_of(run, tendons, poses=POSES):
+    """(R, 5, 3) where the markers of the poses are in the frame of the body, pulled by some tendons [m]."""
+    simulator = build_simulator(run.changed(tendons=tendons), of_modulus(run, MODULUS))
     markers = run.markers
     places = np.array([*markers.tracked.values()])
     read = bound_markers(markers, simulator.body.mesh, places, tuple(markers.tracked))
-    tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
+    tensions = torch.tensor([*poses.values()], dtype=torch.float64)
     at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
     base = np.broadcast_to([*markers.reference.values()], (len(at), 1, 3))
     return np.concatenate([at, base], 1)
@@ -86,6 +95,22 @@ def write(folder, places_of_poses):
         frames = row.ravel() + 1e-4 * draw.normal(size=(40, 15))
         table = np.column_stack([np.arange(40), np.arange(40) / 200.0, frames])
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
+
+
+def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    strong = {"weak": (1.5, 0.0), "strong": (4.0, 0.0), "second": (0.0, 3.0), "other": (0.0, 4.0), "both": (3.0, 3.0)}
+    recorded = settings(*TINY, *TRIALS)
+    write(Path("recordings"), poses_of(recorded, recorded.tendons.changed(friction=0.3), strong))
+    offsets = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
+    friction = ["tendons.friction=0.05", "+identify.parameters.tendon_friction={lower:0.0,upper:1.0}"]
+    run_without_report(tmp_path, *TINY, *trials(strong), *offsets, *friction)
+    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
+    assert identified["tendon_friction"] == pytest.approx(0.3, abs=0.02)
+    assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
+    errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
+    assert errors["sysid"]["mean"] < 0.3
+    check_robots("run")
 
 
 def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):

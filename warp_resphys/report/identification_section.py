@@ -26,6 +26,8 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
     "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
     "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
+    "tendon_friction": ("Friction of the tendons", "", 1.0),
+    "tendon_bristle_length": ("Bristle length of the tendons", "mm", 1e3),
 }
 _MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Parameters that regions may have.
 _COMMANDS: Final[Mapping[str, Wording]] = {

@@ -142,3 +142,23 @@ def test_what_acts_counts_from_the_zero_and_not_below_the_least_input():
     of_each = signed.scaled(torch.as_tensor(commands)[:, None].repeat(1, 2, 1))
     np.testing.assert_array_equal(of_each[:, 0, 0], [-0.5, 0.0, 0.5, 4.5])
     np.testing.assert_array_equal(of_each[:, 1, 0], [1.5, 2.5, 3.5, 7.5])
+
+
+def test_gears_turn_back_after_their_backlash():
+    """In one call and step by step; commands at rest have risen to their values."""
+    commands = np.array([1.0, 3.0, 2.5, 2.0, 1.0, 1.5, 1.9, 3.0, 0.0])[:, None, None]
+    expected = 2.0 * np.array([1.0, 3.0, 3.0, 2.75, 1.75, 1.75, 1.9, 3.0, 0.75])
+    response = InputResponse(STEP, 2.0, backlash=0.75)
+    np.testing.assert_allclose(response(response.steady(commands[0]), commands)[0][:, 0, 0], expected)
+    memory, steps = response.steady(commands[0]), []
+    for command in commands:
+        acting, _, memory = response(memory, command[None])
+        steps.append(acting[0, 0, 0])
+    np.testing.assert_allclose(steps, expected)
+    widths = torch.tensor([0.0, 0.75], dtype=torch.float64, requires_grad=True)
+    of_each = torch.as_tensor(commands).expand(-1, 2, 1)
+    response = InputResponse(STEP, 2.0, backlash=widths)
+    result = response(response.steady(of_each[0]), of_each)[0][..., 0]
+    np.testing.assert_allclose(result.detach(), np.stack([2.0 * commands[:, 0, 0], expected], 1))
+    (slope,) = torch.autograd.grad(result.sum(), widths)
+    np.testing.assert_allclose(slope, [2.0 * 4, 2.0 * 4])  # in as many steps the gears have turned back

@@ -164,14 +164,14 @@ class Source:
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
         values = {name: value[0] for name, value in robot.parameters.items()}
-        factor, delay, rise, slew, curve, dead_band, zero, _ = response_of(driven.quantity, values)
-        unknown = {"slew": slew, "dead_band": dead_band, "zero": zero or None}
+        factor, delay, rise, slew, curve, dead_band, zero, backlash, _ = response_of(driven.quantity, values)
+        unknown = {"slew": slew, "dead_band": dead_band, "zero": zero or None, "backlash": backlash}
         if curve is not None or any(value is not None for value in unknown.values()):
             other = next((word for word, value in unknown.items() if value is not None), "")
             one = f"{driven.name}_{other if curve is None else next(iter(curve[1]))}"
             raise InputError(
-                f"{one} is identified, but reduced models have no slew rate, curve, dead band or zero: take it out "
-                "of identify.parameters, or set control=none."
+                f"{one} is identified, but reduced models have no slew rate, curve, dead band, zero or backlash: "
+                "take it out of identify.parameters, or set control=none."
             )
         self._factor, self.delay, self.rise = (
             float(1.0 if factor is None else factor),

@@ -1,4 +1,4 @@
-"""Response of an input to its commands: zero, dead band, factor, curve, delay, lag, slew rate, exponential means.
+"""Response of an input to its commands: backlash, zero, dead band, factor, curve, delay, lag, slew rate, means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -20,7 +20,7 @@ Number = torch.Tensor | float | None
 Curve = tuple[float, Mapping[str, Any]]  # typical command, and slopes by name
 
 SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
-RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", "zero", *SLOPES)  # of an input to its commands
+RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", "zero", "backlash", *SLOPES)  # of an input to its commands
 _FIRST_KNOT = 0.25  # of the typical command, where the second slope begins; the next knots are each twice as large
 _ROUNDED = 0.1  # of a knot: width over which the slope changes
 _LEAST_SLEW = 1e-12  # s/unit
@@ -47,6 +47,9 @@ class InputResponse:
             or more; a number, or (1 or B,). None for none.
         zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; a number, or (1 or B,). None
             for zero.
+        backlash: fall of the commands after which they act again when they turn back, as of gears that are loaded in
+            one direction; at rest, commands have risen to their values. Zero or more; a number, or (1 or B,). None for
+            none.
         lower: least input; with a zero, lower ones count as this one.
         filters: F time constants of the exponential means [s].
     """
@@ -61,11 +64,12 @@ class InputResponse:
         curve: Curve | None = None,
         dead_band: Number = None,
         zero: Number = None,
+        backlash: Number = None,
         lower: float = -math.inf,
         filters: Sequence[float] = (),
     ) -> None:
         self.filters, self._factor, self._curve, self._dead_band = tuple(filters), factor, curve, dead_band
-        self._zero, self._lower = zero, lower
+        self._zero, self._backlash, self._lower = zero, backlash, lower
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
         follows = rise is not None or slew is not None
@@ -76,7 +80,8 @@ class InputResponse:
     def steady(self, commands: Array) -> dict[str, Array]:
         """Returns the memory under constant commands (..., C); its entries are (..., C) or (L, ..., C)."""
         scaled, like = self.scaled(commands), _library(commands)
-        memory = {} if self._late is None else {"queue": like.broadcast_to(scaled, (self._length, *scaled.shape))}
+        memory = {} if self._backlash is None else {"geared": commands}
+        memory |= {} if self._late is None else {"queue": like.broadcast_to(scaled, (self._length, *scaled.shape))}
         memory |= {} if self._kept_lag is None else {"behind": scaled}
         means = {"means": like.broadcast_to(scaled, (len(self.filters), *scaled.shape))} if self.filters else {}
         return memory | means
@@ -91,7 +96,11 @@ class InputResponse:
         Returns:
             The input (T, ..., C), its means at the ends of the steps (F, T, ..., C), and the memory after the steps.
         """
-        acting, later, like = self.scaled(commands), dict[str, Array](), _library(commands)
+        later, like = dict[str, Array](), _library(commands)
+        if self._backlash is not None:
+            commands = _geared(memory["geared"], commands, _column(self._backlash))
+            later["geared"] = commands[-1]
+        acting = self.scaled(commands)
         if self._late is not None:
             queue = like.concatenate([memory["queue"], acting])
             acting, later["queue"] = self._delayed(queue, len(acting)), queue[len(acting) :]
@@ -134,13 +143,13 @@ class InputResponse:
 
 def response_of(
     quantity: Quantity, parameters: Mapping[str, torch.Tensor]
-) -> tuple[Number, Number, Number, Number, Curve | None, Number, Number, float]:
-    """Returns the identified factor, delay, rise, slew, curve, dead band and zero or None, and the least input."""
+) -> tuple[Number, Number, Number, Number, Curve | None, Number, Number, Number, float]:
+    """Returns the identified factor, delay, rise, slew, curve, dead band, zero, backlash, and the least input."""
     own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
     slopes = {word: own[word] for word in SLOPES if own[word] is not None}
     curve = (quantity.typical, slopes) if slopes else None
     first = own["factor"], own["delay"], own["rise"], own["slew"]
-    return *first, curve, own["dead_band"], own["zero"], quantity.lower
+    return *first, curve, own["dead_band"], own["zero"], own["backlash"], quantity.lower
 
 
 def with_means(acting: Array, means: Array) -> Array:
@@ -189,6 +198,15 @@ def _lagged(behind: Array, series: Array, kept: Array, reach: Array = None) -> A
         behind = behind + change
         lagged.append(behind)
     return _library(series).stack(lagged)
+
+
+def _geared(held: Array, series: Array, width: Array) -> Array:
+    """The play (T, ..., C) of gears whose output rises with a series (T, ..., C) and falls by the backlash later."""
+    geared, like = list[Array](), _library(series)
+    for now in series:
+        held = like.where(held < now, now, like.where(held > now + width, now + width, held))
+        geared.append(held)
+    return like.stack(geared)
 
 
 def _share_kept(time: torch.Tensor | float, step: float) -> Array:

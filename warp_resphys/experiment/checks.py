@@ -177,10 +177,10 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
                 f"identify.parameters.{name}.lower is {limits.lower:g}: slew rates are positive, so it must be zero "
                 "or more, in s by the unit of the input."
             )
-        if word == "dead_band" and limits.lower < 0.0:
+        if word in ("dead_band", "backlash") and limits.lower < 0.0:
             raise InputError(
-                f"identify.parameters.{name}.lower is {limits.lower:g}: a dead band is zero or more, in the unit of "
-                "the input."
+                f"identify.parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is zero or more, in "
+                "the unit of the input."
             )
         if word in SLOPES and limits.lower < 0.0:
             raise InputError(

@@ -80,9 +80,10 @@ class Replay:
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
             body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
-            time [s] of its response, its reciprocal slew rate, its dead band, its zero and the slopes of its
-            characteristic curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``, ``pressure_slew``,
-            ``pressure_dead_band``, ``pressure_zero`` and ``pressure_slope_1``.
+            time [s] of its response, its reciprocal slew rate, its dead band, its zero, its backlash and the
+            slopes of its characteristic curve: ``pressure_factor``, ``pressure_delay``, ``pressure_rise``,
+            ``pressure_slew``, ``pressure_dead_band``, ``pressure_zero``, ``pressure_backlash`` and
+            ``pressure_slope_1``.
     """
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:

@@ -37,10 +37,11 @@ _COMMANDS: Final[Mapping[str, Wording]] = {
     "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
     "dead_band": ("Dead band", "", 1.0),
     "zero": ("Zero", "", 1.0),
+    "backlash": ("Backlash", "", 1.0),
     "slope": ("Slope", "", 1.0),
 }
 _COMMAND: Final = re.compile(
-    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|zero|slope)(?:_([1-8]))?"
+    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|zero|backlash|slope)(?:_([1-8]))?"
 )
 _BANDS: Final = {
     "pressure": ("kPa", 1e-3),
@@ -170,7 +171,7 @@ def parameter_wording(parameter: str) -> Wording:
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]
-        if word in ("dead_band", "zero"):
+        if word in ("dead_band", "zero", "backlash"):
             unit, factor = _BANDS["muscle_contraction" if parameter.startswith("muscle_contraction") else words]
         kind += f" {octave} of the characteristic" if octave else ""
         return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor

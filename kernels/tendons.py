@@ -223,3 +223,55 @@ def adjoint(
     by_offset_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(by_offset[1], by_offset[2])
     longer_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(longer[1], longer[2])
     rest_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(at_rest[1], at_rest[2])
+
+
+@wp.kernel
+def stick(
+    first: wp.array[int],
+    begin: wp.array2d[wp.float64],  # (B, T) tension before the first guide [N]
+    held: wp.array2d[wp.float64],  # (B, P) tension of each segment so far [N]
+    growth: wp.array2d[wp.float64],  # (B, P) exp(mu theta) of the guide before it
+    tension_out: wp.array2d[wp.float64],  # (B, P) its tension, within the bounds of that guide [N]
+):
+    """Lets every guide stick, or slide as far as its bounds ask for."""
+    b, t = wp.tid()
+    before = wp.float64(begin[b, t])
+    for p in range(first[t], first[t + 1]):
+        before = wp.clamp(held[b, p], before / growth[b, p], before * growth[b, p])
+        tension_out[b, p] = before
+
+
+@wp.kernel
+def stick_adjoint(
+    first: wp.array[int],
+    begin: wp.array2d[wp.float64],
+    held: wp.array2d[wp.float64],
+    growth: wp.array2d[wp.float64],
+    tension: wp.array2d[wp.float64],
+    adjoint: wp.array2d[wp.float64],  # (B, P) of the tension
+    begin_out: wp.array2d[wp.float64],
+    held_out: wp.array2d[wp.float64],
+    growth_out: wp.array2d[wp.float64],
+):
+    """Adjoint of `stick`; guides without contact slide."""
+    b, t = wp.tid()
+    carried = wp.float64(0.0)
+    for k in range(first[t + 1] - first[t]):
+        p = first[t + 1] - 1 - k
+        before = begin[b, t]
+        if p > first[t]:
+            before = tension[b, p - 1]
+        total = adjoint[b, p] + carried
+        by_held, by_growth, factor = ZERO, ZERO, ZERO
+        if held[b, p] <= before / growth[b, p]:
+            factor = ONE / growth[b, p]
+            by_growth = -total * before * factor * factor
+        elif held[b, p] >= before * growth[b, p]:
+            factor = growth[b, p]
+            by_growth = total * before
+        else:
+            by_held = total
+        held_out[b, p] = by_held
+        growth_out[b, p] = by_growth
+        carried = total * factor
+    begin_out[b, t] = carried

@@ -13,7 +13,7 @@ from ..energies.materials import Corotated, Material
 from ..energies.placement import Materials, joined_names, place_energies
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
-from ..io.errors import InputError
+from ..io.errors import ConvergenceError, InputError
 from ..io.machine import find_device
 from ..linalg.threads import shards_of
 from ..stepping.constants import Constants
@@ -332,9 +332,15 @@ class Simulator:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
         solve = partial(self._balance, inputs, constants, state.q)
         limited = self.settings.max_iterations < MOST_ITERATIONS
-        x = find_equilibrium(solve, state.q, state.q if start is None else start.detach(), limited)
-        if self._energies.follow_pose:
-            x = settle(lambda near: self._balance(inputs, constants, state.q, 1.0, near.detach(), near)[0], x)
+        guess = state.q if start is None else start.detach()
+        if not self._energies.follow_pose:
+            x = find_equilibrium(solve, state.q, guess, limited)
+            return State(x, torch.zeros_like(x))
+        try:
+            x = find_equilibrium(partial(solve, near=guess), state.q, guess, limited)
+        except ConvergenceError:  # The guess is far away.
+            x = find_equilibrium(solve, state.q, guess, limited)
+        x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
         return State(x, torch.zeros_like(x))
 
     def _balance(

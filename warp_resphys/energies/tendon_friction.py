@@ -22,15 +22,19 @@ P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..kernels import tendons as kernels
+from ..kernels.modules import launch_stream
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
+from .launcher import BLOCK, warp_view
 from .tendon_routes import OFFSETS, TendonPoints, offset_vector
 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
@@ -80,10 +84,7 @@ class BoundTendons(BoundEnergy):
         self._one_hot = site.tensor(np.eye(tendons.count)[part])  # (P, T)
         self._beyond = site.tensor(beyond(part))
         first = np.searchsorted(part, np.arange(tendons.count + 1))
-        order = first[:-1, None] + np.arange(np.diff(first).max())
-        # Segments (S, T) in their order along the tendons; a shorter tendon repeats its last one, which is `ended`.
-        self._order = torch.as_tensor(np.minimum(order, first[1:, None] - 1).T.copy(), device=device)
-        self._ended = torch.as_tensor((order >= first[1:, None]).T.copy(), device=device)
+        self._runs: Any = wp.array(first.astype(np.int32), dtype=int, device=str(device))
         self._first = torch.as_tensor(first[:-1], device=device)
         entry = np.zeros(len(part))
         entry[first[:-1]] = np.broadcast_to(np.asarray(entry_angle, dtype=np.float64), tendons.count)
@@ -141,15 +142,9 @@ class BoundTendons(BoundEnergy):
         if held is None:
             held = self._slack(tension, here, values)
         growth = torch.exp(values[FRICTION.name][:, self._part] * here.turns)
-        lower, upper, segments = 1.0 / growth, growth, torch.zeros_like(held)
-        before = tension
-        for row, ended in zip(self._order, self._ended, strict=True):
-            own, least, most = held[:, row], before * lower[:, row], before * upper[:, row]
-            kept = torch.where((own > least) & (own < most), own, torch.where(own <= least, least, most))
-            before = torch.where(ended, before, kept)
-            segments = segments.index_copy(1, row, before)
+        segments: torch.Tensor = _Stick.apply(self._runs, tension, held, growth)
         before = self._before(tension, segments)
-        bounds = before - before * lower, before * upper - before
+        bounds = before - before / growth, before * growth - before
         return dict(zip(STEP_VALUES, (segments - before, *bounds, here.beyond), strict=True))
 
     @override
@@ -179,6 +174,38 @@ class BoundTendons(BoundEnergy):
         spring = self._spring(end, values)
         segments = (values["tendon_tension"] + spring)[:, self._part] + friction @ self._beyond.mT
         return {"tendon_segment_tension": segments.clamp_min(0.0), "tendon_spring_force": spring}
+
+
+class _Stick(torch.autograd.Function):
+    """Tensions (B, P) of the segments where guides stick or slide (`kernels.tendons.stick`)."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, runs: Any, begin: torch.Tensor, held: torch.Tensor, growth: torch.Tensor) -> torch.Tensor:
+        given = [x.detach().double().expand(len(held), -1).contiguous() for x in (begin, held, growth)]
+        segments = torch.zeros_like(given[1])
+        _launch(kernels.stick, given[0], runs, *given, segments)
+        ctx.runs, ctx.shared = runs, [len(x) < len(held) for x in (begin, held, growth)]
+        ctx.save_for_backward(*given, segments)
+        return segments.to(held.dtype)
+
+    @override
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        *given, segments = ctx.saved_tensors
+        slopes = [torch.zeros_like(x) for x in given]
+        _launch(kernels.stick_adjoint, given[0], ctx.runs, *given, segments, gradient.double().contiguous(), *slopes)
+        pairs = zip(slopes, ctx.shared, strict=True)
+        return None, *((x.sum(0, keepdim=True) if shared else x).to(gradient.dtype) for x, shared in pairs)
+
+
+def _launch(kernel: Any, like: torch.Tensor, runs: Any, *tensors: torch.Tensor) -> None:
+    """Launches a kernel with a thread for each tendon (B, T)."""
+    views, device = [warp_view(x, wp.float64) for x in tensors], like.device
+    wp.launch(
+        kernel, dim=like.shape, inputs=[runs, *views], device=str(device), stream=launch_stream(device), block_dim=BLOCK
+    )
 
 
 def beyond(part: NDArray[np.int64]) -> NDArray[np.float64]:

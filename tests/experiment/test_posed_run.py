@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import warp_resphys
+from support.bags import write_points
 from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, run_without_report
 from support.played_run import check_robots
@@ -15,6 +16,7 @@ from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.pipeline import acquire
 from warp_resphys.report.identification_section import own_table
 from warp_resphys.report.uniaxial import small_strain
 from warp_resphys.settings.body import MaterialSettings
@@ -42,6 +44,7 @@ TINY = [
     ),  # hardly distinguishable from E
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
+QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
 
 
 def trials(poses):
@@ -95,6 +98,31 @@ def write(folder, places_of_poses):
         frames = row.ravel() + 1e-4 * draw.normal(size=(40, 15))
         table = np.column_stack([np.arange(40), np.arange(40) / 200.0, frames])
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
+
+
+def test_poses_are_imported_from_bags(poses, tmp_path, monkeypatch):
+    """A folder or a file for each pose, with a topic for each marker, under the names of the configuration."""
+    monkeypatch.chdir(tmp_path)
+    names = ["M1", "M2", "M3", "Tip", "Base"]
+    for name, places in zip(POSES, poses, strict=True):
+        turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1) + [0.3, 0.4, -0.1]
+        write_points(
+            Path(name), {f"/{label}": np.tile(at, (40, 1)) for label, at in zip(names, turned, strict=True)}, 200.0
+        )
+    Path("both.mcap").write_bytes((Path("both") / "both.mcap").read_bytes())
+    recorded = [TRIALS[0], TRIALS[1].replace("both.csv", "both.mcap").replace(".csv", "")]
+    markers = f"+data.bag={{markers: {{{','.join(f'{label}: /{label}' for label in names)}}}}}"
+    given = settings(*TINY, *recorded, "data.folder=.", "data.table=null", markers, "markers.labels=recorded")
+    acquire(given, Path("run"))
+    dataset = read_dataset(Path("run/dataset.h5"))
+    rows = [dataset.names.index(name) for name in POSES]
+    np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=1e-5)
+    code, err = run("inspect", "weak", *QUIET)
+    assert code == 2
+    assert "/M1 (geometry_msgs/msg/PointStamped)" in err
+    code, err = run("inspect", "weak", "recording.bag={markers: {tip: /Tip, middle: /M2}}", *QUIET)
+    assert (code, err[-300:] if code else "") == (0, "")
+    assert json.loads(next(Path().rglob("quality.json")).read_text())["rate_hz"] == 200.0
 
 
 def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.assignment import assign
 from ..data.marker_view import MarkerView
+from ..data.recordings.bag import Bag
 from ..data.recordings.quality import check_passive
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
@@ -63,6 +64,7 @@ class Reader:
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if self.data.folder is None else None
         self._table = None if table is None else Table(table.columns, table.header_lines)
+        self._bag = None if self.data.bag is None else Bag(**self.data.bag.plain())
         self._hanging: FloatArray | None = None
 
     def tracked_in(self, trial: Trial) -> list[str]:
@@ -134,7 +136,8 @@ class Reader:
             recording = read_recording(self._folder / trial.recording)
         else:
             assert trial.file is not None
-            recording = read_recording(Path(trial.file), self.data.units, self.data.rate, trial.labels, self._table)
+            given = self.data.units, self.data.rate, trial.labels, self._table, self._bag
+            recording = read_recording(Path(trial.file), *given)
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(

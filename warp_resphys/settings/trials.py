@@ -230,6 +230,17 @@ class TableSettings(Settings):
     header_lines: Count = setting(0, "lines before the first row of numbers")
 
 
+class BagSettings(Settings):
+    """Topics of ROS bags, with a member after # where a message has several: /tf#tip, /joint_states#finger.effort."""
+
+    markers: dict[str, Word] = setting(description="topics by name of the marker; poses are rigid bodies")
+    inputs: Many[Word] = setting((), "topics of the inputs, with their unit in brackets: '/pressure#1 [mbar]'")
+    base: Word | None = setting(None, "topic of the pose of the base")
+    rate: Positive | None = setting(
+        None, "of the frames to which messages are brought; null: of the first marker", "Hz"
+    )
+
+
 class ReadingSettings(Settings):
     """Reading of recordings and their transformation into the frame of the body."""
 
@@ -237,6 +248,7 @@ class ReadingSettings(Settings):
     units: LengthUnit | None = setting(None, "of files that do not name their unit")
     rate: Positive | None = setting(None, "of files that do not have a frame rate", "Hz")
     table: TableSettings | None = setting(None, "columns of tables without headers")
+    bag: BagSettings | None = setting(None, "topics of ROS bags")
     axes: Annotated[Many[SignedAxis], Field(min_length=3, max_length=3), AfterValidator(different)] | None = setting(
         None, "recorded axes along the body's x, y and z, if known; one fixed marker then suffices for registration"
     )

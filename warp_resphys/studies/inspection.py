@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import model_validator
 
+from ..data.recordings.bag import is_bag
 from ..data.recordings.reading import READERS
 from ..io.errors import InputError
 from ..io.settings import Many, Positive, Word, setting
@@ -30,7 +31,7 @@ class Inspection(RecordingInspection):
         if not isinstance(values, Mapping) or not isinstance(values["mesh"], Mapping):
             return values
         files = values["files"] if isinstance(values["files"], list) else []
-        recordings = [file for file in files if Path(str(file)).suffix.lower() in READERS]
+        recordings = [file for file in files if Path(str(file)).suffix.lower() in READERS or is_bag(Path(str(file)))]
         meshes = [file for file in files if file not in recordings]
         if len(meshes) > 1:
             raise ValueError(f"{meshes[0]} and {meshes[1]} are two meshes: name one at a time.")

@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from ..data.recordings.bag import Bag
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import (
     BaseMotion,
@@ -31,6 +32,7 @@ from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
 from ..report.figures import STYLE, TONES, new_figure, save_png
+from ..settings.trials import BagSettings
 from .tables import aligned
 
 FloatArray = NDArray[np.float64]
@@ -50,6 +52,7 @@ class RecordingFile(Settings):
     units: Word | None = None
     rate: Positive | None = setting(None, unit="Hz")
     labels: Many[Word] | None = None
+    bag: BagSettings | None = None
 
 
 class RecordingInspection(Settings):
@@ -131,7 +134,7 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     file = settings.recording
-    configured = (file.units, file.rate, file.labels)
+    configured = (file.units, file.rate, file.labels, None, None if file.bag is None else Bag(**file.bag.plain()))
     recording = read_recording(str(file.path), *configured)
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)

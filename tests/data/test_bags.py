@@ -1,0 +1,171 @@
+"""Recordings in ROS bags, written by rosbags and read back."""
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from warp_resphys.data.base_motion import since_first
+from warp_resphys.data.recordings.bag import Bag
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.io.errors import DataFileError, InputError
+
+RATE, FRAMES = 50.0, 41
+TIMES = np.arange(FRAMES) / RATE
+MARKERS = {"tip": "/mocap/tip", "plate": "/tf#plate", "second": "/cloud#2"}
+INPUTS = ["/pressure#2 [mbar]", "/joint_states#winch.position [mm]"]
+
+
+def place(number, times):
+    """(T, 3) [m]"""
+    swing = 0.02 * np.sin(3.0 * np.asarray(times) + number)
+    return np.stack([swing, 0.1 * number + 0.0 * swing, 0.2 + swing**2], -1)
+
+
+def turn(times):
+    return Rotation.from_rotvec(np.multiply.outer(0.5 * np.sin(2.0 * np.asarray(times)), [0.0, 0.0, 1.0]))
+
+
+class Messages:
+    """Messages of a type store, with the times of their headers."""
+
+    def __init__(self, store):
+        self.of = lambda name: store.types[name]
+
+    def header(self, time):
+        seconds, rest = divmod(round(1e9 * (time + 100.0)), 1_000_000_000)
+        stamp = self.of("builtin_interfaces/msg/Time")(seconds, rest)
+        more = {"seq": 0} if "seq" in self.of("std_msgs/msg/Header").__dataclass_fields__ else {}
+        return self.of("std_msgs/msg/Header")(**more, stamp=stamp, frame_id="world")
+
+    def point(self, at, kind="Point"):
+        return self.of(f"geometry_msgs/msg/{kind}")(*map(float, at))
+
+    def pose(self, at, rotation):
+        quaternion = self.of("geometry_msgs/msg/Quaternion")(*rotation.as_quat())
+        return self.of("geometry_msgs/msg/Pose")(self.point(at), quaternion)
+
+    def stamped(self, time, at):
+        return self.of("geometry_msgs/msg/PointStamped")(self.header(time), self.point(at))
+
+    def transforms(self, time, at, rotation, child):
+        quaternion = self.of("geometry_msgs/msg/Quaternion")(*rotation.as_quat())
+        moved = self.of("geometry_msgs/msg/Transform")(self.point(at, "Vector3"), quaternion)
+        one = self.of("geometry_msgs/msg/TransformStamped")(self.header(time), child, moved)
+        return self.of("tf2_msgs/msg/TFMessage")([one])
+
+    def cloud(self, time, points):
+        field = self.of("sensor_msgs/msg/PointField")
+        fields = [field(name, 4 * number, 7, 1) for number, name in enumerate("xyz")]
+        data = np.frombuffer(np.ascontiguousarray(points, dtype="<f4").tobytes(), dtype=np.uint8)
+        cloud = self.of("sensor_msgs/msg/PointCloud2")
+        return cloud(self.header(time), 1, len(points), fields, False, 12, 12 * len(points), data, True)
+
+    def joints(self, time, **positions):
+        names, none = [*positions], np.zeros(0)
+        values = np.array([*positions.values()], dtype=np.float64)
+        return self.of("sensor_msgs/msg/JointState")(self.header(time), names, values, none, none)
+
+    def numbers(self, values):
+        layout = self.of("std_msgs/msg/MultiArrayLayout")([], 0)
+        return self.of("std_msgs/msg/Float64MultiArray")(layout, np.array(values, dtype=np.float64))
+
+
+def written(path, kind="sqlite3", left_out=()):
+    """A bag with two markers, a rigid body, two inputs and an image topic."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    if kind == "bag":  # not among the types of ROS 1 that rosbags brings
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    make = Messages(store)
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer1(path) if kind == "bag" else Writer2(path, version=9, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
+    with writer:
+        topics = {}
+
+        def write(topic, message, time):
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            writer.write(topics[topic], round(1e9 * (time + 100.0)), serialize(message, message.__msgtype__))
+
+        for number, time in enumerate(TIMES):
+            if number not in left_out:
+                write("/mocap/tip", make.stamped(time, place(0, time)), time)
+            late = time + 0.3 / RATE  # Other devices have their own times.
+            write("/tf", make.transforms(late, place(1, late), turn(late), "plate"), late)
+            write("/tf", make.transforms(late, place(5, late), turn(0.0), "other"), late)
+            write("/cloud", make.cloud(time, [place(3, time), place(2, time)]), time)
+            if number % 10 == 0:
+                write("/pressure", make.numbers([0.0, number]), time)
+                write("/joint_states", make.joints(time, arm=9.0, winch=0.5 * number), time)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "bag"])
+def test_topics_are_brought_to_common_frames(kind, tmp_path):
+    path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind)
+    read = read_recording(path, bag=Bag(MARKERS, INPUTS))
+    assert read.rate == RATE
+    assert read.labels == ("tip", "plate", "second", "plate +x", "plate +y", "plate +z")
+    times = 0.3 / RATE + np.arange(len(read.positions)) / RATE  # from the first message of the rigid body on
+    assert len(times) == FRAMES - 1
+    for column, number in enumerate(range(3)):
+        np.testing.assert_allclose(read.positions[:, column], place(number, times), atol=2e-5)
+    arm = place(1, times) + 0.05 * turn(times).as_matrix()[:, :, 0]
+    np.testing.assert_allclose(read.positions[:, 3], arm, atol=2e-5)
+    last = 10 * (np.floor(times * RATE / 10 + 1e-9))
+    np.testing.assert_allclose(read.actuation, np.stack([1e2 * last, 0.5e-3 * last], 1))
+
+
+def test_a_pose_is_the_motion_of_the_base(tmp_path):
+    path = written(tmp_path / "trial")
+    read = read_recording(path, bag=Bag({"tip": "/mocap/tip"}, base="/tf#plate"))
+    times = np.maximum(TIMES, 0.3 / RATE)  # before its first message, the base is where that has it
+    quaternions = turn(times).as_quat()[:, [3, 0, 1, 2]]
+    np.testing.assert_allclose(read.base, since_first(place(1, times), quaternions, path), atol=2e-4)
+
+
+def test_a_gap_is_not_bridged(tmp_path):
+    read = read_recording(written(tmp_path / "trial", left_out=range(10, 15)), bag=Bag({"tip": "/mocap/tip"}))
+    np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, 0]), range(10, 15))
+    single = read_recording(written(tmp_path / "other", left_out=[10]), bag=Bag({"tip": "/mocap/tip"}))
+    assert single.seen.all()
+    np.testing.assert_allclose(single.positions[:, 0], place(0, TIMES), atol=4e-5)
+
+
+def test_another_rate_may_be_given(tmp_path):
+    read = read_recording(written(tmp_path / "trial"), bag=Bag({"tip": "/mocap/tip"}, rate=100.0))
+    assert (read.rate, len(read.positions)) == (100.0, 2 * FRAMES - 1)
+
+
+@pytest.mark.parametrize(
+    ("bag", "error", "words"),
+    [
+        (Bag({"tip": "/mocap/tup"}), DataFileError, "no topic /mocap/tup, did you mean '/mocap/tip'"),
+        (Bag({"tip": "/other"}), DataFileError, "it has /cloud, /joint_states, /mocap/tip, /pressure, /tf"),
+        (Bag({"tip": "/tf#tip"}), DataFileError, "/tf has no message of tip"),
+        (Bag({"tip": "/pressure#1"}), DataFileError, "which hold no place"),
+        (Bag({"tip": "/cloud"}), InputError, "say which entry"),
+        (Bag({"tip": "/mocap/tip"}, ["/mocap/tip"]), DataFileError, "which hold no input"),
+        (Bag({"tip": "/mocap/tip"}, ["/pressure#3 [mbar]"]), DataFileError, "has 2 entries"),
+        (Bag({"tip": "/mocap/tip"}, ["/pressure#1 [psi]"]), InputError, "whose unit is unknown"),
+        (Bag({"tip": "/mocap/tip"}, ["/joint_states#winch"]), InputError, "name the joint and its position"),
+        (Bag({"tip": "mocap tip"}), InputError, "write a topic"),
+        (Bag({}), InputError, "data.bag.markers is empty"),
+        (None, InputError, "name topics in data.bag .* /pressure .std_msgs/msg/Float64MultiArray"),
+    ],
+)
+def test_what_cannot_be_read_is_said(bag, error, words, tmp_path):
+    with pytest.raises(error, match=words):
+        read_recording(written(tmp_path / "trial"), bag=bag)
+
+
+def test_files_that_are_no_bags_are_said(tmp_path):
+    with pytest.raises(DataFileError, match="there is no such file or folder"):
+        read_recording(tmp_path / "trial.bag", bag=Bag(MARKERS))
+    (tmp_path / "broken.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    with pytest.raises(DataFileError, match="is damaged, or no bag"):
+        read_recording(tmp_path / "broken.bag", bag=Bag(MARKERS))

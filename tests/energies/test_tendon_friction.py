@@ -10,6 +10,7 @@ from warp_resphys import (
     Body,
     Corotated,
     Inputs,
+    Scene,
     Simulator,
     SolverSettings,
     State,
@@ -58,6 +59,33 @@ def test_the_tension_of_a_hard_body_is_the_play_of_a_capstan():
         np.testing.assert_allclose(segments(state), [*at, 1.0, 1.0], rtol=1e-4)
 
 
+def contraction(*metres):
+    return Inputs(tendon_contraction=torch.tensor([metres], dtype=torch.float64))
+
+
+def test_a_cable_that_is_wound_up_and_let_go_is_a_capstan_too():
+    """By contraction, whose spring lies before the first guide."""
+    s = simulator(CORNERS, material=HARD, stiffness=1000.0)
+    state, at, corner = s.rest_state(), np.zeros(3), math.exp(0.5 * math.pi * MU)
+    for shorter in [1e-3, 4e-3, 3e-3, 1e-3, 2e-3, 0.0]:
+        state, _ = s.step(state, contraction(shorter))
+        at[0] = before = 1000.0 * max(shorter - 0.5e-4, 0.0)
+        for k in (1, 2):
+            at[k] = before = np.clip(at[k], before / corner, before * corner)
+        np.testing.assert_allclose(segments(state), at, rtol=0.02, atol=0.01)  # the body yields a little
+
+
+def test_a_slow_contraction_ends_in_the_pose():
+    s = simulator(CORNERS, stiffness=1000.0)
+    state = s.rest_state()
+    for shorter in np.linspace(0.0, 4e-3, 41)[1:]:
+        for _ in range(3):
+            state, _ = s.step(state, contraction(shorter))
+    pose = s.static_equilibrium(contraction(4e-3))
+    posed, _ = s.step(pose, contraction(4e-3))
+    np.testing.assert_allclose(segments(state), segments(posed), rtol=0.02)
+
+
 @pytest.mark.parametrize("entry", [0.0, 0.7])
 def test_at_rest_the_tension_falls_by_the_angles_of_the_pose(entry):
     """The forces on the vertices of the solution are those of segments with Euler's tensions."""
@@ -81,11 +109,15 @@ def test_at_rest_the_tension_falls_by_the_angles_of_the_pose(entry):
     np.testing.assert_allclose(split.static_equilibrium(tension(*tensions)).q, q, atol=5e-6)
 
 
-def test_a_step_from_rest_holds_the_pose():
-    s = simulator(STRAIGHT, entry_angle=0.3)
-    pose = s.static_equilibrium(tension(2.0))
-    trajectory = s.rollout(pose, 5, tension(2.0))
-    torch.testing.assert_close(trajectory.q[-1], pose.q, rtol=0.0, atol=1e-9)
+@pytest.mark.parametrize("acting", [tension(2.0), contraction(6e-3)])
+@pytest.mark.parametrize("forgets", [False, True])
+def test_a_step_from_rest_holds_the_pose(acting, forgets):
+    """Also where an environment is reset, whose memory is zero."""
+    s = simulator(STRAIGHT, entry_angle=0.3, stiffness=400.0)
+    pose = s.static_equilibrium(acting)
+    zero = {"tendon_segment_tension": torch.zeros(1, 6, dtype=torch.float64)} if forgets else {}
+    trajectory = s.rollout(State(pose.q, pose.v, memory=zero), 5, acting)
+    torch.testing.assert_close(trajectory.q[-1], pose.q, rtol=0.0, atol=1e-8)
 
 
 def test_a_slide_takes_the_tension_to_its_bound_over_the_bristle_length():
@@ -146,6 +178,38 @@ def test_gradients_of_a_pose_equal_differences(stiffness):
         assert float(gradient) * steps[name] == pytest.approx(difference, rel=1e-6), name
 
 
+def test_poses_of_single_precision_have_gradients():
+    results = []
+    for dtype in (torch.float64, torch.float32):
+        body = Body(BEAM, fixed=CLAMP, energies=(Tendons([STRAIGHT], friction=MU),))
+        s = Simulator(body, SOFT, gravity=(0.0, 0.0, 0.0), dtype=dtype)
+        pull = s.tensor([[2.0], [6.0], [0.1]]).requires_grad_()
+        q = s.static_equilibrium(Inputs(tendon_tension=pull)).q
+        (gradient,) = torch.autograd.grad(q.square().sum(), pull)
+        results.append((q.detach().double(), gradient.double()))
+    (q, gradient), (rounded, approximate) = results
+    torch.testing.assert_close(rounded, q, rtol=0.0, atol=2e-6)
+    torch.testing.assert_close(approximate, gradient, rtol=2e-3, atol=1e-6)
+
+
+def test_a_scene_has_the_friction_of_its_bodies():
+    alone = simulator(STRAIGHT)
+    pair = Scene(
+        {
+            name: Body(BEAM, fixed=CLAMP, energies=(Tendons([STRAIGHT], friction=mu),))
+            for name, mu in (("a", MU), ("b", 0.0))
+        }
+    )
+    s = Simulator(pair, {"a": SOFT, "b": SOFT}, gravity=(0.0, 0.0, 0.0), solver=TIGHT)
+    both = Inputs(a_tendon_tension=torch.full((1, 1), 2.0).double(), b_tendon_tension=torch.full((1, 1), 2.0).double())
+    state = s.rollout(s.static_equilibrium(both), 3, both).final
+    expected = alone.rollout(alone.static_equilibrium(tension(2.0)), 3, tension(2.0)).final
+    torch.testing.assert_close(state.q[:, : len(BEAM.vertices)], expected.q, rtol=0.0, atol=1e-8)
+    memory = state.memory
+    torch.testing.assert_close(memory["a_tendon_segment_tension"], expected.memory["tendon_segment_tension"])
+    torch.testing.assert_close(memory["b_tendon_segment_tension"], torch.full((1, 6), 2.0).double())
+
+
 def test_gradients_from_a_straight_rest_are_finite_and_right():
     """Angles are zero there, where that of a chord has no derivative."""
     s = simulator(STRAIGHT)
@@ -171,6 +235,8 @@ def test_without_friction_the_coefficient_of_zero_changes_nothing():
     [
         ({"friction": -0.1}, "tendon_friction is -0.1"),
         ({"bristle_length": 0.0}, "tendon_bristle_length is 0"),
+        ({"friction": None, "entry_angle": 1.0}, "acts by friction"),
+        ({"friction": None, "bristle_length": -1.0}, "tendon_bristle_length is -1"),
         ({"entry_angle": -1.0}, "the entry angle of tendons is -1.0"),
         ({"entry_angle": [0.1, 0.2]}, "give one angle, or 1"),
     ],

@@ -92,6 +92,10 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
         ("mesh.radii=[[0.0,0.01],[0.2]]", "mesh.radii is"),
         ("mesh.layers=0", "mesh.layers is 0"),
         ("laboratory.material.prony_time_1=0", "prony_time_1 is"),
+        ("+tendons.routes.left.entry_angle=1.0", r"routes\.left\.entry_angle acts by friction"),
+        ("+tendons.bristle_length=1e-3", "bristle_length is that of friction"),
+        ("+tendons.routes.left.fixed_guides=[0,1]", r"routes\.left\.fixed_guides has all guides"),
+        ("+tendons.routes.left.fixed_guides=[2]", "the route has guides 0 to 1"),
     ],
 )
 def test_wrong_tendons_are_refused_before_anything_runs(override, said):

@@ -15,7 +15,7 @@ MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
 _MOST_SETTLINGS = 100
-_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size
+_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 
@@ -91,11 +91,11 @@ def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor) -
         x = _repeated(solve, start.detach(), "the equilibrium does not settle")
     if not torch.is_grad_enabled():
         return x
-    near = x.requires_grad_()
-    again = solve(near)
-    solution = solve(x.detach())
+    solution = solve(x)
     if not solution.requires_grad:
         return solution
+    near = x.clone().requires_grad_()
+    again = solve(near)
 
     def through(gradient: torch.Tensor) -> torch.Tensor:
         def more(total: torch.Tensor) -> torch.Tensor:
@@ -109,9 +109,10 @@ def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor) -
 
 def _repeated(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str) -> torch.Tensor:
     """Returns the limit of repeated calls of a function, or raises ConvergenceError."""
+    settled = max(_SETTLED, 16.0 * torch.finfo(x.dtype).eps)
     for _ in range(_MOST_SETTLINGS):
         previous, x = x, function(x)
-        if bool((x - previous).norm() <= _SETTLED * x.norm()):
+        if bool((x - previous).norm() <= settled * x.norm()):
             return x
     raise ConvergenceError(
         f"{failure}: friction depends too strongly on the pose; lower the friction or the tension.", x, None

@@ -12,7 +12,8 @@ direction of the slide,
     f(s) = F + (f_0 - F) exp(-|s| / z_c),
 
 which derives from a convex potential of s, that of `energies.friction` with two bounds. Angles and bounds are those at
-the start of the step. The spring of a tendon counts as lying before its first guide.
+the start of the step, under the commands of the step: a contraction that yields much within it makes friction too large
+in that step. The spring of a tendon lies before its first guide.
 
 In a static equilibrium, and at the start of a roll-out without memory, tendons have been pulled from slack: the tension
 falls at every guide by the factor exp(-mu theta).
@@ -39,6 +40,7 @@ from .tendon_routes import OFFSETS, TendonPoints, offset_vector
 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
 BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
+SEGMENT_TENSION = "tendon_segment_tension"
 STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")
 _STRAIGHT = 1e-4  # rad: angles are rounded off below it, so that they have a derivative at zero
 
@@ -62,7 +64,7 @@ class Geometry(NamedTuple):
 class BoundTendons(BoundEnergy):
     """Tendons with friction in a simulator.
 
-    Memory is ``tendon_segment_tension`` (B, P) and ``tendon_spring_force`` (B, T) [N].
+    Memory is ``tendon_segment_tension`` (B, P) [N].
 
     Args:
         tendons: the tendons.
@@ -89,10 +91,7 @@ class BoundTendons(BoundEnergy):
         entry = np.zeros(len(part))
         entry[first[:-1]] = np.broadcast_to(np.asarray(entry_angle, dtype=np.float64), tendons.count)
         self._entry = site.tensor(entry)
-        self.memory = (
-            Memory("tendon_segment_tension", "N", (len(part),), "segment"),
-            Memory("tendon_spring_force", "N", (tendons.count,), "tendon"),
-        )
+        self.memory = (Memory(SEGMENT_TENSION, "N", (len(part),), "segment"),)
 
     def _geometry(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> Geometry:
         """Returns the tendons at positions (B, N, 3)."""
@@ -136,11 +135,8 @@ class BoundTendons(BoundEnergy):
     def _start(self, step: EnergyStep, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns the values of the step by name, and the tension ``before`` each guide at its start."""
         here = self._geometry(step.state.q, values)
-        spring = step.state.memory.get("tendon_spring_force")
-        tension = values["tendon_tension"] + (self._spring(here, values) if spring is None else spring)
-        held = step.state.memory.get("tendon_segment_tension")
-        if held is None:
-            held = self._slack(tension, here, values)
+        tension = values["tendon_tension"] + self._spring(here, values)
+        held = step.state.memory.get(SEGMENT_TENSION, torch.zeros_like(here.turns))
         growth = torch.exp(values[FRICTION.name][:, self._part] * here.turns)
         segments: torch.Tensor = _Stick.apply(self._runs, tension, held, growth)
         before = self._before(tension, segments)
@@ -171,9 +167,9 @@ class BoundTendons(BoundEnergy):
         hold, drop, rise, before = (start[name] for name in STEP_VALUES)
         length = values[BRISTLE.name][:, self._part]
         friction = friction_after(end.beyond - before, hold, drop, rise, length)
-        spring = self._spring(end, values)
-        segments = (values["tendon_tension"] + spring)[:, self._part] + friction @ self._beyond.mT
-        return {"tendon_segment_tension": segments.clamp_min(0.0), "tendon_spring_force": spring}
+        tension = values["tendon_tension"] + self._spring(end, values)
+        segments = tension[:, self._part] + friction @ self._beyond.mT
+        return {SEGMENT_TENSION: segments.clamp_min(0.0)}
 
 
 class _Stick(torch.autograd.Function):

@@ -90,7 +90,9 @@ class Tendons(Energy):
         STIFFNESS.check(self.stiffness)
         if self.friction is not None:
             FRICTION.check(self.friction)
-            BRISTLE.check(self.bristle_length)
+        elif np.any(self.entry_angle):
+            raise InputError("an entry angle of tendons acts by friction: give their friction, or leave it out.")
+        BRISTLE.check(self.bristle_length)
         if len(self.fixed_guides) not in (0, self.count):
             raise InputError(f"fixed guides are given for {len(self.fixed_guides)} of {self.count} tendons: give all.")
         for number, (route, fixed) in enumerate(zip(self.guides, self.fixed_guides, strict=False), 1):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
 from ..energies.solid import VISCOUS_STRAIN
+from ..energies.tendon_friction import SEGMENT_TENSION
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
@@ -30,6 +31,7 @@ from ..stepping.state import State
 FloatArray = NDArray[np.float64]
 Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
 
+_CARRIED = (VISCOUS_STRAIN, SEGMENT_TENSION)  # memory that forces of later steps depend on
 _AT_ONCE = 256  # environments of a batch
 _RIDGE = 1e-14  # of the trace, where columns are dependent
 
@@ -115,7 +117,7 @@ class WeakForm:
             for name, own in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
         }
         constants = simulator.prepare(spread)
-        carries = any(name.startswith("prony_modulus") and any(own) for name, own in values.items())
+        carries = True
         memory: Mapping[str, torch.Tensor] = {}
         rows = []
         for number, start in enumerate(states):
@@ -129,7 +131,8 @@ class WeakForm:
                 rows.append(self._weighted(simulator.linearise(state, inputs, constants).residual(x), end))
             if carries:
                 memory = simulator.remember(state, end.repeat(count, 1, 1), constants, inputs).memory
-                memory = {name: value for name, value in memory.items() if name.endswith(VISCOUS_STRAIN)}
+                memory = {name: value for name, value in memory.items() if name.endswith(_CARRIED)}
+                carries = bool(memory)
         return np.concatenate(rows)
 
     def _weighted(self, residuals: torch.Tensor, at: torch.Tensor) -> FloatArray:

@@ -147,9 +147,13 @@ class TendonSettings(Settings):
     def _pulls(self) -> Self:
         if self.commanded == "contraction" and not self.stiffness > 0.0:
             raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
+        if self.friction is None and "bristle_length" in self.model_fields_set and self.bristle_length != 1.0e-4:
+            raise ValueError("bristle_length is that of friction: set friction, or leave it out.")
         for name, route in self.routes.items():
             if route.entry_angle and self.friction is None:
                 raise ValueError(f"routes.{name}.entry_angle acts by friction: set tendons.friction, or leave it out.")
+            if len(set(route.fixed_guides)) == len(route.guides):
+                raise ValueError(f"routes.{name}.fixed_guides has all guides: one or more must lie in the body.")
             if not set(route.fixed_guides) <= set(range(len(route.guides))):
                 raise ValueError(
                     f"routes.{name}.fixed_guides is {list(route.fixed_guides)}: the route has guides 0 to "

@@ -1,5 +1,6 @@
 """Friction of tendons against Euler's capstan, the play of a cable, and differences."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from warp_resphys import (
     Body,
     Corotated,
     Inputs,
+    Rigid,
     Scene,
     Simulator,
     SolverSettings,
@@ -283,8 +285,28 @@ def test_fixed_guides_are_checked():
         simulator(CORNERS, fixed_guides=[[4]])
     with pytest.raises(InputError, match="it does not pull on the body"):
         simulator(SHORT, fixed_guides=[[0, 1, 2]])
-    with pytest.raises(InputError, match="name it among the fixed guides"):
+    with pytest.raises(InputError, match=r"lies far outside of the body: .* name it among the fixed guides"):
         simulator([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]])
+
+
+def test_a_guide_in_a_rigid_part_pulls_on_it():
+    """The couple of a cable on a rigid end is that of the same cable on a stiff one."""
+    mesh = box_hexahedra(SIZE, (6, 2, 1))
+    plate = np.flatnonzero(mesh.vertices[mesh.cells].mean(axis=1)[:, 0] > 0.1)
+    mesh = dataclasses.replace(mesh, regions={"plate": plate, "rest": np.setdiff1d(np.arange(len(mesh.cells)), plate)})
+    route = [[-0.05, 0.02, 0.05], [0.06, 0.02, 0.018], [0.115, 0.02, 0.018]]
+    tendons = Tendons([route], friction=MU, fixed_guides=[[0]])
+    poses = []
+    for more, material in (
+        ({"rigid": {"plate": Rigid(SOFT.density)}}, SOFT),
+        ({}, {"plate": Corotated(1e9, 0.3), "rest": SOFT}),
+    ):
+        s = Simulator(
+            Body(mesh, fixed=CLAMP, energies=(tendons,), **more), material, gravity=(0.0, 0.0, 0.0), solver=TIGHT
+        )
+        poses.append(s.static_equilibrium(tension(2.0)).q)
+    assert float((poses[0] - s.rest_positions).abs().max()) > 1e-3
+    torch.testing.assert_close(*poses, rtol=0.0, atol=2e-5)
 
 
 def test_a_rollout_and_its_gradient_on_any_device_are_those_of_the_cpu(device):

@@ -74,7 +74,7 @@ class Messages:
         return self.of("std_msgs/msg/Float64MultiArray")(layout, np.array(values, dtype=np.float64))
 
 
-def written(path, kind="sqlite3", left_out=()):
+def written(path, kind="sqlite3", left_out=(), late=0.0):
     """A bag with two markers, a rigid body, two inputs and an image topic."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
     if kind == "bag":  # not among the types of ROS 1 that rosbags brings
@@ -89,14 +89,14 @@ def written(path, kind="sqlite3", left_out=()):
         def write(topic, message, time):
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
-            writer.write(topics[topic], round(1e9 * (time + 100.0)), serialize(message, message.__msgtype__))
+            writer.write(topics[topic], round(1e9 * (time + 100.0 + late)), serialize(message, message.__msgtype__))
 
         for number, time in enumerate(TIMES):
             if number not in left_out:
                 write("/mocap/tip", make.stamped(time, place(0, time)), time)
-            late = time + 0.3 / RATE  # Other devices have their own times.
-            write("/tf", make.transforms(late, place(1, late), turn(late), "plate"), late)
-            write("/tf", make.transforms(late, place(5, late), turn(0.0), "other"), late)
+            other = time + 0.3 / RATE  # Devices have their own times.
+            write("/tf", make.transforms(other, place(1, other), turn(other), "plate"), other)
+            write("/tf", make.transforms(other, place(5, other), turn(0.0), "other"), other)
             write("/cloud", make.cloud(time, [place(3, time), place(2, time)]), time)
             if number % 10 == 0:
                 write("/pressure", make.numbers([0.0, number]), time)
@@ -104,9 +104,10 @@ def written(path, kind="sqlite3", left_out=()):
     return path
 
 
-@pytest.mark.parametrize("kind", ["sqlite3", "mcap", "bag"])
-def test_topics_are_brought_to_common_frames(kind, tmp_path):
-    path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind)
+@pytest.mark.parametrize(("kind", "late"), [("sqlite3", 0.0), ("mcap", 30.0), ("bag", 0.0)])
+def test_topics_are_brought_to_common_frames(kind, late, tmp_path):
+    """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
+    path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind, late=late)
     read = read_recording(path, bag=Bag(MARKERS, INPUTS))
     assert read.rate == RATE
     assert read.labels == ("tip", "plate", "second", "plate +x", "plate +y", "plate +z")

@@ -101,7 +101,7 @@ class BoundTendons(BoundEnergy):
         lengths = line.norm(dim=-1)
         u = line / lengths.clamp_min(torch.finfo(q.dtype).tiny)[..., None]
         chord = (u[:, 1:] - u[:, :-1]).square().sum(-1)
-        half = (0.5 * (chord + _STRAIGHT**2).sqrt()).clamp_max(1.0 - 1e-9)
+        half = (0.5 * (chord + _STRAIGHT**2).sqrt()).clamp_max(1.0 - 4.0 * torch.finfo(q.dtype).eps)
         turn = torch.nn.functional.pad(2.0 * (half.asin() - np.arcsin(0.5 * _STRAIGHT)), (1, 0))
         turns = turn.index_fill(1, self._first, 0.0) + self._entry
         rest = (self._rest * c[..., None, :]).sum(-1).norm(dim=-1)

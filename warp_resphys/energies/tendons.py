@@ -204,8 +204,8 @@ class Tendons(Energy):
                 far = f"{1e3 * places.outside[worst]:.3g} mm" if np.isfinite(places.outside[worst]) else "far"
                 raise InputError(
                     f"guide {worst + 1} of tendon {number + 1}, at {route[worst].tolist()} m, lies "
-                    f"{far} outside of the body: move it, raise the reach of "
-                    f"{1e3 * self.reach:g} mm, or name it among the fixed guides if it stays in the world."
+                    f"{far} outside of the body: move it, raise the reach of {1e3 * self.reach:g} mm, or name it among "
+                    "the fixed guides if it stays in the world."
                 )
             weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): position, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))
@@ -374,8 +374,8 @@ class TendonTerm(PartTerm):
             past = shorter @ self._beyond  # (B, P) of the tendon beyond each guide
             by_length = -self._friction[..., 2] * past
             by_offsets = [
-                sum_ - self.sum_parts((by_length @ self._beyond.mT) * taut)
-                for sum_, taut in zip(by_offsets, longer.unbind(-1), strict=True)
+                total - self.sum_parts((by_length @ self._beyond.mT) * taut)
+                for total, taut in zip(by_offsets, longer.unbind(-1), strict=True)
             ]
             by_friction = self._friction_slopes(values, past)
             slopes = (by_tension, by_contraction, by_stiffness, *by_offsets, *by_friction, by_length)

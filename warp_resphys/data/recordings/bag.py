@@ -1,7 +1,8 @@
 """Recordings in ROS 1 and 2 bags and MCAP files, read without ROS by the package rosbags.
 
-Every topic has messages at its own times. Markers and inputs are brought to common frames: markers by linear
-interpolation, rotations by the shortest turn, and inputs keep their last value.
+Every topic has messages at its own times: those of its headers or, without headers, those at which it was recorded, on
+the clock of the headers. Markers and inputs are brought to common frames: markers by linear interpolation, rotations by
+the shortest turn, and inputs keep their last value.
 """
 
 import re
@@ -59,12 +60,14 @@ class _Source:
 class _Series:
     """What the messages of a source hold."""
 
-    times: list[float] = field(default_factory=list)  # s
+    stamps: list[float] = field(default_factory=list)  # s, NaN without a header
+    received: list[float] = field(default_factory=list)  # s
     values: list[Sequence[float]] = field(default_factory=list)
 
-    def sorted(self) -> tuple[FloatArray, FloatArray]:
-        """Times (n,) that grow, and values (n, ...)."""
-        times, first = np.unique(np.array(self.times), return_index=True)
+    def sorted(self, late: float) -> tuple[FloatArray, FloatArray]:
+        """Times (n,) [s] that grow, and values (n, ...); ``late`` is the clock of the bag less that of the headers."""
+        stamps, received = np.array(self.stamps), np.array(self.received)
+        times, first = np.unique(np.where(np.isfinite(stamps), stamps, received - late), return_index=True)
         return times, np.array(self.values, dtype=np.float64)[first]
 
 
@@ -94,16 +97,19 @@ def read_raw_bag(path: Path, bag: Bag) -> RawRecording:
     for kind, message, received, topic in _messages(path, {source.topic for source, _ in series}):
         for (source, read), own in series.items():
             if source.topic == topic and (value := read(kind, message, source, path)) is not None:
-                own.times.append(_time_of(message, source, received))
+                own.stamps.append(_stamp_of(message, source))
+                own.received.append(1e-9 * received)
                 own.values.append(value)
     for (source, _), own in series.items():
-        if not own.times:
+        if not own.values:
             named = "" if source.member is None else f" of {source.member}"
             raise DataFileError(f"{path}: {source.topic} has no message{named}; check what was recorded.")
-    poses = {source: series[source, _pose].sorted() for source in posed}
+    clocks = np.concatenate([np.subtract(own.received, own.stamps) for own in series.values()])
+    late = float(np.nanmedian(clocks)) if np.isfinite(clocks).any() else 0.0
+    poses = {source: series[source, _pose].sorted(late) for source in posed}
     times, rate = _frames(path, [poses[source][0] for source in markers.values()], bag.rate)
     moved = np.stack([_at_frames(*poses[source], times, rate) for source in markers.values()], 1)
-    held = [_held(*series[source, _number].sorted(), times) for source in inputs]
+    held = [_held(*series[source, _number].sorted(late), times) for source in inputs]
     return RawRecording(
         moved[..., :3],
         [*markers],
@@ -169,13 +175,13 @@ def _opened(path: Path) -> Iterator[Any]:
         raise DataFileError(f"{path} is damaged, or no bag ({what}); record it again.") from error
 
 
-def _time_of(message: Any, source: _Source, received: int) -> float:
-    """Time of a message [s]: that of its header, or else that at which it was recorded."""
+def _stamp_of(message: Any, source: _Source) -> float:
+    """Time of a message [s] by its header, NaN without one."""
     if hasattr(message, "transforms"):
         message = next((own for own in message.transforms if own.child_frame_id == source.member), message)
     header = getattr(message, "header", None)
     stamp = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
-    return float(stamp or 1e-9 * received)
+    return float(stamp or np.nan)
 
 
 def _pose(kind: str, message: Any, source: _Source, path: Path) -> Sequence[float] | None:

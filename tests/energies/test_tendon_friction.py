@@ -285,7 +285,7 @@ def test_fixed_guides_are_checked():
         simulator(CORNERS, fixed_guides=[[4]])
     with pytest.raises(InputError, match="it does not pull on the body"):
         simulator(SHORT, fixed_guides=[[0, 1, 2]])
-    with pytest.raises(InputError, match=r"lies far outside of the body: .* name it among the fixed guides"):
+    with pytest.raises(InputError, match=r"lies 180 mm outside of the body: .* name it among the fixed guides"):
         simulator([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]])
 
 

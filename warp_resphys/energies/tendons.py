@@ -201,11 +201,10 @@ class Tendons(Energy):
             places = locate(mesh, np.where(held[:, None], route[~held][:1], route))  # those in the world have no place
             worst = int(np.argmax(places.outside))
             if places.outside[worst] > self.reach:
-                far = f"{1e3 * places.outside[worst]:.3g} mm" if np.isfinite(places.outside[worst]) else "far"
                 raise InputError(
                     f"guide {worst + 1} of tendon {number + 1}, at {route[worst].tolist()} m, lies "
-                    f"{far} outside of the body: move it, raise the reach of {1e3 * self.reach:g} mm, or name it among "
-                    "the fixed guides if it stays in the world."
+                    f"{1e3 * places.distance[worst]:.3g} mm outside of the body: move it, raise the reach of "
+                    f"{1e3 * self.reach:g} mm, or name it among the fixed guides if it stays in the world."
                 )
             weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): position, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))

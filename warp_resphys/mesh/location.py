@@ -20,6 +20,7 @@ class Location:
     weights: FloatArray  # (P, K) weights of its nodes, with sum one
     gradients: FloatArray  # (P, K, 3) derivatives of the weights by the position of the point [1/m]
     outside: FloatArray  # (P,) distance from the cell [m]; zero inside, infinite where the extrapolation fails
+    distance: FloatArray  # (P,) distance from the cell [m], there too
 
 
 def locate(mesh: Mesh, points: FloatArray) -> Location:
@@ -39,7 +40,7 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
         raise InputError("a point to locate in a mesh is not finite.")
     element, nodes = mesh.element, mesh.vertices[mesh.cells]  # (M, K, 3)
     low, high = nodes.min(axis=1), nodes.max(axis=1)
-    cells, weights, gradients, outside = [], [], [], []
+    cells, weights, gradients, outside, away = [], [], [], [], []
     for point in points:
         distance = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
         limit = np.partition(distance, min(_CANDIDATES, len(distance)) - 1)[min(_CANDIDATES, len(distance)) - 1]
@@ -54,8 +55,9 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
         gradients.append(slopes @ np.linalg.pinv(nodes[near[best]].T @ slopes))
         error = float(np.linalg.norm(weights[-1] @ nodes[near[best]] - point))
         size = float(np.linalg.norm(high[near[best]] - low[near[best]]))
+        away.append(distances[best])
         outside.append(np.inf if error > 1e-6 * size else distances[best] if distances[best] > 1e-9 * size else 0.0)
-    return Location(np.array(cells), np.array(weights), np.array(gradients), np.array(outside))
+    return Location(*map(np.array, (cells, weights, gradients, outside, away)))
 
 
 def _reference_coordinates(element: Element, nodes: Array, point: Array) -> Array:

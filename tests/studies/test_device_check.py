@@ -19,7 +19,7 @@ def test_the_cpu_passes(folder):
     (page,) = (folder / "pages").glob("*-check-cpu.md")
     text = page.read_text()
     assert "all passed" in text
-    assert "Robots' steps/s" in text
+    assert "| Plain | Forward | Backward | / yardstick | Steps/s |" in text
     assert (folder / "check" / "check.html").is_file()
 
 

@@ -1,5 +1,6 @@
 # The public names of the package. Type checkers read this file; `__init__.py` imports a name when it is first used.
 from .data.camera import CameraMarkers as CameraMarkers
+from .data.camera import Lens as Lens
 from .data.markers import Markers as Markers
 from .data.markers import bind_markers as bind_markers
 from .data.observation import Observation as Observation

@@ -6,7 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
-from warp_resphys.data.camera import CameraMarkers
+from warp_resphys.data.camera import CameraMarkers, Lens
+from warp_resphys.io.errors import DataFileError, InputError
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 TIP = wr.select_vertices(MESH, x=0.1)
@@ -88,3 +89,79 @@ def test_bad_input_is_named():
         CameraMarkers(MARKERS, torch.eye(3))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
         wr.ObservedMotion(torch.zeros(3, 1, 3, 3), observation=camera())
+
+
+OPENCV = """%YAML:1.0
+---
+calibration_time: "Thu Nov 26 2026"
+image_width: 640
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 900., 0., 320., 0., 910., 240., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 1.0000000000000001e-01, -2.0e-01, 1.0e-03, -2.0e-03,
+       3.0e-01 ]
+avg_reprojection_error: 3.2e-01
+"""
+
+
+def test_a_lens_is_read_and_distorts_as_opencv_does(tmp_path):
+    (tmp_path / "camera.yaml").write_text(OPENCV)
+    lens = Lens.read(tmp_path / "camera.yaml")
+    points = torch.tensor([[0.1, -0.2, 1.0], [0.3, 0.4, 2.0], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    x, y = (points[:, :2] / points[:, 2:]).T.numpy()
+    square = x**2 + y**2
+    radial = 1.0 + 0.1 * square - 0.2 * square**2 + 0.3 * square**3
+    moved_x = x * radial + 2e-3 * x * y - 2e-3 * (square + 2.0 * x**2)
+    moved_y = y * radial + 1e-3 * (square + 2.0 * y**2) - 4e-3 * x * y
+    expected = np.column_stack([900.0 * moved_x + 320.0, 910.0 * moved_y + 240.0])
+    np.testing.assert_allclose(lens.pixels(points), expected, rtol=1e-12)
+    rational = Lens(lens.matrix, torch.tensor([0.1, -0.2, 1e-3, -2e-3, 0.3, 0.5, 0.0, 0.0], dtype=torch.float64))
+    grown = (
+        rational.pixels(points)[0]
+        - Lens(lens.matrix, torch.tensor([0.0, 0.0, 1e-3, -2e-3], dtype=torch.float64)).pixels(points)[0]
+    )
+    share = (radial / (1.0 + 0.5 * square) - 1.0)[0]
+    np.testing.assert_allclose(grown, share * np.array([900.0 * x[0], 910.0 * y[0]]), rtol=1e-9)
+
+
+def test_a_camera_with_a_straight_lens_is_the_pinhole():
+    intrinsic = torch.tensor([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    pose, at = torch.as_tensor(np.column_stack([TURN, SHIFT])), torch.as_tensor(MESH.vertices)[None]
+    for distortion in (None, torch.zeros(5, dtype=torch.float64)):
+        torch.testing.assert_close(CameraMarkers(MARKERS, pose, Lens(intrinsic, distortion))(at), camera()(at))
+    bent = CameraMarkers(MARKERS, pose, Lens(intrinsic, torch.tensor([0.3, 0.1, 2e-3, 1e-3, 0.0], dtype=torch.float64)))
+    way = torch.as_tensor(np.random.default_rng(1).normal(size=at.shape))
+    numeric = (bent(at + 1e-6 * way) - bent(at - 1e-6 * way)).flatten() / 2e-6
+    torch.testing.assert_close(bent.transposed_jacobian(at)[0].T @ way.flatten(), numeric, rtol=1e-7, atol=1e-5)
+
+
+def test_a_calibration_of_ros_is_read(tmp_path):
+    matrix, distortion = "{rows: 3, cols: 3, data: [1, 0, 2, 0, 3, 4, 0, 0, 1]}", "{data: [0.1, 0, 0, 0]}"
+    (tmp_path / "info.yaml").write_text(f"camera_matrix: {matrix}\ndistortion_coefficients: {distortion}\n")
+    lens = Lens.read(tmp_path / "info.yaml")
+    assert lens.matrix.tolist() == [[1.0, 0.0, 2.0], [0.0, 3.0, 4.0], [0.0, 0.0, 1.0]]
+    assert lens.distortion.tolist() == [0.1, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("a: 1", DataFileError, "has no camera_matrix of nine numbers"),
+        ("camera_matrix: [1, 2]", DataFileError, "has no camera_matrix of nine numbers"),
+        ("camera_matrix: {data: [a]}", DataFileError, "give its numbers"),
+        ("[", DataFileError, "is no YAML"),
+        ("camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]", InputError, "give k1, k2, p1, p2"),
+    ],
+)
+def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(error, match=words):
+        Lens.read(tmp_path / "camera.yaml")
+    with pytest.raises(DataFileError, match="Cannot read"):
+        Lens.read(tmp_path / "none.yaml")

@@ -68,7 +68,7 @@ class Tendons(Energy):
     directions: Sequence[Sequence[ArrayLike]] = ()
     fixed_guides: Sequence[Sequence[int]] = ()  # numbers of the guides of each tendon, from 0, that stay in the world
     friction: Parameter | None = None  # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
-    bristle_length: Parameter = 1e-4  # slide over which friction turns [m]
+    bristle_length: Parameter = 1e-4  # slide over which friction reverses [m]
     entry_angle: ArrayLike = 0.0  # of contact before the first guide, such as around pulleys: one, or (T,) [rad]
 
     def __post_init__(self) -> None:

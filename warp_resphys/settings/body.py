@@ -141,7 +141,7 @@ class TendonSettings(Settings):
     friction: NotNegative | None = setting(
         None, "coefficient in the guides, by the angle of contact (`tendon_friction`); null: none"
     )
-    bristle_length: Positive = setting(1.0e-4, "slide over which friction turns", "m")
+    bristle_length: Positive = setting(1.0e-4, "slide over which friction reverses", "m")
 
     @model_validator(mode="after")
     def _pulls(self) -> Self:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.base_motion import since_first
 from warp_resphys.data.recordings.bag import Bag
 from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.text import Table
 from warp_resphys.io.errors import DataFileError, InputError
 
 RATE, FRAMES = 50.0, 41
@@ -135,6 +136,31 @@ def test_a_gap_is_not_bridged(tmp_path):
     single = read_recording(written(tmp_path / "other", left_out=[10]), bag=Bag({"tip": "/mocap/tip"}))
     assert single.seen.all()
     np.testing.assert_allclose(single.positions[:, 0], place(0, TIMES), atol=4e-5)
+
+
+def test_a_rigid_body_that_is_lost_is_not_seen(monkeypatch, tmp_path):
+    """Its messages go on, with a quaternion of zeros, or a place of NaN."""
+    whole = Messages.transforms
+
+    def lost(self, time, at, rotation, child):
+        message = whole(self, time, at, rotation, child)
+        frame = round(time * RATE - 0.3)
+        if frame in range(10, 15):
+            message.transforms[0].transform.rotation.__dict__.update(x=0.0, y=0.0, z=0.0, w=0.0)
+        if frame in range(20, 25):
+            message.transforms[0].transform.translation.__dict__.update(x=float("nan"))
+        return message
+
+    monkeypatch.setattr(Messages, "transforms", lost)
+    read = read_recording(written(tmp_path / "trial"), bag=Bag({"plate": "/tf#plate"}))
+    assert read.labels == ("plate", "plate +x", "plate +y", "plate +z")
+    for column in range(4):
+        np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, column]), [*range(10, 15), *range(20, 25)])
+
+
+def test_a_table_does_not_describe_a_bag(tmp_path):
+    with pytest.raises(DataFileError, match="is no text"):
+        read_recording(written(tmp_path / "trial"), table=Table(["time [s]"]), bag=Bag(MARKERS))
 
 
 def test_another_rate_may_be_given(tmp_path):

@@ -42,6 +42,11 @@ PAYLOAD = Quantity(
 )
 
 
+def thread_pull(elongation: torch.Tensor, toe: float) -> torch.Tensor:
+    """Returns the force of a thread of stiffness one [m], as the kernels have it (`kernels.laws.thread.pull`)."""
+    return torch.where(elongation > toe, elongation - 0.5 * toe, 0.5 * elongation.clamp_min(0.0) ** 2 / toe)
+
+
 @dataclass(frozen=True)
 class Strings(Energy):
     """Weights on strings.
@@ -211,7 +216,7 @@ class BoundStrings(BoundEnergy):
         line, toe = tied - free, self._strings.toe
         distance = line.norm(dim=-1)
         excess = distance - constants.value("string_length")
-        pull = torch.where(excess > toe, excess - 0.5 * toe, 0.5 * excess.clamp_min(0.0) ** 2 / toe)
+        pull = thread_pull(excess, toe)
         compliance = constants.value("string_compliance")
         share = pull / (1.0 + compliance * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
         return free + share[..., None] * line

@@ -36,6 +36,7 @@ from ..kernels.modules import launch_stream
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import BLOCK, warp_view
+from .strings import thread_pull
 from .tendon_routes import OFFSETS, TendonPoints, offset_vector
 
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
@@ -109,10 +110,7 @@ class BoundTendons(BoundEnergy):
 
     def _spring(self, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Returns the tensions (B, T) of the springs [N]."""
-        toe, excess = self._toe, geometry.longer + values["tendon_contraction"]
-        return values["tendon_stiffness"] * torch.where(
-            excess > toe, excess - 0.5 * toe, 0.5 * excess.clamp_min(0.0) ** 2 / toe
-        )
+        return values["tendon_stiffness"] * thread_pull(geometry.longer + values["tendon_contraction"], self._toe)
 
     def _slack(self, tension: torch.Tensor, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Returns the tensions (B, P) of segments that have been pulled from slack by (B, T) [N]."""

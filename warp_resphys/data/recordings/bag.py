@@ -58,7 +58,7 @@ class _Source:
 
 @dataclass
 class _Series:
-    """What the messages of a source hold."""
+    """Times and values of the messages of a source."""
 
     stamps: list[float] = field(default_factory=list)  # s, NaN without a header
     received: list[float] = field(default_factory=list)  # s
@@ -168,7 +168,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield reader
-    except (ResphysError, GeneratorExit):
+    except ResphysError:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
@@ -293,15 +293,22 @@ def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tupl
 
 
 def _at_frames(times: FloatArray, poses: FloatArray, frames: FloatArray, rate: float) -> FloatArray:
-    """Poses (T, 7) at the frames, NaN in gaps and where they were not seen."""
+    """Poses (T, 7) at the frames, NaN in gaps.
+
+    A rigid body was not seen in a message whose quaternion is zero or NaN, nor any marker in one without its place.
+    """
     result = np.full((len(frames), 7), np.nan)
+    turned = np.isfinite(poses[:, 3:]).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.0)
+    seen = np.isfinite(poses[:, :3]).all(1) & (turned | (not turned.any()))
+    if not seen.any():
+        return result
+    times, poses = times[seen], poses[seen]
     after = np.clip(np.searchsorted(times, frames), 1, len(times) - 1) if len(times) > 1 else np.zeros(len(frames), int)
     gap = times[after] - times[after - 1] if len(times) > 1 else np.full(len(frames), np.inf)
     known = (gap <= _GAP / rate) | np.isin(frames, times)
     for column in range(3):
         result[known, column] = np.interp(frames[known], times, poses[:, column])
-    turned = np.isfinite(poses[:, 3:]).all(1) & (np.linalg.norm(poses[:, 3:], axis=1) > 0.0)
-    if turned.all() and len(times) > 1:
+    if turned.any() and len(times) > 1:
         turn = Slerp(times, Rotation.from_quat(poses[:, [4, 5, 6, 3]]))
         result[known, 3:] = turn(np.clip(frames[known], times[0], times[-1])).as_quat()[:, [3, 0, 1, 2]]
     return result

@@ -45,19 +45,17 @@ def read_recording(
         InputError: An argument is invalid.
     """
     path = Path(path)
-    if is_bag(path):
-        if bag is None:
-            raise InputError(
-                f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has {topics_of(path)}."
-            )
-        return to_recording(read_raw_bag(path, bag), path, units, bag.rate or rate, labels)
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
+    reader = None if is_bag(path) else READERS.get(path.suffix.lower())
+    if reader is None and not is_bag(path):
         raise DataFileError(
             f"{path} is no recording that can be read: give a file that ends in {', '.join((*READERS, *SUFFIXES))}, as "
             "docs/recordings.md has them."
         )
     if table is not None and reader is not read_raw_text:
         raise DataFileError(f"{path} is no text, so that data.table cannot tell what its columns are: leave that out.")
-    raw = reader(path) if table is None else read_raw_text(path, table)
-    return to_recording(raw, path, units, rate, labels)
+    if reader is not None:
+        raw = reader(path) if table is None else read_raw_text(path, table)
+        return to_recording(raw, path, units, rate, labels)
+    if bag is None:
+        raise InputError(f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has {topics_of(path)}.")
+    return to_recording(read_raw_bag(path, bag), path, units, bag.rate or rate, labels)

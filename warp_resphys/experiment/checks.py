@@ -56,7 +56,8 @@ def check_run(run: RunSettings) -> None:
     """
     _check_memory(run)
     body = build_body(run, run.payload_at)
-    select_vertices(body.mesh, **run.tip.arguments())
+    if run.tip is not None:
+        select_vertices(body.mesh, **run.tip.arguments())
     simulator = build_simulator(run, run.simulation, body)
     for material in simulator.materials.values():
         check_size(body, material, run.gravity)
@@ -204,6 +205,10 @@ def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
             "refinement knows one placement of the markers, and trials name sessions: set refinement=none."
         )
     for name, limits in identify.parameters.items():
+        if limits.per == "material":
+            raise InputError(
+                f"identify.parameters.{name}.per is material, which is for data.kind pictures: leave it out."
+            )
         if limits.per == "session" and not named:
             raise InputError(
                 f"identify.parameters.{name}.per is session, but no trial names one: set data.trials.NAME.session."

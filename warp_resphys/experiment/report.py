@@ -87,7 +87,7 @@ def make_report(context: StageContext) -> None:
     no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
         **_common_parts(run, metrics, body),
-        tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
+        tip=no_vertices if trials.labels or run.tip is None else select_vertices(mesh, **run.tip.arguments()),
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
         trials=trials,

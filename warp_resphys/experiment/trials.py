@@ -59,7 +59,7 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
     Raises:
         DataFileError: the folder of recordings does not exist or has no recordings.
     """
-    data = run.data
+    data = run.trial_data
     if not isinstance(data, RecordedData):
         variation = VARIATIONS[data.kind]
         values = (*data.amounts.train, *data.amounts.validation, *data.amounts.test)
@@ -127,7 +127,7 @@ def split_of(run: RunSettings) -> Split:
         InputError: an unknown trial, a trial in two splits, too few trials, or an empty training or test split.
         DataFileError: see `all_trials`.
     """
-    data = run.data
+    data = run.trial_data
     lists = _named(run) if isinstance(data, RecordedData) else _valued(data)
     if data.limit is not None:
         lists = {name: evenly(row, getattr(data.limit, name)) if row else [] for name, row in lists.items()}
@@ -214,7 +214,7 @@ def folds_of(run: RunSettings) -> dict[str, Split] | None:
     Raises:
         InputError: fewer than two trials.
     """
-    data = run.data
+    data = run.trial_data
     if data.folds is None or (isinstance(data, RecordedData) and _splits(run)[0] == "laboratory"):
         return None
     names = list(all_trials(run))

@@ -16,8 +16,9 @@ import torch
 
 from ..io.errors import ConvergenceError
 from ..linalg.least_squares import UnitBox, minimise
+from .bounded_misfit import BoundedMisfit, FloatArray
 from .bounds import Bounds
-from .misfit import FloatArray, Misfit
+from .misfit import Misfit
 from .placement import Accuracy
 from .replay import Replay, Start
 from .uncertainty import Uncertainty
@@ -41,37 +42,16 @@ class Identification:
     uncertainty: Uncertainty | None = None  # None if the simulation fails beside the minimum
 
 
-class Identifier:
-    """Searches for the parameters with the smallest misfit.
+class ParameterSearch:
+    """A search for the parameters with the smallest misfit.
 
     Args:
-        replays: groups of trials that begin alike, such as motions or static poses, with their starts; all with one
-            simulator.
-        bounds: range of each parameter to identify.
-        seconds: length of each motion that is compared [s]; the whole motion if None.
-        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        labels: names of the markers, where `accuracy` is given.
-        centre: (3,) about which recordings may be rotated [m].
-        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
-        delay: standard deviation of the delay of motions that their inputs begin, fitted to each [s]; zero for none.
-
-    Raises:
-        InputError: an unknown parameter, or none; or a motion in which nothing moves.
+        misfit: of the parameters.
+        labels: names of the markers, where their places are uncertain.
     """
 
-    def __init__(
-        self,
-        replays: Sequence[tuple[Replay, Start]],
-        bounds: Mapping[str, Bounds],
-        seconds: float | None = None,
-        accuracy: Accuracy | None = None,
-        labels: Sequence[str] = (),
-        centre: Sequence[float] = (0.0, 0.0, 0.0),
-        known: Mapping[str, float] | None = None,
-        delay: float = 0.0,
-    ) -> None:
-        self._misfit = Misfit(replays, bounds, seconds, accuracy, centre, known, delay)
-        self._labels = tuple(labels)
+    def __init__(self, misfit: BoundedMisfit, labels: Sequence[str] = ()) -> None:
+        self._misfit, self._labels = misfit, tuple(labels)
 
     @property
     def bounds(self) -> dict[str, Bounds]:
@@ -172,13 +152,12 @@ class Identifier:
         unit = misfit.to_unit(best["parameters"])
         misfit.prior_weight = best.get("prior_weight", 0.0)
         misfit.forget()  # As in a resumed run, in which all attempts are finished.
-        placed = misfit.placed(unit)
         return Identification(
             parameters=best["parameters"],
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
             at_bounds=tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4),
-            placement=None if placed is None else placed.plain(self._labels),
+            placement=misfit.placement(unit, self._labels),
             uncertainty=misfit.uncertainty(unit),
         )
 
@@ -218,3 +197,35 @@ class Identifier:
             "history": history,
             "prior_weight": misfit.prior_weight,
         }
+
+
+class Identifier(ParameterSearch):
+    """Searches for the parameters with which simulated motions come closest to observed ones.
+
+    Args:
+        replays: groups of trials that begin alike, such as motions or static poses, with their starts; all with one
+            simulator.
+        bounds: range of each parameter to identify.
+        seconds: length of each motion that is compared [s]; the whole motion if None.
+        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
+        labels: names of the markers, where `accuracy` is given.
+        centre: (3,) about which recordings may be rotated [m].
+        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
+        delay: standard deviation of the delay of motions that their inputs begin, fitted to each [s]; zero for none.
+
+    Raises:
+        InputError: an unknown parameter, or none; or a motion in which nothing moves.
+    """
+
+    def __init__(
+        self,
+        replays: Sequence[tuple[Replay, Start]],
+        bounds: Mapping[str, Bounds],
+        seconds: float | None = None,
+        accuracy: Accuracy | None = None,
+        labels: Sequence[str] = (),
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        known: Mapping[str, float] | None = None,
+        delay: float = 0.0,
+    ) -> None:
+        super().__init__(Misfit(replays, bounds, seconds, accuracy, centre, known, delay), labels)

@@ -1,11 +1,7 @@
 """The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. Parameters are fractions of their ranges, "units" from 0 to 1.
-
-Prior knowledge, normal distributions of parameters (`Prior`) and of marker places (`placement`), adds its squares,
-weighted as much as one independent residual of the data: by their mean square, times the number of frames that are
-correlated. That weight is computed at the start of a search and again at the minimum.
+all motions at once. Prior knowledge (`bounded_misfit`) is that of the parameters and of marker places (`placement`).
 
 A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
@@ -14,29 +10,28 @@ mean of the prior. A trial depends on its own value alone, so that one motion gi
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
+from .bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
 from .bounds import Bounds
 from .nuisance import NuisanceFit
 from .parameters import check_names, split_name
 from .placement import Accuracy, DisplacedMarkers, Placed
 from .replay import Replay, Start
-from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
+from .uncertainty import Linearised
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
-_LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
-
-FloatArray = NDArray[np.float64]
 
 
-class Misfit:
+class Misfit(BoundedMisfit):
     """Loss, residuals and their derivatives.
 
     Args:
@@ -51,8 +46,6 @@ class Misfit:
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
-        bounds: see above.
-        prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
@@ -72,13 +65,13 @@ class Misfit:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
         first = replays[0][0]
         check_names(bounds, first.parameter_names)
-        simulator, self.bounds = first.simulator, dict(bounds)
+        super().__init__(bounds)
+        simulator = first.simulator
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
-        self.prior_weight, self._known = 0.0, {} if known is None else dict(known)
+        self._known = {} if known is None else dict(known)
         self._accuracy = accuracy
-        self._priors = [range_.unit_prior() for range_ in self.bounds.values()]
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
         count = sum(len(replay.trials.names) for replay, _ in replays)
@@ -105,21 +98,10 @@ class Misfit:
         shift = None if start.shift is None else start.shift.repeat(1, displaced.copies, 1)
         return Replay(self.simulator, displaced, trials), replace(start, shift=shift)
 
+    @override
     def forget(self) -> None:
         """Forgets the equilibria of earlier parameters, from which the next equilibria are predicted."""
         self._equilibria: list[_Equilibria | None] = [None] * len(self._replays)
-
-    def to_unit(self, values: Mapping[str, float]) -> FloatArray:
-        """(P,) values as fractions of their ranges, clipped to the bounds."""
-        clipped = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
-        return np.array([b.to_unit(value) for b, value in clipped])
-
-    def from_unit(self, unit: Sequence[float] | FloatArray) -> dict[str, float]:
-        """Values of the parameters at (P,) fractions of their ranges."""
-        return {
-            name: float(range_.from_unit(torch.tensor(float(u), dtype=torch.float64)))
-            for (name, range_), u in zip(self.bounds.items(), unit, strict=True)
-        }
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, differentiable."""
@@ -129,6 +111,7 @@ class Misfit:
         ]
         return torch.stack(weighted).sum(0) + prior.square().sum(1)
 
+    @override
     def losses_or_infinite(self, points: FloatArray) -> FloatArray:
         """(E,) losses of (E, P) parameters, without gradients; infinite where the simulation fails.
 
@@ -144,7 +127,8 @@ class Misfit:
                 left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
         return losses
 
-    def linearise(self, unit: FloatArray, derivatives: bool = True) -> "LinearMisfit | None":
+    @override
+    def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
         """Linearises the residuals at (P,) parameters; None where the simulation fails.
 
         Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into the range.
@@ -177,7 +161,7 @@ class Misfit:
             columns.append(slopes)
         jacobians, nuisance_slopes = nuisances.projected(columns, math.sqrt(self.prior_weight))
         trials = [(rows, own, seen) for (rows, _, seen), own in zip(trials, jacobians, strict=True)]
-        prior, slopes = self._prior_rows(unit)
+        prior, slopes = self.prior_rows(unit)
         return LinearMisfit(trials, np.concatenate([prior, nuisances.rows]), np.concatenate([slopes, nuisance_slopes]))
 
     def _slopes(
@@ -192,34 +176,15 @@ class Misfit:
                 slopes[mine, :, column] = own[mine] / steps[column]
         return slopes
 
-    def _prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(K,) weighted residuals of the priors of parameters, and their derivatives (K, P)."""
-        known = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
-        rows, slopes, weight = np.zeros(len(known)), np.zeros((len(known), len(unit))), math.sqrt(self.prior_weight)
-        for row, (i, mean, deviation) in enumerate(known):
-            rows[row], slopes[row, i] = weight * (unit[i] - mean) / deviation, weight / deviation
-        return rows, slopes
+    @property
+    @override
+    def has_priors(self) -> bool:
+        return super().has_priors or not self._fit.is_empty
 
-    def update_prior_weight(self, unit: FloatArray) -> float:
-        """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
-        before = self.prior_weight
-        if self._fit.is_empty and not any(self._priors):
-            return 1.0
-        linearised = self.linearise(unit, derivatives=False)
-        if linearised is None:
-            return 1.0
-        trials = linearised.trials
-        seen = sum(count for *_, count in trials)
-        squares = [np.square(rows).sum() * redundancy(rows) for rows, _, _ in trials]
-        self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
-        return self.prior_weight / before if before else math.inf
-
-    def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
-        """Uncertainty of (P,) parameters; None if a simulation close by fails."""
-        found = self.linearise(unit)
-        if found is None:
-            return None
-        return uncertainty_of(found.trials, found.prior_slopes, self.prior_weight, self.bounds, unit)
+    @override
+    def placement(self, unit: FloatArray, labels: Sequence[str]) -> dict[str, Any] | None:
+        placed = self.placed(unit)
+        return None if placed is None else placed.plain(labels)
 
     def placed(self, unit: FloatArray) -> Placed | None:
         """The best placements of the markers with (P,) parameters; None where they are exact."""
@@ -235,8 +200,7 @@ class Misfit:
         """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
         series = self._simulated(unit)
         weight = math.sqrt(self.prior_weight)
-        priors = [(i, *prior) for i, prior in enumerate(self._priors) if prior is not None]
-        columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in priors]
+        columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in self._priors]
         rows = torch.stack(columns, 1) if columns else unit.new_zeros(len(unit), 0)
         fitted, nuisance_rows = [], []
         for row in range(len(unit)):
@@ -300,32 +264,6 @@ def _moves_of(names: Iterable[str]) -> list[list[int]]:
         parameter, owner = split_name(name)
         moves.setdefault(parameter if owner else name, []).append(number)
     return [*moves.values()]
-
-
-@dataclass(frozen=True)
-class LinearMisfit:
-    """Weighted residuals at some parameters and their derivatives, whose squares sum to the loss."""
-
-    trials: list[Linearised]
-    prior: FloatArray  # (K,) weighted residuals of the priors
-    prior_slopes: FloatArray  # (K, P)
-
-    @property
-    def loss(self) -> float:
-        """Sum of the squares."""
-        return float(sum(np.square(rows).sum() for rows, _, _ in self.trials) + np.square(self.prior).sum())
-
-    @property
-    def gradient(self) -> FloatArray:
-        """(P,) gradient of the loss."""
-        parts = [jacobian.T @ rows.ravel() for rows, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
-
-    @property
-    def gauss_newton(self) -> FloatArray:
-        """(P, P) Gauss-Newton matrix of the loss."""
-        parts = [jacobian.T @ jacobian for _, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,16 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
     "tendon_friction": ("Friction of the tendons", "", 1.0),
     "tendon_bristle_length": ("Bristle length of the tendons", "mm", 1e3),
+    "clamp_turn": ("Turn of the second clamp", "°", 180.0 / np.pi),
+    "clamp_shift": ("Shift of the second clamp", "mm", 1e3),
+    "focal_factor": ("Factor of the focal length", "", 1.0),
+    **{f"camera_shift_{axis}": (f"Shift before the camera along {'xyz'[axis - 1]}", "mm", 1e3) for axis in (1, 2, 3)},
+    **{
+        f"camera_turn_{axis}": (f"Turn before the camera about {'xyz'[axis - 1]}", "°", 180.0 / np.pi)
+        for axis in (1, 2, 3)
+    },
+    "principal_point_1": ("Principal point, to the right", "px", 1.0),
+    "principal_point_2": ("Principal point, downwards", "px", 1.0),
 }
 _MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Parameters that regions may have.
 _COMMANDS: Final[Mapping[str, Wording]] = {
@@ -134,7 +144,9 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
     deviations = (identified.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in identified["parameters"].items():
-        words, unit, factor = parameter_wording(parameter)
+        whole, owner = split_name(parameter)
+        words, unit, factor = parameter_wording(whole)
+        words += f", {owner}" * bool(owner)
         deviation = deviations.get(parameter)
         beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
         cells = [Cell(digits(start.get(parameter), factor)), Cell(digits(value, factor, deviation), beside=beside)]

@@ -14,7 +14,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
 from ..experiment.experiment import LEARNED, Experiment
-from ..experiment.files import ERRORS, fold_folder, read_if_there
+from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
@@ -190,6 +190,8 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
     Raises:
         DataFileError: the run is missing, unfinished or changed, or it is a cross-validation.
     """
+    if (folder / "stages" / f"{COMPARE}.json").is_file():
+        raise DataFileError(f"{folder} has pictures of bodies at rest, which have no motion: name a run with trials.")
     if not (folder / "stages" / f"{_EVALUATE}.json").is_file():
         records = folder.glob(f"{fold_folder('*')}/stages/{_EVALUATE}.json")
         folds = sorted(str(record.parent.parent) for record in records)

@@ -38,14 +38,15 @@ class RangeSettings(SpanSettings):
     """The search range of a parameter."""
 
     prior: PriorSettings | None = setting(None, "prior knowledge")
-    per: Literal["all", "session", "trial"] = setting(
+    per: Literal["all", "session", "trial", "material"] = setting(
         "all",
-        "trials that share a value; session, trial: a value of each, near the mean of the prior, that of all others",
+        "trials that share a value; session, trial: a value of each, near the mean of the prior, that of all others; "
+        "material: of pictures, a value of each material",
     )
 
     @model_validator(mode="after")
     def _is_held(self) -> Self:
-        if self.per != "all" and self.prior is None:
+        if self.per in ("session", "trial") and self.prior is None:
             raise ValueError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
         return self
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from ..io.errors import InputError
 from ..io.settings import Natural, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
@@ -27,20 +28,28 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import PlaceSettings
+from .pictures import PictureData
 from .shapes import ShapeSettings
 from .trials import (
     BindingSettings,
-    DataSettings,
     LaboratorySettings,
     MarkerSettings,
     MotionSettings,
+    MovingBase,
     RecordedData,
     ReleaseFromLoad,
+    ReleaseFromTwist,
+    SimulatedData,
 )
 
 Name = Annotated[
     str,
     Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"}),
+]
+
+
+DataSettings = Annotated[
+    RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase | PictureData, Field(discriminator="kind")
 ]
 
 
@@ -78,7 +87,7 @@ class RunSettings(SimulatorSettings):
     seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
         0, "of all random numbers"
     )
-    tip: PlaceSettings = setting(description="vertices whose mean motion is reported, where there are no markers")
+    tip: PlaceSettings | None = setting(None, "vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
     target: TargetSettings | None = setting(None, "plays the real body where data are simulated")
     data: DataSettings
@@ -130,6 +139,22 @@ class RunSettings(SimulatorSettings):
     def recorded(self) -> RecordedData | None:
         """Data of bodies that are observed through markers; None where every vertex is observed."""
         return self.data if isinstance(self.data, RecordedData) else None
+
+    @property
+    def pictures(self) -> PictureData | None:
+        """Data of bodies at rest that cameras see; None for others."""
+        return self.data.limited() if isinstance(self.data, PictureData) else None
+
+    @property
+    def trial_data(self) -> RecordedData | SimulatedData:
+        """Data of trials.
+
+        Raises:
+            InputError: the run has pictures of bodies at rest.
+        """
+        if isinstance(self.data, PictureData):
+            raise InputError("data.kind is pictures: bodies at rest have no trials to show, to track or to learn from.")
+        return self.data
 
     @property
     def is_laboratory(self) -> bool:
@@ -230,6 +255,12 @@ class RunSettings(SimulatorSettings):
             raise ValueError(
                 f"data.kind is {self.data.kind!r}, in which all vertices are observed: leave markers null."
             )
+        if self.pictures is not None:
+            if self.identify is None:
+                raise ValueError("identify is null, but data.kind is pictures: name parameters to identify.")
+            return self
+        if self.tip is None:
+            raise ValueError("tip is null: name the vertices whose mean motion is reported, such as {x: 0.1}.")
         if self.shapes and (self.recorded is not None or (self.identify is None and self.law is None)):
             why = "nothing is identified" if self.recorded is None else "data.kind is recorded"
             raise ValueError(

@@ -22,6 +22,7 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import PlaceSettings
+from .pictures import PictureData
 from .run import PublishedSettings, RunSettings
 from .shapes import ShapeSettings
 from .trials import (
@@ -84,6 +85,21 @@ class ImportStage(SimulationStage):
     data: ReadingSettings
     trials: Many[Trial]
     learned: Many[str] | None  # names of the trials of training and validation; None for a cross-validation
+
+
+class PictureStage(SimulatorSettings):
+    """Pictures of bodies at rest."""
+
+    simulation: MaterialSettings
+    data: PictureData
+    files: dict[str, str]  # SHA-256 of all files that are read, by path
+    seed: int
+
+
+class IdentifyPicturesStage(PictureStage):
+    """Identification of a material from pictures."""
+
+    identify: IdentifySettings
 
 
 class LearningStage(SimulationStage):

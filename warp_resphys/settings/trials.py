@@ -318,12 +318,6 @@ class RecordedData(ReadingSettings):
         return self
 
 
-DataSettings = Annotated[
-    RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase,
-    Field(discriminator="kind"),
-]
-
-
 class BindingSettings(Settings):
     """Positions of markers on the undeformed body, and how they are bound to it."""
 

@@ -119,7 +119,7 @@ def setup_section(reproduction: Reproduction, studies: Mapping[str, Runs]) -> Pa
 
 def _setup(settings: RunSettings) -> dict[str, float]:
     """Parameters of a run that the published tables list."""
-    data = settings.data
+    data = settings.trial_data
     assert not isinstance(data, RecordedData)
     assert settings.target is not None
     constants = {"incorrect": settings.simulation.constants, "correct": settings.target.material.constants}
@@ -209,6 +209,7 @@ def _study_figures(reproduction: Reproduction, name: str, drawn: Mapping[str, Ru
 def _tip_motion(settings: RunSettings, test: TrialResults, paths: Mapping[str, Any]) -> dict[str, Any]:
     """Displacement (T + 1, 3) of the tip [m] of the target and the models."""
     mesh = build_mesh(settings.mesh)
+    assert settings.tip is not None
     tip = select_vertices(mesh, **settings.tip.arguments())
     rest = mesh.vertices[tip].mean(axis=0)
     whole = {"target": test.target[test.worst], **paths}

@@ -1,0 +1,139 @@
+"""Parameters of bodies at rest from simulated pictures: derivatives, Young's modulus, obstacles, and a turned clamp."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import torch
+
+import warp_resphys as wr
+from warp_resphys.data.camera import Lens
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.bounds import Bounds, Prior
+from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.mesh.mesh import boundary_triangles
+from warp_resphys.pictures.camera import PlacedCamera
+from warp_resphys.pictures.misfit import PictureMisfit, values_of
+from warp_resphys.pictures.outlines import ClosedSurface, Outline
+from warp_resphys.pictures.seen import Photo, SeenPose
+
+MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
+LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+LOOKS = torch.tensor(  # from the side: x right, z up
+    [[1.0, 0.0, 0.0, -0.05], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
+)
+CAMERA = PlacedCamera(LENS, LOOKS, torch.tensor([0.0, 0.01, 0.01], dtype=torch.float64))
+POINTS = wr.bind_markers(MESH, [[0.1, 0.0, 0.01], [0.06, 0.0, 0.01], [0.08, 0.0, 0.02]], ["a", "b", "c"])
+SIZE = (240, 320)
+RANGES = {
+    "youngs_modulus": Bounds(3e4, 1e6, True),
+    "camera_shift_1": Bounds(-0.02, 0.02, prior=Prior(0.0, 0.01)),
+    "camera_turn_2": Bounds(-0.2, 0.2, prior=Prior(0.0, 0.05)),
+    "focal_factor": Bounds(0.9, 1.1, prior=Prior(1.0, 0.02)),
+}
+TRUTH = {"youngs_modulus": 1.2e5, "camera_shift_1": 0.003, "camera_turn_2": 0.02, "focal_factor": 1.01}
+FIRST = {"youngs_modulus": 3e5, "camera_shift_1": 0.0, "camera_turn_2": 0.0, "focal_factor": 1.0}
+
+
+def pose(outline=True, tracked=False, name="beam", both_ends=False):
+    ends = (wr.select_vertices(MESH, x=0.0), wr.select_vertices(MESH, x=0.1))[: 1 + both_ends]
+    body = wr.Body(MESH, fixed=np.concatenate(ends))
+    simulator = wr.Simulator(body, wr.Corotated(2e5, 0.45), gravity=(0.0, 0.0, -9.81))
+    surface = ClosedSurface.of(boundary_triangles(MESH))
+    plain = SeenPose(name, simulator, surface, ends, (Photo("0", CAMERA),), points=POINTS)
+    q = plain.shape(TRUTH)
+    corrections = PlacedCamera.corrections(TRUTH)
+    region = surface.region(CAMERA.pixels(q, corrections).numpy())
+    rows, columns = np.indices(SIZE)
+    mask = np.asarray(shapely.contains_xy(region, columns.ravel(), rows.ravel())).reshape(SIZE)
+    pixels = CAMERA.pixels(POINTS(q[None])[0], corrections).numpy()
+    photo = Photo("0", CAMERA, Outline.of_mask(mask) if outline else None, pixels if tracked else None)
+    return replace(plain, photos=(photo,)), mask
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return pose(tracked=True)[0]
+
+
+def test_derivatives_are_those_of_differences(seen):
+    """Of the residuals of tracked points, and of the loss of outlines, whose closest points differ everywhere."""
+    for own, tolerance in ((replace(seen, photos=(replace(seen.photos[0], outline=None),)), 1e-3), (seen, 0.03)):
+        misfit = PictureMisfit([own], RANGES)
+        unit = misfit.to_unit({**FIRST, "youngs_modulus": 1.6e5, "camera_shift_1": 0.001})
+        linear = misfit.linearise(unit)
+        gradient = []
+        for column in range(len(unit)):
+            step = 1e-3 * np.eye(len(unit))[column]
+            ends = [misfit.linearise(unit + by * step, derivatives=False).loss for by in (1.0, -1.0)]
+            gradient.append((ends[0] - ends[1]) / 2e-3)
+        assert linear.gradient == pytest.approx(gradient, rel=tolerance, abs=tolerance * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("kind", ["outline", "points"])
+def test_parameters_come_back(seen, kind):
+    photo = replace(seen.photos[0], **({"tracked": None} if kind == "outline" else {"outline": None}))
+    # Six exact coordinates determine four parameters, without priors.
+    ranges = RANGES if kind == "outline" else {name: replace(range_, prior=None) for name, range_ in RANGES.items()}
+    result = ParameterSearch(PictureMisfit([replace(seen, photos=(photo,))], ranges)).run([FIRST], 40, tolerance=1e-12)
+    limit = 0.1 if kind == "outline" else 1e-3  # a mask has whole pixels
+    assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=limit)
+    assert result.uncertainty.deviation["youngs_modulus"] < 0.2 * TRUTH["youngs_modulus"]
+    own = replace(seen, photos=(photo,))
+    q = own.shape(result.parameters)
+    difference = own.difference(photo, q, result.parameters)
+    assert difference.distance < 0.25
+    undeformed = replace(own, deforms=False)
+    assert undeformed.difference(photo, undeformed.shape({}), {}).distance > 10.0 * difference.distance
+    if kind == "outline":
+        assert difference.overlap > 0.97
+        assert difference.outline_px == pytest.approx(difference.outline_mm * 0.7 / 0.31, rel=0.1)
+
+
+def test_an_obstacle_before_the_body_hardly_matters():
+    """A rod that hides a part of the beam, as wide as the beam is thick."""
+    seen, mask = pose()
+    mask[60:200, 200:222] = False
+    photo = replace(seen.photos[0], outline=Outline.of_mask(mask))
+    result = ParameterSearch(PictureMisfit([replace(seen, photos=(photo,))], RANGES)).run([FIRST], 30)
+    assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.15)
+
+
+def test_values_belong_to_all_to_a_material_or_to_a_pose(seen):
+    own = replace(seen, material="soft")
+    values = {"a": 1.0, "a@soft": 2.0, "a@beam": 3.0, "b": 1.0, "b@soft": 2.0, "c@other": 5.0}
+    assert values_of(own, values) == {"a": 3.0, "b": 2.0}
+    with pytest.raises(InputError, match="nobody is neither a pose nor a material"):
+        PictureMisfit([own], {"youngs_modulus@nobody": RANGES["youngs_modulus"]})
+    with pytest.raises(InputError, match="no parameter 'colour' to identify: choose from"):
+        PictureMisfit([own], {"colour": RANGES["youngs_modulus"]})
+    with pytest.raises(InputError, match="nothing to identify"):
+        PictureMisfit([own], {})
+    misfit = PictureMisfit([own], {"youngs_modulus@soft": RANGES["youngs_modulus"]}, TRUTH)
+    assert misfit.linearise(misfit.to_unit({"youngs_modulus@soft": 1.2e5})).loss < 0.2
+
+
+def test_a_turned_clamp_twists_the_body():
+    """Half of the turn arrives in the middle, whether it is turned at once or from a near shape; an axis keeps."""
+    seen, _ = pose(both_ends=True)
+    q = seen.shape({"clamp_turn": math.pi, "clamp_shift": 0.004})
+    rest = seen.simulator.rest_state(1).q[0]
+    end = wr.select_vertices(MESH, x=0.1)
+    turned = rest[end] * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([0.004, 0.02, 0.02])
+    assert torch.allclose(q[end], turned, atol=1e-9)
+    middle = torch.as_tensor(np.flatnonzero(np.abs(MESH.vertices[:, 0] - 0.05) < 0.0101))
+    away, before = (x[middle][:, 1:] - x[middle][:, 1:].mean(0) for x in (q, rest))
+    angle = torch.atan2((before[:, 0] * away[:, 1] - before[:, 1] * away[:, 0]).sum(), (before * away).sum())
+    assert math.degrees(float(angle)) == pytest.approx(90.0, abs=3.0)
+    near = seen.shape({"clamp_turn": math.pi - 0.3})
+    again = seen.shape({"clamp_turn": math.pi, "clamp_shift": 0.004}, ({"clamp_turn": math.pi - 0.3}, near))
+    assert torch.allclose(again, q, atol=1e-7)
+
+
+def test_a_pose_has_pictures_and_places_of_its_points(seen):
+    with pytest.raises(InputError, match="has no picture"):
+        replace(seen, photos=())
+    with pytest.raises(InputError, match="places on the body are not known"):
+        replace(seen, points=None)

@@ -1,0 +1,90 @@
+"""Files of pictures: cameras, masks by colour, and tracked points."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.pictures.reading import Colours, read_mask, read_scene, read_tracked
+
+FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}
+
+
+def write(path, content):
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def picture(path):
+    """A red body with a hole and a speck beside it, and a blue one."""
+    image = np.full((60, 80, 3), 30, dtype=np.uint8)
+    image[10:40, 10:40] = (200, 20, 40)
+    image[20:25, 20:25] = 255
+    image[50:52, 70:72] = (200, 20, 40)
+    image[45:58, 45:60] = (20, 60, 220)
+    Image.fromarray(image).save(path)
+    return image
+
+
+def test_cameras_and_masks_of_a_scene(tmp_path):
+    picture(tmp_path / "00.png")
+    content = {"frames": [FRAME, {**FRAME, "mask": "mask.png"}], "fixed": [{"vertices": [3, 1]}, {"vertices": [7]}]}
+    scene = read_scene(write(tmp_path / "camera.json", content))
+    assert [clamp.tolist() for clamp in scene.clamps] == [[3, 1], [7]]
+    assert scene.frames[0].time == 0.5
+    red = read_mask(scene.frames[0], Colours((340.0, 10.0), 0.5, 0.3))
+    assert red.sum() == 900  # with its hole, without the speck
+    assert red[10:40, 10:40].all()
+    given = np.zeros((60, 80), dtype=np.uint8)
+    given[5:9, 5:9] = 1
+    Image.fromarray(given).save(tmp_path / "mask.png")
+    assert read_mask(scene.frames[1], None).sum() == 16
+    with pytest.raises(InputError, match=r"00.png: no part has a hue from 100 to 140 degrees"):
+        read_mask(scene.frames[0], Colours((100.0, 140.0), 0.5, 0.3))
+    with pytest.raises(DataFileError, match=r"has no mask: name one in camera.json"):
+        read_mask(scene.frames[0], None)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("{", "give the cameras of a scene as JSON"),
+        ({"frames": []}, "has no list 'frames'"),
+        ([1], "has no list 'frames'"),
+        ({"frames": [{"time": 0.0}]}, "frame 0 has no 'image'"),
+        ({"frames": [{**FRAME, "world_to_camera": [1, 2]}]}, "frame 0 needs 'world_to_camera', 4 rows of 4 numbers"),
+        ({"frames": [FRAME], "fixed": [{"vertex": 1}]}, "'fixed' is a list of clamps"),
+    ],
+)
+def test_a_damaged_scene_is_named(tmp_path, content, sentence):
+    with pytest.raises(DataFileError, match=sentence):
+        read_scene(write(tmp_path / "camera.json", content))
+
+
+def test_tracked_points_of_known_programs(tmp_path):
+    wanted = np.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [np.nan, np.nan]]])
+    heads = [
+        "scorer,net,net,net,net,net,net",
+        "bodyparts,tip,tip,tip,base,base,base",
+        "coords,x,y,likelihood,x,y,likelihood",
+    ]
+    lines = [*heads, "0,3,4,0.9,1,2,1.0", "1,8,9,0.2,5,6,0.8"]
+    table = write(tmp_path / "dlc.csv", "\n".join(lines))
+    assert read_tracked(table, ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
+    plain = write(tmp_path / "plain.csv", "frame,base.x,base.y,tip.x,tip.y\n0,1,2,3,4\n1,5,6,,\n")
+    assert read_tracked(plain, ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
+    tracks = np.nan_to_num(wanted)
+    np.savez(tmp_path / "cotracker.npz", tracks=tracks, visibility=np.array([[1, 1], [1, 0]]))
+    assert read_tracked(tmp_path / "cotracker.npz", ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
+
+
+def test_a_damaged_table_is_named(tmp_path):
+    with pytest.raises(DataFileError, match="no columns x and y of 'tip'"):
+        read_tracked(write(tmp_path / "a.csv", "frame,base.x,base.y\n0,1,2\n"), ["base", "tip"], 0.6)
+    with pytest.raises(DataFileError, match="cannot read tracked points"):
+        read_tracked(tmp_path / "missing.csv", ["base"], 0.6)
+    np.savez(tmp_path / "b.npz", tracks=np.zeros((4, 3, 2)))
+    with pytest.raises(DataFileError, match=r"has tracks of shape \(4, 3, 2\): the 2 points"):
+        read_tracked(tmp_path / "b.npz", ["base", "tip"], 0.6)

@@ -1,0 +1,87 @@
+"""A simulated laboratory of pictures: masks of a body of another material, before a camera that stands elsewhere."""
+
+import numpy as np
+import scipy.ndimage
+import shapely
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..io.atomic import atomic_path
+from ..io.files import write_json
+from ..io.stages import StageContext
+from ..mesh.mesh import boundary_triangles
+from ..pictures.camera import PlacedCamera
+from ..pictures.outlines import ClosedSurface
+from ..settings.pictures import SimulatedCamera
+from ..settings.stages import PictureStage
+from .build import build_body, build_simulator
+from .seen_poses import read_lens, scene_file
+
+FloatArray = NDArray[np.float64]
+
+_CORRELATED = 2.0  # px, along an outline, of its noise
+
+
+def play_camera(context: StageContext) -> None:
+    """Writes camera.json and the masks of every pose."""
+    settings: PictureStage = context.settings
+    data, played = settings.data, settings.data.simulated
+    assert played is not None
+    material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})
+    body = build_body(settings)
+    surface = ClosedSurface.of(boundary_triangles(body.mesh))
+    for number, (name, pose) in enumerate(data.poses.items()):
+        gravity = settings.gravity if pose.gravity is None else pose.gravity
+        simulator = build_simulator(settings.model_copy(update={"gravity": gravity}), material, body)
+        with torch.no_grad():
+            q = simulator.static_equilibrium().q[0].double().cpu()
+        looking = looks(played, gravity)
+        centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))
+        camera = PlacedCamera(read_lens(data), torch.as_tensor(looking), centre)
+        pixels = camera.pixels(q, PlacedCamera.corrections(played.corrections)).numpy()
+        random = np.random.default_rng([settings.seed, number])
+        mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
+        path = scene_file(data, pose, context.run_dir)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path.parent / "00.png") as partial:
+            Image.fromarray(mask).save(partial, format="png")
+        frame = {"image": "00.png", "mask": "00.png", "time": 0.0, "world_to_camera": looking.tolist()}
+        write_json(path, {"name": name, "frames": [frame]})
+
+
+def looks(played: SimulatedCamera, gravity: tuple[float, float, float]) -> FloatArray:
+    """Returns world_to_camera (4, 4) of an upright camera at a place that looks at a point."""
+    place, forward = np.array(played.place), np.array(played.looks_at) - np.array(played.place)
+    forward = forward / np.linalg.norm(forward)
+    down = np.array(gravity) - forward * (forward @ np.array(gravity))
+    down = down / np.linalg.norm(down)
+    axes = np.stack([np.cross(down, forward), down, forward])
+    return np.block([[axes, -(axes @ place)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def noisy_mask(
+    region: shapely.Geometry, size: tuple[int, int], noise: float, random: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Returns a mask (H, W) of a region [px] whose border is moved across itself by correlated noise [px]."""
+    area = shapely.Polygon()
+    for part in shapely.get_parts(region):
+        holes = [hole for hole in part.interiors if shapely.polygons(hole).area > 1.0]
+        outer, *inner = (
+            shapely.make_valid(shapely.polygons(_moved(own, noise, random))) for own in (part.exterior, *holes)
+        )
+        area = shapely.union(area, shapely.difference(outer, shapely.union_all(inner)))
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    inside = shapely.contains_xy(area, columns.ravel(), rows.ravel())
+    return np.asarray(inside).reshape(size[1], size[0])
+
+
+def _moved(ring: shapely.LinearRing, noise: float, random: np.random.Generator) -> FloatArray:
+    """A closed line (P, 2) with points a pixel apart, moved by noise."""
+    count = max(int(ring.length), 8)
+    points = shapely.get_coordinates(shapely.line_interpolate_point(ring, np.arange(count) * ring.length / count))
+    along = np.roll(points, -1, 0) - np.roll(points, 1, 0)
+    across = np.stack([-along[:, 1], along[:, 0]], 1) / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    smooth = scipy.ndimage.gaussian_filter1d(random.normal(size=count), _CORRELATED, mode="wrap")
+    moved = points + noise * (smooth / max(float(smooth.std()), 1e-12))[:, None] * across
+    return np.concatenate([moved, moved[:1]])

@@ -1,0 +1,245 @@
+"""Bodies at rest before a camera: from settings and the files of pictures to `SeenPose`."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..data.camera import Lens
+from ..data.markers import bind_markers
+from ..fem.body import Body
+from ..io.atomic import digest
+from ..io.errors import DataFileError, InputError
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5
+from ..io.stages import StageContext
+from ..mesh.mesh import Mesh, boundary_triangles, quadratic, select_vertices
+from ..mesh.readers import read_mesh
+from ..pictures.camera import PlacedCamera
+from ..pictures.outlines import ClosedSurface, Outline
+from ..pictures.reading import Colours, Frame, read_mask, read_picture, read_scene, read_tracked
+from ..pictures.seen import Photo, SeenPose
+from ..settings.body import MaterialSettings
+from ..settings.pictures import PictureData, PoseSettings
+from ..settings.stages import PictureStage
+from .build import build_mesh, build_simulator
+
+log = logging.getLogger(__name__)
+
+PICTURES: Final = "pictures.h5"
+SCENE: Final = "camera.json"
+_KIND: Final = "pictures"
+_ALIKE: Final = 1e-9  # of two poses of a camera
+
+
+def scene_file(data: PictureData, pose: PoseSettings, run_dir: Path) -> Path:
+    """Returns the path of a pose's camera.json, in the folder of the data or of a simulated laboratory."""
+    folder = run_dir / "recordings" if data.folder is None else Path(data.folder).expanduser()
+    return folder / pose.folder / SCENE
+
+
+def picture_files(data: PictureData) -> dict[str, str]:
+    """Returns the SHA-256 of all files of the pictures, by path; empty where they are simulated.
+
+    Raises:
+        DataFileError: a file is missing.
+    """
+    if data.folder is None:
+        return {}
+    paths = [] if data.lens.file is None else [Path(data.folder).expanduser() / data.lens.file]
+    for pose in data.poses.values():
+        scene = read_scene(scene_file(data, pose, Path()))
+        own = [pose.mesh, pose.points]
+        paths += [scene.path, *(scene.path.parent / name for name in own if name is not None)]
+        paths += [
+            path for frame in _chosen(scene.frames, pose) for path in (frame.image, frame.mask) if path is not None
+        ]
+    result = {}
+    for path in paths:
+        try:
+            result[str(path)] = digest(path)
+        except OSError as error:
+            raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
+    return result
+
+
+def _chosen(frames: Sequence[Frame], pose: PoseSettings) -> list[Frame]:
+    return [frame for number, frame in enumerate(frames) if pose.frames is None or number in pose.frames]
+
+
+def import_pictures(context: StageContext) -> None:
+    """Writes pictures.h5: of every pose the masks of the body, the poses of the camera and the tracked points.
+
+    Raises:
+        DataFileError: a picture cannot be read, or does not show the body.
+    """
+    settings: PictureStage = context.settings
+    data = settings.data
+    with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
+        for name, pose in data.poses.items():
+            scene = read_scene(scene_file(data, pose, context.run_dir))
+            wrong = [number for number in pose.frames or () if number >= len(scene.frames)]
+            if wrong:
+                raise InputError(f"data.poses.{name}.frames has {wrong[0]}, but {scene.path} has {len(scene.frames)}.")
+            frames = _different(name, _chosen(scene.frames, pose))
+            colours = pose.mask or data.mask
+            chosen = None if colours is None else Colours(**dict(colours))
+            masks = [read_mask(frame, chosen) for frame in frames] if pose.outline else []
+            if len({mask.shape for mask in masks}) > 1:
+                raise DataFileError(f"{scene.path}: its pictures have different sizes: give each size its own pose.")
+            if pose.points is not None:
+                tracked = read_tracked(scene.path.parent / pose.points, [*data.points], data.likelihood)
+                numbers = [scene.frames.index(frame) for frame in frames]
+                if len(tracked) < len(scene.frames):
+                    raise DataFileError(
+                        f"{scene.path.parent / pose.points} has {len(tracked)} rows for {len(scene.frames)} frames."
+                    )
+                create(file, f"{name}/tracked", tracked[numbers], "px")
+            create(file, f"{name}/masks", np.array(masks, dtype=bool))
+            create(file, f"{name}/world_to_camera", np.stack([frame.pose for frame in frames]), "1, m")
+            create(file, f"{name}/frames", [scene.frames.index(frame) for frame in frames])
+            log.info("import: %s has %d pictures", name, len(frames))
+
+
+def _different(name: str, frames: Sequence[Frame]) -> list[Frame]:
+    """Frames without copies of earlier pictures, which would count as often as there are copies."""
+    first: dict[str, Frame] = {}
+    for frame in frames:
+        first.setdefault(digest(frame.mask or frame.image), frame)
+    if len(first) < len(frames):
+        log.warning(
+            "import: %d of the %d pictures of %s are copies of others, and are left out",
+            *(len(frames) - len(first), len(frames), name),
+        )
+    return [*first.values()]
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A pose as it was read."""
+
+    masks: NDArray[np.bool_]  # (F, H, W), or empty
+    cameras: NDArray[np.float64]  # (F, 4, 4) world_to_camera
+    tracked: NDArray[np.float64] | None  # (F, M, 2) [px]
+    frames: tuple[int, ...]
+
+
+class SeenPoses:
+    """The poses of a run.
+
+    Args:
+        settings: of the run's stage.
+        run_dir: its folder, with pictures.h5.
+
+    Raises:
+        DataFileError: a file is missing or damaged.
+        InputError: values that do not fit.
+    """
+
+    def __init__(self, settings: PictureStage, run_dir: Path) -> None:
+        self.settings, self.data, self.run_dir = settings, settings.data, run_dir
+        self.lens, self._outlines = read_lens(self.data), dict[str, list[Outline | None]]()
+        with read_hdf5(run_dir / PICTURES, _KIND) as file:
+            self.loaded = {
+                name: Loaded(
+                    read_array(file, f"{name}/masks"),
+                    read_array(file, f"{name}/world_to_camera"),
+                    read_array(file, f"{name}/tracked") if f"{name}/tracked" in file else None,
+                    tuple(read_array(file, f"{name}/frames").tolist()),
+                )
+                for name in self.data.poses
+            }
+
+    def picture(self, name: str, number: int) -> NDArray[np.uint8]:
+        """Returns a picture (H, W, 3) of a pose, by its number among those that are used.
+
+        Raises:
+            DataFileError: it is missing.
+        """
+        scene = read_scene(scene_file(self.data, self.data.poses[name], self.run_dir))
+        return read_picture(scene.frames[self.loaded[name].frames[number]].image)
+
+    def cameras_of(self, name: str) -> list[int]:
+        """Returns the numbers of the pictures whose given cameras differ, from which a standing camera is chosen."""
+        different: list[int] = []
+        for number, pose in enumerate(self.loaded[name].cameras):
+            if all(np.abs(pose - self.loaded[name].cameras[other]).max() > _ALIKE for other in different):
+                different.append(number)
+        return different
+
+    def material(self, name: str) -> MaterialSettings:
+        """Returns the material of a pose, as configured."""
+        constants = self.data.materials.get(self.data.poses[name].material or "", {})
+        common = self.settings.simulation
+        return common.changed(**{**common.constants, **constants})
+
+    def pose(self, name: str, camera: int | None = None, deforms: bool = True) -> SeenPose:
+        """Returns a pose.
+
+        Args:
+            name: of the pose.
+            camera: number of the picture whose given camera counts for all; None: each has its own.
+            deforms: whether the body is simulated, or undeformed.
+        """
+        settings, own, loaded = self.settings, self.data.poses[name], self.loaded[name]
+        mesh, clamps = self._mesh(name)
+        fixed = np.unique(np.concatenate(clamps))
+        material = self.material(name)
+        if own.gravity is not None:
+            settings = settings.model_copy(update={"gravity": own.gravity})
+        simulator = build_simulator(settings, material, Body(mesh, fixed=fixed, **dict(settings.physics)))
+        points = None
+        if own.points is not None:
+            points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
+        centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
+        if name not in self._outlines:
+            self._outlines[name] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
+        photos = []
+        for number, frame in enumerate(loaded.frames):
+            pose = torch.as_tensor(loaded.cameras[number if camera is None else camera])
+            tracked = None if loaded.tracked is None else loaded.tracked[number]
+            placed = PlacedCamera(self.lens, pose, centre)
+            photos.append(Photo(f"{name} {frame}", placed, self._outlines[name][number], tracked))
+        surface = ClosedSurface.of(boundary_triangles(mesh))
+        return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points, deforms)
+
+    def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
+        """Mesh of a pose, and the vertices in its clamps."""
+        own = self.data.poses[name]
+        scene = read_scene(scene_file(self.data, own, self.run_dir))
+        if own.mesh is None:
+            mesh = build_mesh(self.settings.mesh)
+        else:
+            mesh = read_mesh(scene.path.parent / own.mesh, self.data.units)
+        corners = len(mesh.vertices)
+        if wrong := [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]:
+            raise DataFileError(f"{scene.path}: 'fixed' has the vertex {wrong[0].max()}, but the mesh has {corners}.")
+        if own.mesh is not None and self.data.order == 2:
+            mesh = quadratic(mesh)
+        clamps = tuple(_with_midpoints(mesh, clamp) for clamp in scene.clamps)
+        return mesh, clamps or (select_vertices(mesh, **self.settings.fixed.arguments()),)
+
+
+def _with_midpoints(mesh: Mesh, corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Vertices of a clamp and, of quadratic elements, the nodes between them."""
+    inside = np.isin(np.arange(len(mesh.vertices)), corners)
+    within = inside.copy()
+    first = mesh.cells.shape[1] - len(mesh.element.parents)
+    for number, parents in enumerate(mesh.element.parents):
+        within[mesh.cells[inside[mesh.cells[:, list(parents)]].all(1), first + number]] = True
+    return np.flatnonzero(within)
+
+
+def read_lens(data: PictureData) -> Lens:
+    """Returns the lens of the camera.
+
+    Raises:
+        DataFileError: its calibration cannot be read.
+    """
+    if data.lens.file is not None:
+        return Lens.read(Path(data.folder or ".").expanduser() / data.lens.file)
+    return Lens(torch.tensor(data.lens.matrix, dtype=torch.float64))

@@ -1,0 +1,133 @@
+"""Misfits of parameters that are searched in ranges, with normal priors: a sum of squares and its linearisation.
+
+Parameters are fractions of their ranges, "units" from 0 to 1. Prior knowledge (`bounds.Prior`, and whatever a subclass
+fits for each set of parameters) adds its squares, weighted as much as one independent residual of the data: by their
+mean square, times the number of residuals that are correlated. That weight is computed at the start of a search and
+again at the minimum.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .bounds import Bounds
+from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
+
+
+@dataclass(frozen=True)
+class LinearMisfit:
+    """Weighted residuals at some parameters and their derivatives, whose squares sum to the loss."""
+
+    trials: list[Linearised]
+    prior: FloatArray  # (K,) weighted residuals of the priors
+    prior_slopes: FloatArray  # (K, P)
+
+    @property
+    def loss(self) -> float:
+        """Sum of the squares."""
+        return float(sum(np.square(rows).sum() for rows, _, _ in self.trials) + np.square(self.prior).sum())
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(P,) gradient of the loss."""
+        parts = [jacobian.T @ rows.ravel() for rows, jacobian, _ in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
+
+    @property
+    def gauss_newton(self) -> FloatArray:
+        """(P, P) Gauss-Newton matrix of the loss."""
+        parts = [jacobian.T @ jacobian for _, jacobian, _ in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
+
+
+class BoundedMisfit(ABC):
+    """A misfit as a function of parameters with bounds and priors.
+
+    Args:
+        bounds: range of each of the P parameters.
+
+    Attributes:
+        bounds: see above.
+        prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
+    """
+
+    def __init__(self, bounds: Mapping[str, Bounds]) -> None:
+        self.bounds, self.prior_weight = dict(bounds), 0.0
+        priors = [range_.unit_prior() for range_ in self.bounds.values()]
+        self._priors = [(index, *prior) for index, prior in enumerate(priors) if prior is not None]
+
+    @abstractmethod
+    def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
+        """Linearises the residuals at (P,) parameters; None where the simulation fails.
+
+        Args:
+            unit: the parameters, as fractions of their ranges.
+            derivatives: whether to compute derivatives; they are zero otherwise.
+        """
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Forgets the results of earlier parameters, from which the next are predicted."""
+
+    def placement(self, unit: FloatArray, labels: Sequence[str]) -> dict[str, Any] | None:
+        """Returns the best placement of markers with (P,) parameters, as JSON data; None without uncertain places."""
+        return None
+
+    @property
+    def has_priors(self) -> bool:
+        """Whether something is held by prior knowledge."""
+        return bool(self._priors)
+
+    def to_unit(self, values: Mapping[str, float]) -> FloatArray:
+        """(P,) values as fractions of their ranges, clipped to the bounds."""
+        clipped = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
+        return np.array([b.to_unit(value) for b, value in clipped])
+
+    def from_unit(self, unit: Sequence[float] | FloatArray) -> dict[str, float]:
+        """Values of the parameters at (P,) fractions of their ranges."""
+        return {
+            name: float(range_.from_unit(torch.tensor(float(u), dtype=torch.float64)))
+            for (name, range_), u in zip(self.bounds.items(), unit, strict=True)
+        }
+
+    def losses_or_infinite(self, points: FloatArray) -> FloatArray:
+        """(E,) losses of (E, P) parameters; infinite where the simulation fails."""
+        linear = [self.linearise(point, derivatives=False) for point in points]
+        return np.array([math.inf if own is None else own.loss for own in linear])
+
+    def prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(K,) weighted residuals of the priors of parameters, and their derivatives (K, P)."""
+        rows, slopes = np.zeros(len(self._priors)), np.zeros((len(self._priors), len(unit)))
+        weight = math.sqrt(self.prior_weight)
+        for row, (i, mean, deviation) in enumerate(self._priors):
+            rows[row], slopes[row, i] = weight * (unit[i] - mean) / deviation, weight / deviation
+        return rows, slopes
+
+    def update_prior_weight(self, unit: FloatArray) -> float:
+        """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
+        before = self.prior_weight
+        linearised = self.linearise(unit, derivatives=False) if self.has_priors else None
+        if linearised is None:
+            return 1.0
+        trials = linearised.trials
+        seen = sum(count for *_, count in trials)
+        squares = [np.square(rows).sum() * redundancy(rows) for rows, _, _ in trials]
+        self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
+        return self.prior_weight / before if before else math.inf
+
+    def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
+        """Uncertainty of (P,) parameters; None if a simulation close by fails."""
+        found = self.linearise(unit)
+        if found is None:
+            return None
+        return uncertainty_of(found.trials, found.prior_slopes, self.prior_weight, self.bounds, unit)

@@ -1,0 +1,188 @@
+"""The misfit of simulated bodies to pictures of them, as a function of physical parameters and of the camera's.
+
+The loss is the mean square distance of the measured and the simulated outlines, both ways, and of tracked points, in
+pixels; every picture has the same weight. A distance r counts as s sqrt(2 (sqrt(1 + (r / s)^2) - 1)), which is r where
+it is well below s pixels, and less beyond, as a cable or a hand before the body moves its outline by any number of
+pixels (Charbonnier et al. 1997).
+
+A name with an owner (`learning.parameters.own_name`) is the value of one pose, or of the poses of one material; a name
+without, that of all. Shapes follow the physical parameters by differences of equilibria, and pixels follow shapes and
+cameras exactly. `tests/pictures/test_picture_misfit.py` compares the derivatives with differences.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from typing_extensions import override
+
+from ..io.errors import ConvergenceError, InputError
+from ..learning.bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
+from ..learning.bounds import Bounds
+from ..learning.parameters import split_name
+from ..learning.uncertainty import Linearised
+from .camera import CORRECTIONS, PlacedCamera
+from .seen import Photo, SeenPose, Shape
+
+_DIFFERENCE: Final = 1e-4  # of a physical parameter, as a fraction of its range
+_ROBUST: Final = 4.0  # px, s
+
+
+class PictureMisfit(BoundedMisfit):
+    """Residuals of poses and their derivatives; see the module.
+
+    Args:
+        poses: seen bodies.
+        bounds: range of each parameter to identify.
+        known: values of further parameters, which are not identified.
+        near: shapes by pose from which equilibria are sought first; None where none is known.
+
+    Raises:
+        InputError: an unknown parameter or owner, or nothing to identify.
+    """
+
+    def __init__(
+        self,
+        poses: Sequence[SeenPose],
+        bounds: Mapping[str, Bounds],
+        known: Mapping[str, float] | None = None,
+        near: Sequence[Shape | None] | None = None,
+    ) -> None:
+        super().__init__(bounds)
+        self.poses, self._known = [*poses], {} if known is None else dict(known)
+        if not bounds:
+            raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
+        for name in bounds:
+            if not any(self._acts(name, pose) for pose in self.poses):
+                parameter, owner = split_name(name)
+                known_names = ", ".join(dict.fromkeys(n for pose in self.poses for n in pose.parameter_names))
+                raise InputError(
+                    f"{owner} is neither a pose nor a material: name one."
+                    if owner and parameter in known_names
+                    else f"there is no parameter {parameter!r} to identify: choose from {known_names}."
+                )
+        self._first: list[Shape | None] = [None] * len(self.poses) if near is None else [*near]
+        self.forget()
+
+    @override
+    def forget(self) -> None:
+        self._shapes = [*self._first]
+
+    @staticmethod
+    def _acts(name: str, pose: SeenPose) -> bool:
+        """Whether a parameter acts on a pose."""
+        parameter, owner = split_name(name)
+        return owner in ("", pose.name, pose.material) and parameter in pose.parameter_names
+
+    def shape(self, number: int, own: Mapping[str, float]) -> torch.Tensor:
+        """Returns the vertices (N, 3) of a pose with values of its parameters [m], from the last ones.
+
+        Raises:
+            ConvergenceError: there is no equilibrium.
+        """
+        physical, last = {name: v for name, v in own.items() if name not in CORRECTIONS}, self._shapes[number]
+        if last is not None and last[0] == physical:
+            return last[1]
+        q = self.poses[number].shape(physical, last)
+        self._shapes[number] = (physical, q)
+        return q
+
+    @override
+    def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
+        values, trials = self.from_unit(unit), list[Linearised]()
+        share = 1.0 / sum(len(pose.photos) for pose in self.poses)
+        for number, pose in enumerate(self.poses):
+            own = values_of(pose, {**self._known, **values})
+            try:
+                q = self.shape(number, own)
+                tangents = self._tangents(number, unit, own, q) if derivatives else {}
+            except ConvergenceError:
+                return None
+            for photo in pose.photos:
+                trials += self._of_photo(pose, photo, own, q, tangents, share)
+        return LinearMisfit(trials, *self.prior_rows(unit))
+
+    def _tangents(
+        self, number: int, unit: FloatArray, own: Mapping[str, float], q: torch.Tensor
+    ) -> dict[int, torch.Tensor]:
+        """Derivatives (N, 3) of a shape by its physical parameters, by their column; differences into the range."""
+        pose, tangents = self.poses[number], dict[int, torch.Tensor]()
+        for column, (name, range_) in enumerate(self.bounds.items()):
+            parameter = split_name(name)[0]
+            if parameter in CORRECTIONS or not pose.deforms or not self._acts(name, pose):
+                continue
+            step = _DIFFERENCE if unit[column] < 0.5 else -_DIFFERENCE
+            moved = {**own, parameter: float(range_.from_unit(torch.tensor(unit[column] + step, dtype=torch.float64)))}
+            tangents[column] = (pose.shape(moved, (own, q)) - q) / step
+        return tangents
+
+    def _of_photo(
+        self,
+        pose: SeenPose,
+        photo: Photo,
+        own: Mapping[str, float],
+        q: torch.Tensor,
+        tangents: Mapping[int, torch.Tensor],
+        share: float,
+    ) -> list[Linearised]:
+        """Weighted residuals of a picture, and their derivatives: outlines both ways, and tracked points."""
+        corrections, parts = PlacedCamera.corrections(own), list[tuple[float, FloatArray, FloatArray, FloatArray]]()
+        moved = torch.stack([*tangents.values()]) if tangents else q.new_zeros(0, *q.shape)
+        if photo.outline is not None:
+            seen = pose.outlines(photo, q, corrections)
+            rim = seen.silhouette
+            slopes = self._slopes(pose, photo, rim.points(q), corrections, rim.points(moved), [*tangents])
+            distance, along = photo.outline.signed(rim.pixels)
+            order = np.argsort(cKDTree(photo.outline.points).query(rim.pixels)[1], kind="stable")
+            jacobian = np.einsum("kpi,pi->pk", slopes, along)
+            parts.append((0.5 * share, seen.of_simulated[order], distance[order], jacobian[order]))
+            index, distance, along = rim.closest(photo.outline.points)
+            jacobian = np.einsum("kpi,pi->pk", slopes[:, index], along)
+            parts.append((0.5 * share, seen.of_measured, -distance, jacobian))
+        if photo.tracked is not None and pose.points is not None:
+            places = pose.points(q[None])[0]
+            moves = (moved.flatten(1) @ pose.points.transposed_jacobian(q[None])[0]).unflatten(1, (-1, 3))
+            slopes = self._slopes(pose, photo, places, corrections, moves, [*tangents])
+            away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
+            visible = np.isfinite(away)
+            jacobian = slopes.transpose(1, 2, 0).reshape(away.size, -1)
+            parts.append((share, 1.0 * visible.ravel(), np.nan_to_num(away).ravel(), jacobian))
+        return [_weighted(*part) for part in parts]
+
+    def _slopes(
+        self,
+        pose: SeenPose,
+        photo: Photo,
+        points: torch.Tensor,
+        corrections: torch.Tensor,
+        moves: torch.Tensor,
+        columns: Sequence[int],
+    ) -> FloatArray:
+        """(K, P, 2) derivatives of the pixels of points (P, 3) by all K parameters, with those of the points [px]."""
+        by = photo.camera.derivative(points, corrections, moves).numpy()
+        slopes = np.zeros((len(self.bounds), *by.shape[1:]))
+        slopes[columns] = by[: len(columns)]
+        for column, (name, range_) in enumerate(self.bounds.items()):
+            parameter = split_name(name)[0]
+            if parameter in CORRECTIONS and self._acts(name, pose):
+                slopes[column] = by[len(columns) + CORRECTIONS.index(parameter)] * range_.slope(0.5)
+        return slopes
+
+
+def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: FloatArray) -> Linearised:
+    """Robust residuals (P, 1) whose squares sum to a share of the weighted mean of those of distances (P,)."""
+    root = np.sqrt(share * weight / max(float(weight.sum()), 1e-12))
+    bent = np.sqrt(1.0 + (distance / _ROBUST) ** 2)
+    rows = np.sign(distance) * _ROBUST * np.sqrt(2.0 * (bent - 1.0))
+    slope = np.where(np.abs(rows) > 1e-9, distance / bent / np.where(rows == 0.0, 1.0, rows), 1.0)
+    return (root * rows)[:, None], (root * slope)[:, None] * jacobian, max(int((weight > 0.0).sum()), 1)
+
+
+def values_of(pose: SeenPose, values: Mapping[str, float]) -> dict[str, float]:
+    """Returns the values of a pose's parameters, by their names without an owner; the pose's own take precedence."""
+    own: dict[str, float] = {}
+    for owner in dict.fromkeys(("", pose.material, pose.name)):
+        own |= {split_name(name)[0]: value for name, value in values.items() if split_name(name)[1] == owner}
+    return own

@@ -1,0 +1,228 @@
+"""Bodies at rest before a camera, and how far pictures of them are from simulated ones."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import shapely
+import torch
+
+from ..data.observation import Observation
+from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
+from ..learning.parameters import constants_of, identifiable_parameters
+from ..stepping.inputs import Inputs
+from .camera import CORRECTIONS, PlacedCamera
+from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within
+
+CLAMP_TURN: Final = "clamp_turn"  # rad
+CLAMP_SHIFT: Final = "clamp_shift"  # m
+Shape = tuple[Mapping[str, float], torch.Tensor]  # values of parameters, and vertices (N, 3) at rest with them [m]
+
+_TURNED: Final = 0.4  # rad, largest part of a clamp's turn from one equilibrium to the next
+_MARGIN: Final = 6.0  # px, around what a clamp hides
+_MILLI: Final = 1e3
+
+
+@dataclass(frozen=True)
+class Photo:
+    """What a picture shows of a body; at least one of an outline and tracked points.
+
+    Attributes:
+        name: of the picture.
+        camera: before which the body stands.
+        outline: of the body; None where it was not drawn.
+        tracked: (M, 2) pixels of the body's tracked points, NaN where one was not seen; None without tracked points.
+    """
+
+    name: str
+    camera: PlacedCamera
+    outline: Outline | None = None
+    tracked: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class SeenOutline:
+    """The simulated outline of a body in a picture, beside the measured one.
+
+    Attributes:
+        silhouette: the simulated outline.
+        of_simulated: (P,) weights of its points: the length that each stands for [px], less where a clamp hides it.
+        of_measured: (Q,) weights of the measured points.
+    """
+
+    silhouette: Silhouette
+    of_simulated: FloatArray
+    of_measured: FloatArray
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far a simulated picture is from a measured one.
+
+    Attributes:
+        outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
+        outline_px: the same in pixels.
+        overlap: common area over that of both together, outside of the clamps.
+        points_mm: mean distance of the tracked points, at their depths; None without.
+    """
+
+    outline_mm: float | None
+    outline_px: float | None
+    overlap: float | None
+    points_mm: float | None
+
+    @property
+    def distance(self) -> float:
+        """Distance of the outlines, or of the points where there are no outlines [mm]."""
+        known = [value for value in (self.outline_mm, self.points_mm) if value is not None]
+        return known[0] if known else math.nan
+
+
+@dataclass(frozen=True)
+class SeenPose:
+    """A body at rest, and pictures of it.
+
+    Attributes:
+        name: of the pose.
+        simulator: of the body.
+        surface: of the body.
+        clamps: (V,) vertices in each clamp, which hides them.
+        photos: pictures of it, at least one.
+        material: owner of the parameters that poses of the same material share.
+        points: observation of the tracked points; None without.
+        deforms: whether it is simulated; else the undeformed body is compared.
+
+    Raises:
+        InputError: there is no picture, or points were tracked that nothing observes.
+    """
+
+    name: str
+    simulator: Simulator
+    surface: ClosedSurface
+    clamps: tuple[IntArray, ...]
+    photos: tuple[Photo, ...]
+    material: str = ""
+    points: Observation | None = None
+    deforms: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks that there is something to compare."""
+        if not self.photos:
+            raise InputError(f"{self.name} has no picture.")
+        if self.points is None and any(photo.tracked is not None for photo in self.photos):
+            raise InputError(f"{self.name}: points were tracked, but their places on the body are not known.")
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters that shape and pictures depend on."""
+        clamps = (CLAMP_TURN, CLAMP_SHIFT) if len(self.clamps) > 1 else ()
+        return (*identifiable_parameters(self.simulator), *clamps, *CORRECTIONS)
+
+    def shape(self, values: Mapping[str, float], near: Shape | None = None) -> torch.Tensor:
+        """Returns the vertices (N, 3) of the body at rest [m].
+
+        Args:
+            values: of parameters by name; those of the camera are ignored.
+            near: values and the body at rest with them, from which the equilibrium is sought; the undeformed body, if
+                left out.
+
+        Raises:
+            ConvergenceError: there is no equilibrium.
+        """
+        sim = self.simulator
+        if not self.deforms:
+            return sim.rest_state(1).q[0]
+        own = {name: sim.tensor([v]) for name, v in values.items() if name in identifiable_parameters(sim)}
+        constants = sim.prepare(constants_of(sim, own))
+        before, q = ({}, sim.rest_state(1).q[0]) if near is None else near
+        if len(self.clamps) < 2:
+            with torch.no_grad():
+                return sim.static_equilibrium(None, constants, start=q[None]).q[0]
+        first, last = ([own.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)] for own in (before, values))
+        parts = max(math.ceil(abs(last[0] - first[0]) / _TURNED), 1)
+        with torch.no_grad():
+            for turn, shift in np.linspace(first, last, parts + 1)[1:]:
+                inputs = Inputs(fixed_positions=self._clamped(turn, shift)[None])
+                q = self._turned(q, (last[0] - first[0]) / parts)
+                q = sim.static_equilibrium(inputs, constants, start=q[None]).q[0]
+        return q
+
+    def _between(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Centre of the second clamp, direction from the first to it, and share (N,) of its motion along the body."""
+        rest = self.simulator.rest_state(1).q[0]
+        first, second = (torch.as_tensor(own).to(self.simulator.fixed) for own in self.clamps[:2])
+        centre = rest[second].mean(0)
+        axis = torch.nn.functional.normalize(centre - rest[first].mean(0), dim=0)
+        along = rest @ axis
+        low, high = along[first].max(), along[second].min()
+        return centre, axis, ((along - low) / (high - low)).clamp(0.0, 1.0)
+
+    def _turned(self, q: torch.Tensor, turn: float) -> torch.Tensor:
+        """Vertices (N, 3) turned with the second clamp, in proportion to their place between the clamps."""
+        centre, axis, share = self._between()
+        away = q - centre
+        cos, sin = torch.cos(turn * share)[:, None], torch.sin(turn * share)[:, None]
+        across = torch.linalg.cross(axis.expand_as(away), away)
+        return centre + cos * away + sin * across + (1.0 - cos) * (away @ axis)[:, None] * axis  # Rodrigues
+
+    def _clamped(self, turn: float, shift: float) -> torch.Tensor:
+        """Fixed vertices (D, 3) with the second clamp turned [rad] about the line from the first to it, and shifted."""
+        sim = self.simulator
+        _, axis, share = self._between()
+        rest = sim.rest_state(1).q[0]
+        return (self._turned(rest, turn) + (shift * share)[:, None] * axis)[sim.fixed]
+
+    def outlines(self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor) -> SeenOutline:
+        """Returns the outline of the body (N, 3) in a picture that has a measured one.
+
+        Args:
+            photo: the picture.
+            q: (N, 3) vertices [m].
+            corrections: (9,) of the camera.
+
+        Raises:
+            InputError: a part of the body is behind the camera.
+        """
+        assert photo.outline is not None
+        pixels = photo.camera.pixels(q.double().cpu(), corrections).numpy()
+        rim = self.surface.silhouette(pixels)
+        simulated, measured = rim.lengths.copy(), np.ones(len(photo.outline.points))
+        simulated *= within(rim.pixels, photo.outline.distance.shape)
+        for clamp in self.clamps:
+            simulated *= visibility(rim.pixels, pixels[clamp], _MARGIN)
+            measured *= visibility(photo.outline.points, pixels[clamp], _MARGIN)
+        return SeenOutline(rim, simulated, measured)
+
+    def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
+        """Returns how far a simulated picture is from a measured one.
+
+        Args:
+            photo: the picture.
+            q: (N, 3) vertices [m].
+            values: of the camera's corrections by name; none where they are left out.
+        """
+        q, corrections = q.double().cpu(), PlacedCamera.corrections(values)
+        depth = photo.camera.seen_from(q, corrections)[:, 2]
+        # mm for a pixel at a depth of 1 m
+        scale = _MILLI / float(corrections[6] * photo.camera.lens.matrix[:2, :2].diagonal().mean())
+        millimetres = pixels = overlap = points = None
+        if photo.outline is not None:
+            seen = self.outlines(photo, q, corrections)
+            there = np.abs(photo.outline.signed(seen.silhouette.pixels)[0])
+            back = np.abs(seen.silhouette.closest(photo.outline.points)[1])
+            both = [np.average(there, weights=seen.of_simulated), np.average(back, weights=seen.of_measured)]
+            pixels = float(np.mean(both))
+            millimetres = pixels * float(depth.mean()) * scale
+            drawn = photo.camera.pixels(q, corrections).numpy()
+            hidden = shapely.union_all([shapely.convex_hull(shapely.multipoints(drawn[own])) for own in self.clamps])
+            body, mask = (shapely.difference(own, hidden) for own in (self.surface.region(drawn), photo.outline.region))
+            overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
+        if photo.tracked is not None and self.points is not None:
+            places = self.points(q[None])[0]
+            away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
+            deep = photo.camera.seen_from(places, corrections)[:, 2].numpy()
+            points = float(np.nanmean(np.linalg.norm(away, axis=1) * deep * scale))
+        return Difference(millimetres, pixels, overlap, points)

@@ -1,0 +1,114 @@
+"""Settings of bodies at rest that are seen by cameras."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from ..io.settings import Count, Many, Natural, NotNegative, Pair, Settings, Some, Vector, Word, setting
+from .mesh import LengthUnit
+from .trials import LimitSettings, different
+
+_Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+_Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]
+
+
+class ColourSettings(Settings):
+    """Colours of a body in a picture."""
+
+    hue: Pair[float] = setting(description="first and last hue; the interval may pass 360", unit="degrees")
+    saturation: _Fraction = setting(0.5, "least saturation")
+    value: _Fraction = setting(0.1, "least value (brightness)")
+
+
+class LensSettings(Settings):
+    """The lens of the camera: a calibration, or its matrix."""
+
+    file: Word | None = setting(None, "calibration by OpenCV or ROS, in the folder of the pictures")
+    matrix: _Rows | None = setting(None, "K, row by row", "px")
+
+    @model_validator(mode="after")
+    def _has_one(self) -> Self:
+        if (self.file is None) == (self.matrix is None):
+            raise ValueError("file and matrix: give one of them, a calibration or K.")
+        return self
+
+
+class PoseSettings(Settings):
+    """A body at rest, and the folder of its pictures."""
+
+    folder: Word = setting(description="with camera.json and the pictures, in the folder of the data")
+    mesh: Word | None = setting(None, "file of its mesh, in its folder; null: the group mesh")
+    material: Word | None = setting(None, "name of its material; null: one material")
+    frames: Annotated[Some[Count], AfterValidator(different)] | None = setting(
+        None, "numbers of the frames, from 0; null: all"
+    )
+    mask: ColourSettings | None = setting(None, "colours of the body, where its frames have no masks; null: data.mask")
+    outline: bool = setting(True, "whether the body's outline is compared")
+    points: Word | None = setting(None, "file of tracked points, in its folder, with a row for each frame")
+    gravity: Vector | None = setting(None, "in the axes of the scene; null: as configured", "m/s^2")
+    clamp_turn: float = setting(0.0, "about which the second clamp is turned against the first", "degrees")
+
+
+class SimulatedCamera(Settings):
+    """A simulated laboratory of pictures, on the body of the configuration."""
+
+    material: dict[str, float] = setting({}, "constants of the true material that differ from the simulation")
+    corrections: dict[str, float] = setting({}, "true corrections of the camera, by parameter")
+    noise: NotNegative = setting(1.0, "standard deviation of an outline, across it", "px")
+    size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
+    place: Vector = setting(description="of the camera", unit="m")
+    looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
+
+
+class PictureData(Settings):
+    """Bodies at rest before a camera: outlines and tracked points in pictures."""
+
+    kind: Literal["pictures"]
+    folder: Word | None = setting(None, "of the pictures")
+    lens: LensSettings = setting(description="of the camera")
+    stands: bool = setting(
+        True, "whether the camera stands still during a pose, so that the poses of its frames differ by errors alone"
+    )
+    order: Literal[1, 2] = setting(2, "of the elements of meshes in the folders of poses")
+    units: LengthUnit = setting("m", "of these meshes")
+    mask: ColourSettings | None = setting(None, "colours of the bodies, where frames have no masks")
+    points: dict[str, Vector] = setting({}, "places of tracked points on the undeformed body, by name", "m")
+    likelihood: _Fraction = setting(0.6, "of a tracked point, below which it counts as not seen")
+    materials: dict[str, dict[str, float]] = setting(
+        {}, "constants of materials by name, where they differ from the group simulation"
+    )
+    poses: dict[str, PoseSettings] = setting(description="by name")
+    train: Some[Word] = setting(description="poses that identify the material")
+    test: Many[Word] = setting((), "poses that are predicted with it")
+    limit: LimitSettings | None = setting(None, "fewer poses, the first of each split")
+    steps: None = setting(None, "null, as bodies rest")
+    simulated: SimulatedCamera | None = setting(None, "plays the camera where there is no folder")
+
+    @model_validator(mode="after")
+    def _are_known(self) -> Self:
+        for key, names in (("train", self.train), ("test", self.test)):
+            if unknown := [name for name in names if name not in self.poses]:
+                raise ValueError(f"{key} names '{unknown[0]}': data.poses has {', '.join(self.poses)}.")
+        if both := [name for name in self.train if name in self.test]:
+            raise ValueError(f"test names '{both[0]}', which is in data.train as well: take one out.")
+        used = {pose.material for pose in self.poses.values()} - {None}
+        if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
+            raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
+        if both := [name for name in self.materials if name in self.poses]:
+            raise ValueError(f"materials and data.poses both have '{both[0]}': rename one.")
+        if self.folder is None and self.simulated is None:
+            raise ValueError("folder is not set: give the folder of the pictures.")
+        return self
+
+    @property
+    def base_motion(self) -> None:
+        """Motion of the base: bodies rest."""
+        return None
+
+    def limited(self) -> "PictureData":
+        """Returns the data with as many poses of training and of the test as the limit allows."""
+        if self.limit is None:
+            return self
+        train, test = self.train[: self.limit.train], self.test[: self.limit.test]
+        poses = {name: pose for name, pose in self.poses.items() if name in (*train, *test)}
+        return self.model_copy(update={"train": train, "test": test, "poses": poses})

@@ -44,6 +44,7 @@ from .io.errors import ResphysError as ResphysError
 from .learning.bounds import Bounds as Bounds
 from .learning.bounds import Prior as Prior
 from .learning.identification import Identification as Identification
+from .learning.identification import ParameterSearch as ParameterSearch
 from .learning.library import ObservedMotion as ObservedMotion
 from .learning.library import evaluate as evaluate
 from .learning.library import fit_force as fit_force
@@ -62,6 +63,12 @@ from .mesh.readers import read_surfaces as read_surfaces
 from .mesh.readers import write_mesh as write_mesh
 from .mesh.rod import rod as rod
 from .mesh.tetrahedra import fill_surface as fill_surface
+from .pictures.camera import PlacedCamera as PlacedCamera
+from .pictures.misfit import PictureMisfit as PictureMisfit
+from .pictures.outlines import ClosedSurface as ClosedSurface
+from .pictures.outlines import Outline as Outline
+from .pictures.seen import Photo as Photo
+from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load
 from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names

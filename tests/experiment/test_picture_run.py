@@ -2,13 +2,16 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import meshio
 import numpy as np
 import pytest
 import shapely
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+import warp_resphys
 from support.command_line import outcome, refusal
 from support.configured import composed, settings
 from support.main_job import IN_RUN
@@ -90,7 +93,7 @@ def recorded(played, folder):
     Image.fromarray(np.where(mask[..., None] > 0, (30, 90, 200), (20, 20, 20)).astype(np.uint8)).save(pose / "02.png")
     right = json.loads((source / "camera.json").read_text())["frames"][0]["world_to_camera"]
     wrong = np.array(right)
-    wrong[:3, 3] += (0.05, 0.03, 0.0)
+    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("yz", (2.0, 0.4)).as_matrix()  # about the origin, out of view
     mesh = box_tetrahedra((0.12, 0.03, 0.03), (4, 1, 1))
     meshio.write(pose / "mesh.vtk", meshio.Mesh(mesh.vertices, [("tetra", mesh.cells)]))
     frames = [
@@ -136,6 +139,43 @@ def test_pictures_of_a_folder(recorded):
     assert law["constants"]["density"] == 1100.0
 
 
+def test_tracked_points_of_a_moving_camera(recorded):
+    """Points alone, each frame before a camera of its own, whose places are known."""
+    scene = json.loads((recorded / "pictures/beam/camera.json").read_text())
+    right = np.array(scene["frames"][1]["world_to_camera"])
+    other = right.copy()
+    other[:3, :3] = right[:3, :3] @ Rotation.from_euler("y", 0.4).as_matrix()
+    other[:3, 3] += (0.0, 0.0, 0.1)
+    places = {"tip": (0.12, 0.015, 0.03), "middle": (0.06, 0.015, 0.03), "corner": (0.12, 0.03, 0.015)}
+    mesh = box_tetrahedra((0.12, 0.03, 0.03), (4, 1, 1), 2)
+    clamp = np.flatnonzero(mesh.vertices[:, 0] < 1e-9)
+    body = warp_resphys.Body(mesh, fixed=clamp)
+    material = warp_resphys.Corotated(120e3, 0.49, density=1100.0)
+    simulator = warp_resphys.Simulator(body, material, gravity=(0.0, -9.81, 0.0))
+    q = simulator.static_equilibrium().q
+    points = warp_resphys.bind_markers(mesh, [*places.values()], [*places])(q)[0].numpy()
+    matrix, lines = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 180.0], [0.0, 0.0, 1.0]]), ["frame"]
+    lines[0] += "".join(f",{name}.x,{name}.y" for name in places)
+    for number, camera in enumerate((right, other)):
+        rays = (points @ camera[:3, :3].T + camera[:3, 3]) @ matrix.T
+        lines.append(f"{number}," + ",".join(f"{value:.4f}" for value in (rays[:, :2] / rays[:, 2:]).ravel()))
+    (recorded / "pictures/beam/tracked.csv").write_text("\n".join(lines))
+    frames = [{"image": f"0{2 * n}.png", "world_to_camera": own.tolist()} for n, own in enumerate((right, other))]
+    (recorded / "pictures/beam/camera.json").write_text(json.dumps({**scene, "frames": frames}))
+    table = ",".join(f"{name}:{list(place)}" for name, place in places.items())
+    tracked = ["data.poses.beam.points=tracked.csv", "data.poses.beam.outline=false", f"data.points={{{table}}}"]
+    assert "set data.stands=false" in refusal(*RECORDED, *tracked)
+    result = outcome(*RECORDED, *tracked, "data.stands=false")
+    assert result.code == 0, result.err
+    assert "Distance of tracked points" in result.out
+    assert "diverged" not in result.out
+    (row,) = json.loads((recorded / "run" / "metrics.json").read_text())["poses"]
+    assert row["points_mm"]["sysid"] < 0.02
+    assert row["outline_mm"]["sysid"] is None
+    identified = json.loads((recorded / "run" / "identification.json").read_text())["sysid"]["parameters"]
+    assert identified["youngs_modulus@soft"] == pytest.approx(120e3, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -143,12 +183,17 @@ def test_pictures_of_a_folder(recorded):
         ("data.poses.beam.folder=nowhere", "nowhere/camera.json"),
         ("data.poses.beam.mesh=nowhere.vtk", "nowhere.vtk"),
         ("data.poses.beam.material=hard", "materials lacks 'hard'"),
+        (
+            "identify.parameters.youngs_modulus={lower:1e4,upper:1e6,per:trial,prior:{mean:2e5,deviation:1e5}}",
+            "take material",
+        ),
         ("data.test=[beam]", "which is in data.train as well"),
         ("data.train=[other]", "train names 'other'"),
         ("identify=null", "identify is null, but data.kind is pictures"),
         ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material and trial"),
         ("data.lens.file=calibration.yaml", "give one of them, a calibration or K"),
         ("data.folder=null", "folder is not set"),
+        ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),
     ],
 )
 def test_bad_input_gets_a_sentence(recorded, change, sentence):
@@ -159,6 +204,18 @@ def test_a_value_a_material_is_for_pictures():
     run = settings("experiment=beam_synthetic", "identify.parameters.youngs_modulus.per=material")
     with pytest.raises(InputError, match=r"which is for data\.kind pictures"):
         check_run(run)
+
+
+def test_a_kept_back_material_is_refused():
+    other = "data.poses.other={folder:other,material:hard}"
+    with pytest.raises(InputError, match="test has a pose of hard, of which no pose is in"):
+        settings(
+            "experiment=camera_silicone",
+            "data.folder=x",
+            other,
+            "data.materials.hard={}",
+            "data.test=[twist_red,other]",
+        )
 
 
 def test_a_limit_leaves_out_poses():
@@ -187,5 +244,8 @@ def test_the_verdict_says_where_an_identification_is_no_better():
     better = picture_verdict([result(0.5, 2.0, True), result(9.0, 1.0, False)])
     assert "no better" not in better
     assert "0.500" in better
-    assert "no better than what needs none" in picture_verdict([result(0.95, 1.0, True)])
+    assert "hardly depend on it" in picture_verdict([result(0.95, 1.0, True)])
+    assert "no better than what needs none" in picture_verdict([result(1.5, 1.0, True)])
     assert "as none was kept back" in picture_verdict([result(0.5, 2.0, False)])
+    away = replace(result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1))
+    assert "a is hardly seen where it was simulated" in picture_verdict([away])

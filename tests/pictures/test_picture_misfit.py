@@ -10,10 +10,10 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens
+from warp_resphys.experiment.picture_laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import ParameterSearch
-from warp_resphys.mesh.mesh import boundary_triangles
 from warp_resphys.pictures.camera import PlacedCamera
 from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
@@ -41,7 +41,7 @@ def pose(outline=True, tracked=False, name="beam", both_ends=False):
     ends = (wr.select_vertices(MESH, x=0.0), wr.select_vertices(MESH, x=0.1))[: 1 + both_ends]
     body = wr.Body(MESH, fixed=np.concatenate(ends))
     simulator = wr.Simulator(body, wr.Corotated(2e5, 0.45), gravity=(0.0, 0.0, -9.81))
-    surface = ClosedSurface.of(boundary_triangles(MESH))
+    surface = ClosedSurface.of_mesh(MESH)
     plain = SeenPose(name, simulator, surface, ends, (Photo("0", CAMERA),), points=POINTS)
     q = plain.shape(TRUTH)
     corrections = PlacedCamera.corrections(TRUTH)
@@ -90,6 +90,36 @@ def test_parameters_come_back(seen, kind):
     if kind == "outline":
         assert difference.overlap > 0.97
         assert difference.outline_px == pytest.approx(difference.outline_mm * 0.7 / 0.31, rel=0.1)
+
+
+def test_deviations_are_those_of_repeated_pictures():
+    """Of outlines with a pixel of noise, whose two directions see the same noise."""
+    seen, _ = pose()
+    region = seen.surface.region(CAMERA.pixels(seen.shape(TRUTH), PlacedCamera.corrections(TRUTH)).numpy())
+    ranges = {"youngs_modulus": RANGES["youngs_modulus"], "camera_shift_1": Bounds(-0.02, 0.02)}
+    known = {name: value for name, value in TRUTH.items() if name not in ranges}
+    first, found, said = {name: TRUTH[name] for name in ranges}, [], []
+    for seed in range(16):
+        mask = noisy_mask(region, SIZE[::-1], 1.0, np.random.default_rng(seed))
+        own = replace(seen, photos=(replace(seen.photos[0], outline=Outline.of_mask(mask)),))
+        result = ParameterSearch(PictureMisfit([own], ranges, known)).run([first], 8)
+        found.append(np.log(result.parameters["youngs_modulus"]))
+        said.append(result.uncertainty.deviation["youngs_modulus"] / result.parameters["youngs_modulus"])
+    assert 0.5 < np.std(found, ddof=1) / np.mean(said) < 1.4
+    assert abs(np.mean(found) - np.log(TRUTH["youngs_modulus"])) < 0.02
+    # Copies of a picture, or others of the body at rest by the same camera, say no more than one.
+    thrice = replace(own, photos=3 * own.photos)
+    again = ParameterSearch(PictureMisfit([thrice], ranges, known)).run([first], 8)
+    assert again.parameters["youngs_modulus"] == pytest.approx(result.parameters["youngs_modulus"], rel=1e-6)
+    assert again.uncertainty.deviation["youngs_modulus"] == pytest.approx(
+        result.uncertainty.deviation["youngs_modulus"], rel=0.02
+    )
+
+
+def test_a_body_beside_the_picture_is_named():
+    seen, _ = pose()
+    with pytest.raises(InputError, match="0 does not show the simulated body"):
+        seen.difference(seen.photos[0], seen.shape(TRUTH), {"camera_shift_1": 0.5})
 
 
 def test_an_obstacle_before_the_body_hardly_matters():

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.pictures.reading import Colours, read_mask, read_scene, read_tracked
+from warp_resphys.pictures.reading import Colours, read_mask, read_picture, read_scene, read_tracked
 
 FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}
 
@@ -33,7 +33,7 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     content = {"frames": [FRAME, {**FRAME, "mask": "mask.png"}], "fixed": [{"vertices": [3, 1]}, {"vertices": [7]}]}
     scene = read_scene(write(tmp_path / "camera.json", content))
     assert [clamp.tolist() for clamp in scene.clamps] == [[3, 1], [7]]
-    assert scene.frames[0].time == 0.5
+    assert [frame.number for frame in scene.frames] == [0, 1]
     red = read_mask(scene.frames[0], Colours((340.0, 10.0), 0.5, 0.3))
     assert red.sum() == 900  # with its hole, without the speck
     assert red[10:40, 10:40].all()
@@ -41,10 +41,23 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     given[5:9, 5:9] = 1
     Image.fromarray(given).save(tmp_path / "mask.png")
     assert read_mask(scene.frames[1], None).sum() == 16
+    clear = np.full((60, 80, 4), 255, dtype=np.uint8)
+    clear[..., 3] = 255 * given
+    Image.fromarray(clear).save(tmp_path / "mask.png")
+    assert read_mask(scene.frames[1], None).sum() == 16
     with pytest.raises(InputError, match=r"00.png: no part has a hue from 100 to 140 degrees"):
         read_mask(scene.frames[0], Colours((100.0, 140.0), 0.5, 0.3))
     with pytest.raises(DataFileError, match=r"has no mask: name one in camera.json"):
         read_mask(scene.frames[0], None)
+
+
+def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):
+    """Telephones write how they were held beside the picture."""
+    image = picture(tmp_path / "00.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turned to the right
+    Image.fromarray(image).save(tmp_path / "turned.png", exif=exif)
+    assert (read_picture(tmp_path / "turned.png") == np.rot90(image, -1)).all()
 
 
 @pytest.mark.parametrize(
@@ -54,8 +67,11 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
         ({"frames": []}, "has no list 'frames'"),
         ([1], "has no list 'frames'"),
         ({"frames": [{"time": 0.0}]}, "frame 0 has no 'image'"),
-        ({"frames": [{**FRAME, "world_to_camera": [1, 2]}]}, "frame 0 needs 'world_to_camera', 4 rows of 4 numbers"),
+        ({"frames": [{**FRAME, "world_to_camera": [1, 2]}]}, "frame 0: 'world_to_camera' has 4 rows of 4 numbers"),
         ({"frames": [FRAME], "fixed": [{"vertex": 1}]}, "'fixed' is a list of clamps"),
+        ({"frames": [FRAME], "fixed": [{"vertices": []}]}, "a clamp of 'fixed' has no 'vertices'"),
+        ({"frames": [{**FRAME, "world_to_camera": np.diag([1, 1, -1, 1]).tolist()}]}, "is no rotation with a shift"),
+        ({"frames": [{**FRAME, "world_to_camera": np.diag([2, 2, 2, 1]).tolist()}]}, "is no rotation with a shift"),
     ],
 )
 def test_a_damaged_scene_is_named(tmp_path, content, sentence):
@@ -70,21 +86,43 @@ def test_tracked_points_of_known_programs(tmp_path):
         "bodyparts,tip,tip,tip,base,base,base",
         "coords,x,y,likelihood,x,y,likelihood",
     ]
-    lines = [*heads, "0,3,4,0.9,1,2,1.0", "1,8,9,0.2,5,6,0.8"]
+    lines = [*heads, "0,3,4,0.9,1,2,1.0", "7,8,9,0.2,5,6,0.8"]
     table = write(tmp_path / "dlc.csv", "\n".join(lines))
-    assert read_tracked(table, ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
-    plain = write(tmp_path / "plain.csv", "frame,base.x,base.y,tip.x,tip.y\n0,1,2,3,4\n1,5,6,,\n")
-    assert read_tracked(plain, ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
+    assert read_tracked(table, ["base", "tip"], 0.6, [0, 7]) == pytest.approx(wanted, nan_ok=True)
+    plain = write(tmp_path / "plain.csv", "frame,base.x,base.y,tip.x,tip.y\n7,5,6,,\n0,1,2,3,4\n")
+    assert read_tracked(plain, ["base", "tip"], 0.6, [0, 7]) == pytest.approx(wanted, nan_ok=True)
     tracks = np.nan_to_num(wanted)
     np.savez(tmp_path / "cotracker.npz", tracks=tracks, visibility=np.array([[1, 1], [1, 0]]))
-    assert read_tracked(tmp_path / "cotracker.npz", ["base", "tip"], 0.6) == pytest.approx(wanted, nan_ok=True)
+    assert read_tracked(tmp_path / "cotracker.npz", ["base", "tip"], 0.6, [0, 1]) == pytest.approx(wanted, nan_ok=True)
 
 
-def test_a_damaged_table_is_named(tmp_path):
+def test_tracked_points_of_several_animals(tmp_path):
+    heads = ["scorer,n,n,n,n", "individuals,left,left,right,right", "bodyparts,tip,tip,tip,tip", "coords,x,y,x,y"]
+    table = write(tmp_path / "dlc.csv", "\n".join([*heads, "0,1,2,3,4"]))
+    assert read_tracked(table, ["right.tip"], 0.6, [0]).tolist() == [[[3.0, 4.0]]]
     with pytest.raises(DataFileError, match="no columns x and y of 'tip'"):
-        read_tracked(write(tmp_path / "a.csv", "frame,base.x,base.y\n0,1,2\n"), ["base", "tip"], 0.6)
+        read_tracked(table, ["tip"], 0.6, [0])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("frame,base.x,base.y\n0,1,2\n", "no columns x and y of 'tip'"),
+        ("base.x,base.y,tip.x,tip.y\n1,2,3,4\n", "its first column is 'base.x', not 'frame'"),
+        ("frame,base.x,base.y,tip.x,tip.y\n0,1,2,3,4\n", "has no row of frame 1"),
+        ("frame,base.x,base.y,tip.x,tip.y\n0,1,2\n", "cannot read tracked points"),
+        ("", "cannot read tracked points"),
+    ],
+)
+def test_a_damaged_table_is_named(tmp_path, text, sentence):
+    with pytest.raises(DataFileError, match=sentence):
+        read_tracked(write(tmp_path / "a.csv", text), ["base", "tip"], 0.6, [0, 1])
+
+
+def test_tracks_of_another_shape_are_refused(tmp_path):
     with pytest.raises(DataFileError, match="cannot read tracked points"):
-        read_tracked(tmp_path / "missing.csv", ["base"], 0.6)
-    np.savez(tmp_path / "b.npz", tracks=np.zeros((4, 3, 2)))
-    with pytest.raises(DataFileError, match=r"has tracks of shape \(4, 3, 2\): the 2 points"):
-        read_tracked(tmp_path / "b.npz", ["base", "tip"], 0.6)
+        read_tracked(tmp_path / "missing.csv", ["base"], 0.6, [0])
+    for arrays in ({"tracks": np.zeros((4, 3, 2))}, {"tracks": np.zeros((4, 2, 2)), "visibility": np.ones(4)}):
+        np.savez(tmp_path / "b.npz", **arrays)
+        with pytest.raises(DataFileError, match="cannot read tracked points"):
+            read_tracked(tmp_path / "b.npz", ["base", "tip"], 0.6, [0])

@@ -10,7 +10,6 @@ from PIL import Image
 from ..io.atomic import atomic_path
 from ..io.files import write_json
 from ..io.stages import StageContext
-from ..mesh.mesh import boundary_triangles
 from ..pictures.camera import PlacedCamera
 from ..pictures.outlines import ClosedSurface
 from ..settings.pictures import SimulatedCamera
@@ -30,7 +29,7 @@ def play_camera(context: StageContext) -> None:
     assert played is not None
     material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})
     body = build_body(settings)
-    surface = ClosedSurface.of(boundary_triangles(body.mesh))
+    surface = ClosedSurface.of_mesh(body.mesh)
     for number, (name, pose) in enumerate(data.poses.items()):
         gravity = settings.gravity if pose.gravity is None else pose.gravity
         simulator = build_simulator(settings.model_copy(update={"gravity": gravity}), material, body)

@@ -1,13 +1,13 @@
 """Identification of a material from pictures of bodies at rest: stages and results.
 
 The material is identified from the poses of training, with the camera. Every pose is then predicted by three models:
-the identified simulator, the uncorrected one, and the undeformed body. In each, what belongs to a pose alone (the
-values with ``per: trial``) is fitted to that pose, as nothing else tells where it stands.
+the identified simulator, the uncorrected one, and the undeformed body. In each, the place before the camera, the tilt
+of gravity and the clamps are fitted to the pose, as nothing else shows them.
 """
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -23,11 +23,11 @@ from ..io.progress import Progress
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.bounds import Bounds
 from ..learning.identification import ParameterSearch
-from ..learning.parameters import configured_parameters, own_name, split_name
+from ..learning.parameters import TILTS, configured_parameters, own_name, split_name
 from ..pictures.camera import CORRECTIONS, PlacedCamera
 from ..pictures.misfit import PictureMisfit, values_of
 from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, SeenPose, Shape
-from ..report.page import number_text
+from ..report.page import NONE, number_text
 from ..report.pictures_page import PictureResult, picture_verdict, write_pictures_report
 from ..settings.pictures import PictureData
 from ..settings.run import RunSettings
@@ -43,6 +43,8 @@ log = logging.getLogger(__name__)
 DIFFERENCES: Final = "pictures.json"
 OUTLINES: Final = "outlines.h5"
 MODELS: Final = ("undeformed", "simulation", "sysid")
+
+_PLACED: Final = (*CORRECTIONS, CLAMP_TURN, CLAMP_SHIFT, *TILTS)  # what is of a picture, not of a material
 
 Values = dict[str, float]
 
@@ -63,7 +65,7 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     common = {"files": {**files, **picture_files(data)}, "data": data}
     settings = PictureStage.of(run, **common)
     if data.folder is None:
-        written = tuple(f"recordings/{pose.folder}/{SCENE}" for pose in data.poses.values())
+        written = tuple(f"recordings/{own.folder}/{file}" for own in data.poses.values() for file in (SCENE, "00.png"))
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
     identified = IdentifyPicturesStage.of(run, **common)
@@ -96,83 +98,116 @@ def check_pictures(run: RunSettings) -> None:
     for name, limits in wanted.parameters.items():
         if limits.per == "session":
             raise InputError(f"identify.parameters.{name}.per is session: pictures have all, material and trial.")
+        if limits.per == "trial" and name not in _PLACED:
+            raise InputError(f"identify.parameters.{name}.per is trial, which says nothing of others: take material.")
 
 
 class _Plan:
-    """Bounds and first guesses of the parameters of a run.
+    """Poses of a run, and bounds and first guesses of their parameters.
 
     Args:
         settings: of the stage.
-        poses: their readers.
+        run_dir: the run folder.
+        cameras: (4, 4) of poses whose standing camera is known, by name.
     """
 
-    def __init__(self, settings: IdentifyPicturesStage, poses: SeenPoses) -> None:
-        self.settings, self.data, self.poses = settings, settings.data, poses
+    def __init__(
+        self, settings: IdentifyPicturesStage, run_dir: Path, cameras: Mapping[str, Any] | None = None
+    ) -> None:
+        self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
+        self._cameras = {name: np.array(camera) for name, camera in (cameras or {}).items()}
 
-    def bounds(self, poses: Sequence[SeenPose], per: Sequence[str] = ("all", "material", "trial")) -> dict[str, Bounds]:
-        """Ranges of the parameters that act on some poses, and that all, a material's or one of them share."""
+    def bounds(self, poses: Sequence[SeenPose], chosen: Callable[[str, str], bool]) -> dict[str, Bounds]:
+        """Ranges of parameters that act on some poses, with a name for each owner.
+
+        Args:
+            poses: some poses.
+            chosen: whether a parameter of this name and ``per`` is wanted.
+        """
         result = {}
         for name, limits in self.settings.identify.parameters.items():
             owners = {"all": [""], "material": [pose.material for pose in poses], "trial": [p.name for p in poses]}
-            for owner in dict.fromkeys(owners[limits.per]) if limits.per in per else ():
+            for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
                 mine = [pose for pose in poses if owner in ("", pose.material, pose.name)]
-                if any(self._matters(name, pose) for pose in mine):
+                if any(name in (pose.parameter_names if pose.deforms else CORRECTIONS) for pose in mine):
                     result[own_name(name, owner) if owner else name] = bounds_of(limits)
         return result
 
-    @staticmethod
-    def _matters(name: str, pose: SeenPose) -> bool:
-        return name in CORRECTIONS if not pose.deforms else name in pose.parameter_names
-
-    def guess(self, names: Sequence[str], poses: Sequence[SeenPose]) -> Values:
-        """First guesses: as given, the mean of the prior, or as configured."""
+    def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:
+        """First guesses: as given, the configured turn of a clamp, the mean of the prior, or as configured."""
         wanted, result = self.settings.identify, Values()
-        neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True))
+        neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True)) | {CLAMP_SHIFT: 0.0}
         for name in names:
             parameter, owner = split_name(name)
             pose = next(pose for pose in poses if owner in ("", pose.material, pose.name))
             prior = wanted.parameters[parameter].prior
             if parameter in wanted.first_guess:
-                value = wanted.first_guess[parameter]
+                result[name] = wanted.first_guess[parameter]
             elif parameter == CLAMP_TURN:
-                value = math.radians(self.data.poses[pose.name].clamp_turn)
+                result[name] = math.radians(self.data.poses[pose.name].clamp_turn)
             elif prior is not None:
-                value = prior.mean
-            elif parameter in neutral or parameter == CLAMP_SHIFT:
-                value = neutral.get(parameter, 0.0)
+                result[name] = prior.mean
+            elif parameter in neutral:
+                result[name] = neutral[parameter]
             else:
-                value = configured_parameters(pose.simulator, [parameter])[parameter]
-            result[name] = value
+                result[name] = configured_parameters(pose.simulator, [parameter])[parameter]
         return result
 
-    def given(self, pose: SeenPose) -> Values:
-        """Values that act on a pose without being identified: the turn of its second clamp."""
-        turn = self.data.poses[pose.name].clamp_turn
-        return {CLAMP_TURN: math.radians(turn)} if turn and len(pose.clamps) > 1 else {}
+    def given(self, poses: Sequence[SeenPose]) -> Values:
+        """The turns of second clamps, where they are not identified."""
+        turns = {pose.name: math.radians(self.data.poses[pose.name].clamp_turn) for pose in poses}
+        if CLAMP_TURN in self.settings.identify.parameters:
+            return {}
+        return {own_name(CLAMP_TURN, name): turn for name, turn in turns.items() if turn}
 
-    def seen_from(
-        self, name: str, known: Values | None = None, deforms: bool = True, near: Shape | None = None
-    ) -> SeenPose:
-        """A pose; before a standing camera, with the given place of the camera from which it is seen best at first.
+    def pose(self, name: str, known: Values, deforms: bool = True, near: Shape | None = None) -> SeenPose:
+        """A pose; a standing camera is the one of its frames' from which the body is seen best at first.
 
         Args:
             name: of the pose.
             known: values of parameters; first guesses of the others.
             deforms: whether the body is simulated.
             near: its shape with similar values.
+
+        Raises:
+            InputError: none of the cameras sees the body.
         """
-        first = self.poses.pose(name, 0 if self.data.stands else None, deforms)
-        candidates = self.poses.cameras_of(name)
-        if not self.data.stands or len(candidates) == 1:
-            return first
-        values = values_of(
-            first, {**self.guess([*self.bounds([first])], [first]), **self.given(first), **(known or {})}
-        )
-        q, losses = first.shape(values, near), list[float]()
-        for camera in candidates:
-            pose = self.poses.pose(name, camera, deforms)
-            losses.append(sum(pose.difference(photo, q, values).distance for photo in pose.photos))
-        return self.poses.pose(name, candidates[int(np.argmin(losses))], deforms)
+        if not self.data.stands:
+            return self.poses.pose(name, None, deforms)
+        if name in self._cameras:
+            return self.poses.pose(name, self._cameras[name], deforms)
+        poses = [self.poses.pose(name, camera, deforms) for camera in self.poses.cameras_of(name)]
+        guess = self.guess(self.bounds(poses[:1], lambda name, per: True), poses[:1])
+        values = values_of(poses[0], {**guess, **self.given(poses[:1]), **known})
+        q, distances, failure = poses[0].shape(values, near), list[float](), None
+        for pose in poses:
+            try:
+                distances.append(sum(pose.difference(photo, q, values).distance for photo in pose.photos))
+            except InputError as error:
+                distances.append(math.inf)
+                failure = error
+        if failure is not None and not np.isfinite(distances).any():
+            raise failure
+        self._cameras[name] = poses[int(np.argmin(distances))].photos[0].camera.pose.numpy()
+        return poses[int(np.argmin(distances))]
+
+    def fitted(self, name: str, model: str, identified: Values, near: Shape | None) -> tuple[SeenPose, Values, Shape]:
+        """A pose with a model, the values of its parameters, and its shape.
+
+        Place before the camera, tilt of gravity and clamps are fitted to it, unless they were identified with it. The
+        identified model has the identified lens; the others, which have none, fit it as well.
+        """
+        known = dict(identified) if model == "sysid" else {}
+        pose = self.pose(name, known, model != MODELS[0], near)
+        bounds = self.bounds([pose], lambda name, per: name in _PLACED and (model != "sysid" or per == "trial"))
+        given = {**self.given([pose]), **known}
+        fitted = {key: known[key] for key in bounds if key in known}
+        if bounds and not fitted:
+            wanted, guess = self.settings.identify, self.guess(bounds, [pose])
+            search = ParameterSearch(PictureMisfit([pose], bounds, given, [near]))
+            fitted = search.run([guess], wanted.max_evaluations, tolerance=wanted.tolerance).parameters
+        own = values_of(pose, {**given, **fitted})
+        return pose, own, (own, pose.shape(own, near))
 
 
 def identify_pictures(context: StageContext) -> None:
@@ -183,12 +218,11 @@ def identify_pictures(context: StageContext) -> None:
     """
     settings: IdentifyPicturesStage = context.settings
     wanted, kept = settings.identify, Checkpoint(context, "sysid")
-    plan = _Plan(settings, SeenPoses(settings, context.run_dir))
-    poses = [plan.seen_from(name) for name in settings.data.train]
-    bounds = plan.bounds(poses)
-    given = {own_name(key, pose.name): value for pose in poses for key, value in plan.given(pose).items()}
-    misfit = PictureMisfit(poses, bounds, given)
-    search, guess = ParameterSearch(misfit), plan.guess([*bounds], poses)
+    plan = _Plan(settings, context.run_dir)
+    poses = [plan.pose(name, {}) for name in settings.data.train]
+    bounds = plan.bounds(poses, lambda name, per: True)
+    misfit = PictureMisfit(poses, bounds, plan.given(poses))
+    search, guess = ParameterSearch(misfit), plan.guess(bounds, poses)
     if "starts" not in kept.content:
         kept.keep(starts=search.starts(guess, wanted.starts, wanted.candidates, settings.seed), attempts=[])
     starts, attempts = kept.content["starts"], kept.content["attempts"]
@@ -204,7 +238,7 @@ def identify_pictures(context: StageContext) -> None:
 
         found = search.run(starts, wanted.max_evaluations, report, attempts, keep, wanted.tolerance)
     result = {**asdict(found), "first_guess": guess}
-    cameras = {pose.name: pose.photos[0].camera.pose.tolist() for pose in poses}
+    cameras = {pose.name: pose.photos[0].camera.pose.tolist() for pose in poses if settings.data.stands}
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)
@@ -227,8 +261,8 @@ def compare_pictures(context: StageContext) -> None:
         ConvergenceError: a pose has no equilibrium.
     """
     settings: IdentifyPicturesStage = context.settings
-    plan = _Plan(settings, SeenPoses(settings, context.run_dir))
-    shared = read_json(context.run_dir / IDENTIFICATION)["sysid"]["parameters"]
+    identified = read_json(context.run_dir / IDENTIFICATION)
+    plan, shared = _Plan(settings, context.run_dir, identified["cameras"]), identified["sysid"]["parameters"]
     names = [*settings.data.train, *settings.data.test]
     rows = list[dict[str, Any]]()
     with (
@@ -238,7 +272,7 @@ def compare_pictures(context: StageContext) -> None:
         for name in names:
             near: Shape | None = None
             for model in reversed(MODELS):
-                pose, values, near = _fitted(plan, name, model, shared, near)
+                pose, values, near = plan.fitted(name, model, shared, near)
                 for number, photo in enumerate(pose.photos):
                     row = {"pose": name, "picture": number, "model": model, "tested": name in settings.data.test}
                     rows.append({**row, **asdict(pose.difference(photo, near[1], values)), "values": values})
@@ -250,30 +284,6 @@ def compare_pictures(context: StageContext) -> None:
                             create(file, f"{name}/{number}/measured", photo.outline.points, "px")
                 progress.advance(1, pose=name)
     write_json(context.run_dir / DIFFERENCES, {"rows": rows})
-
-
-def _fitted(
-    plan: _Plan, name: str, model: str, identified: Values, near: Shape | None
-) -> tuple[SeenPose, Values, Shape]:
-    """A pose with a model, the values of its parameters, and its shape; what belongs to it alone is fitted to it.
-
-    The lens is shared with the identification; the other models have none, and fit it as well.
-    """
-    known = dict(identified) if model == "sysid" else {}
-    pose = plan.seen_from(name, known, model != MODELS[0], near)
-    bounds = plan.bounds([pose], ("trial",) if model == "sysid" else ("trial", "all"))
-    if model != "sysid":
-        bounds = {key: own for key, own in bounds.items() if split_name(key)[1] or key in CORRECTIONS}
-    given = {**plan.given(pose), **known}
-    fitted = {key: known[key] for key in bounds if key in known}
-    if bounds and not fitted:
-        wanted = plan.settings.identify
-        search = ParameterSearch(PictureMisfit([pose], bounds, given, [near]))
-        fitted = search.run(
-            [plan.guess([*bounds], [pose])], wanted.max_evaluations, tolerance=wanted.tolerance
-        ).parameters
-    own = values_of(pose, {**given, **fitted})
-    return pose, own, (own, pose.shape(own, near))
 
 
 def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[PictureResult]:
@@ -308,12 +318,16 @@ def report_pictures(context: StageContext) -> None:
     assert data is not None
     settings = PictureStage.of(run, files={}, data=data)
     poses = SeenPoses(settings, context.run_dir)
-    start = {name: value for name, value in run.simulation.constants.items()}
+    identified = read_json(context.run_dir / IDENTIFICATION)["sysid"]
+    start = dict(run.simulation.constants)
+    for name in data.train:
+        material, own = data.poses[name].material or "", poses.material(name).constants
+        start |= {own_name(key, material): value for key, value in own.items()} if material else {}
     write_pictures_report(
         context.run_dir / REPORT,
         picture_metrics(context.run_dir, run),
         run,
-        read_json(context.run_dir / IDENTIFICATION)["sysid"],
+        identified,
         start,
         context.run_dir / OUTLINES,
         poses.picture,
@@ -342,13 +356,14 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     metrics = picture_metrics(folder, run)
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
-    table = Table(
-        "pose", "undeformed [mm]", "uncorrected [mm]", "identified [mm]", "overlap", title="Distance of outlines"
-    )
+    by_outline = any(result.outline_mm["sysid"] is not None for result in results)
+    title = f"Distance of {'outlines' if by_outline else 'tracked points'}"
+    heads = ["undeformed [mm]", "uncorrected [mm]", "identified [mm]", *["overlap"] * by_outline]
+    table = Table("pose", *heads, title=title)
     for result in results:
-        cells = [number_text(result.outline_mm[model]) for model in MODELS]
-        head = f"{result.pose} (test)" if result.tested else result.pose
-        table.add_row(head, *cells, number_text(result.overlap["sysid"]))
+        cells = [number_text(result.distance(model)) for model in MODELS]
+        cells += [NONE if (share := result.overlap["sysid"]) is None else number_text(share)] * by_outline
+        table.add_row(f"{result.pose} (test)" if result.tested else result.pose, *cells)
     console = Console()
     console.print(table)
     console.print(picture_verdict(results), soft_wrap=True)

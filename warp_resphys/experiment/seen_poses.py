@@ -17,12 +17,13 @@ from ..io.atomic import digest
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.stages import StageContext
-from ..mesh.mesh import Mesh, boundary_triangles, quadratic, select_vertices
+from ..mesh.mesh import Mesh, quadratic, select_vertices
 from ..mesh.readers import read_mesh
 from ..pictures.camera import PlacedCamera
 from ..pictures.outlines import ClosedSurface, Outline
 from ..pictures.reading import Colours, Frame, read_mask, read_picture, read_scene, read_tracked
 from ..pictures.seen import Photo, SeenPose
+from ..pictures.tags import Tag
 from ..settings.body import MaterialSettings
 from ..settings.pictures import PictureData, PoseSettings
 from ..settings.stages import PictureStage
@@ -33,7 +34,8 @@ log = logging.getLogger(__name__)
 PICTURES: Final = "pictures.h5"
 SCENE: Final = "camera.json"
 _KIND: Final = "pictures"
-_ALIKE: Final = 1e-9  # of two poses of a camera
+_ALIKE: Final = 1e-9  # of two cameras
+_MOVED: Final = 0.05  # m: a tag that can be seen in two ways keeps its place
 
 
 def scene_file(data: PictureData, pose: PoseSettings, run_dir: Path) -> Path:
@@ -88,21 +90,58 @@ def import_pictures(context: StageContext) -> None:
             frames = _different(name, _chosen(scene.frames, pose))
             colours = pose.mask or data.mask
             chosen = None if colours is None else Colours(**dict(colours))
-            masks = [read_mask(frame, chosen) for frame in frames] if pose.outline else []
+            masks = [_mask(frame, chosen) for frame in frames] if pose.outline else []
             if len({mask.shape for mask in masks}) > 1:
                 raise DataFileError(f"{scene.path}: its pictures have different sizes: give each size its own pose.")
+            numbers = [frame.number for frame in frames]
             if pose.points is not None:
-                tracked = read_tracked(scene.path.parent / pose.points, [*data.points], data.likelihood)
-                numbers = [scene.frames.index(frame) for frame in frames]
-                if len(tracked) < len(scene.frames):
-                    raise DataFileError(
-                        f"{scene.path.parent / pose.points} has {len(tracked)} rows for {len(scene.frames)} frames."
-                    )
-                create(file, f"{name}/tracked", tracked[numbers], "px")
+                path = scene.path.parent / pose.points
+                tracked = read_tracked(path, [*data.points], data.likelihood, numbers)
+                if not np.isfinite(tracked).any():
+                    raise DataFileError(f"{path}: no point was seen in the frames of data.poses.{name}: leave it out.")
+                create(file, f"{name}/tracked", tracked, "px")
             create(file, f"{name}/masks", np.array(masks, dtype=bool))
-            create(file, f"{name}/world_to_camera", np.stack([frame.pose for frame in frames]), "1, m")
-            create(file, f"{name}/frames", [scene.frames.index(frame) for frame in frames])
+            create(file, f"{name}/world_to_camera", _cameras(scene.path, frames, data), "1, m")
+            create(file, f"{name}/frames", numbers)
             log.info("import: %s has %d pictures", name, len(frames))
+
+
+def _mask(frame: Frame, colours: Colours | None) -> NDArray[np.bool_]:
+    """The mask of a picture, of the same size as that."""
+    mask = read_mask(frame, colours)
+    if frame.mask is not None and (size := read_picture(frame.image).shape[:2]) != mask.shape:
+        raise DataFileError(
+            f"{frame.mask} has {mask.shape[1]} x {mask.shape[0]} pixels, and {frame.image.name} {size[1]} x {size[0]}."
+        )
+    return mask
+
+
+def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[np.float64]:
+    """(F, 2, 4, 4) the given cameras of frames, or the two that a tag in each allows."""
+    if data.tag is None:
+        if missing := [frame.image.name for frame in frames if frame.pose is None]:
+            raise DataFileError(f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag.")
+        given = np.stack([np.stack([frame.pose, frame.pose]) for frame in frames if frame.pose is not None])
+        return _of_one_camera(path, given, data)
+    tag, lens = Tag(**dict(data.tag)), read_lens(data)
+    found = [tag.poses(read_picture(frame.image), lens) for frame in frames]
+    if hidden := [frame.image for frame, own in zip(frames, found, strict=True) if not own]:
+        raise DataFileError(
+            f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame out, "
+            "or give its world_to_camera."
+        )
+    return _of_one_camera(path, np.stack([np.stack([own[0], own[-1]]) for own in found]), data)
+
+
+def _of_one_camera(path: Path, cameras: NDArray[np.float64], data: PictureData) -> NDArray[np.float64]:
+    """The cameras (F, 2, 4, 4), refused if a standing one sees the origin of the mesh at different places."""
+    apart = np.linalg.norm(cameras[:, 0, :3, 3] - cameras[0, 0, :3, 3], axis=1).max()
+    if data.stands and apart > _MOVED:
+        raise DataFileError(
+            f"{path}: the origin of the mesh is at places {100.0 * apart:.0f} cm apart before the cameras of its "
+            "frames: set data.stands=false if they are different cameras, or one that moves."
+        )
+    return cameras
 
 
 def _different(name: str, frames: Sequence[Frame]) -> list[Frame]:
@@ -123,7 +162,7 @@ class Loaded:
     """A pose as it was read."""
 
     masks: NDArray[np.bool_]  # (F, H, W), or empty
-    cameras: NDArray[np.float64]  # (F, 4, 4) world_to_camera
+    cameras: NDArray[np.float64]  # (F, 2, 4, 4) world_to_camera: two that a tag allows, or the given one twice
     tracked: NDArray[np.float64] | None  # (F, M, 2) [px]
     frames: tuple[int, ...]
 
@@ -163,12 +202,12 @@ class SeenPoses:
         scene = read_scene(scene_file(self.data, self.data.poses[name], self.run_dir))
         return read_picture(scene.frames[self.loaded[name].frames[number]].image)
 
-    def cameras_of(self, name: str) -> list[int]:
-        """Returns the numbers of the pictures whose given cameras differ, from which a standing camera is chosen."""
-        different: list[int] = []
-        for number, pose in enumerate(self.loaded[name].cameras):
-            if all(np.abs(pose - self.loaded[name].cameras[other]).max() > _ALIKE for other in different):
-                different.append(number)
+    def cameras_of(self, name: str) -> list[NDArray[np.float64]]:
+        """Returns the different cameras (4, 4) of a pose's frames, from which a standing camera is chosen."""
+        different: list[NDArray[np.float64]] = []
+        for camera in self.loaded[name].cameras.reshape(-1, 4, 4):
+            if all(np.abs(camera - other).max() > _ALIKE for other in different):
+                different.append(camera)
         return different
 
     def material(self, name: str) -> MaterialSettings:
@@ -177,12 +216,12 @@ class SeenPoses:
         common = self.settings.simulation
         return common.changed(**{**common.constants, **constants})
 
-    def pose(self, name: str, camera: int | None = None, deforms: bool = True) -> SeenPose:
+    def pose(self, name: str, camera: NDArray[np.float64] | None = None, deforms: bool = True) -> SeenPose:
         """Returns a pose.
 
         Args:
             name: of the pose.
-            camera: number of the picture whose given camera counts for all; None: each has its own.
+            camera: (4, 4) of all pictures; None: each has its own.
             deforms: whether the body is simulated, or undeformed.
         """
         settings, own, loaded = self.settings, self.data.poses[name], self.loaded[name]
@@ -200,11 +239,11 @@ class SeenPoses:
             self._outlines[name] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
         photos = []
         for number, frame in enumerate(loaded.frames):
-            pose = torch.as_tensor(loaded.cameras[number if camera is None else camera])
+            pose = torch.as_tensor(loaded.cameras[number, 0] if camera is None else camera)
             tracked = None if loaded.tracked is None else loaded.tracked[number]
             placed = PlacedCamera(self.lens, pose, centre)
             photos.append(Photo(f"{name} {frame}", placed, self._outlines[name][number], tracked))
-        surface = ClosedSurface.of(boundary_triangles(mesh))
+        surface = ClosedSurface.of_mesh(mesh)
         return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points, deforms)
 
     def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
@@ -217,7 +256,10 @@ class SeenPoses:
             mesh = read_mesh(scene.path.parent / own.mesh, self.data.units)
         corners = len(mesh.vertices)
         if wrong := [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]:
-            raise DataFileError(f"{scene.path}: 'fixed' has the vertex {wrong[0].max()}, but the mesh has {corners}.")
+            raise DataFileError(
+                f"{scene.path}: 'fixed' has vertices from {wrong[0].min()} to {wrong[0].max()}, but the mesh has those "
+                f"from 0 to {corners - 1}."
+            )
         if own.mesh is not None and self.data.order == 2:
             mesh = quadratic(mesh)
         clamps = tuple(_with_midpoints(mesh, clamp) for clamp in scene.clamps)

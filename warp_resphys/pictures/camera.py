@@ -39,7 +39,9 @@ class PlacedCamera:
     centre: torch.Tensor  # (3,) c [m]
 
     def __post_init__(self) -> None:
-        """Checks the pose."""
+        """Converts arrays, and checks the pose."""
+        for name in ("pose", "centre"):
+            object.__setattr__(self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64))
         if self.pose.shape != (4, 4):
             raise InputError(f"the pose of a camera has shape {tuple(self.pose.shape)}: world_to_camera is (4, 4).")
         turn = self.pose[:3, :3]

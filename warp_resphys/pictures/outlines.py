@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..io.errors import InputError
+from ..mesh.mesh import Mesh, boundary_triangles
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -34,11 +35,13 @@ _LEAST = 8  # points of an outline
 
 @dataclass(frozen=True)
 class Outline:
-    """A measured outline: its points, and the distance of every pixel from it."""
+    """A measured outline."""
 
     points: FloatArray  # (P, 2) at equal distances along it [px]
-    distance: FloatArray  # (H, W) of the pixels from it, negative inside [px]
     region: shapely.Geometry  # what it encloses
+    size: tuple[int, int]  # width and height of the picture [px]
+    near: FloatArray  # (Q, 2) points that lie closer together, to which distances are measured [px]
+    outward: FloatArray  # (Q, 2) unit vectors across it there
 
     @classmethod
     def of_mask(cls, mask: Mask, spacing: float = 2.0) -> "Outline":
@@ -49,35 +52,28 @@ class Outline:
             spacing: of the points [px].
 
         Raises:
-            InputError: nothing is seen.
+            InputError: nothing is seen, or the body fills the picture.
         """
         smooth = np.pad(scipy.ndimage.gaussian_filter(mask.astype(np.float64), _SMOOTH), 1)
         lines = [np.asarray(line) - 1.0 for line in contourpy.contour_generator(z=smooth).lines(0.5)]
         lines = [line for line in lines if len(line) >= _LEAST]
         if not lines:
             raise InputError("the mask shows nothing of the body: check the picture, or the colours of its mask.")
-        near, far = (np.concatenate([_evenly(line, by) for line in lines]) for by in (_NEAR, spacing))
-        rows, columns = np.indices(mask.shape)
-        distance = cKDTree(near).query(np.stack([columns, rows], -1).reshape(-1, 2))[0].reshape(mask.shape)
-        signed = np.where(smooth[1:-1, 1:-1] > 0.5, -distance, distance)
+        size = (mask.shape[1], mask.shape[0])
+        points, near = (np.concatenate([_evenly(line, by) for line in lines]) for by in (spacing, _NEAR))
+        points, near = points[within(points, size)], near[within(near, size)]
+        if not len(points):
+            raise InputError("the mask fills the picture: no outline of the body is in it.")
         region = shapely.build_area(shapely.geometrycollections([shapely.linestrings(line) for line in lines]))
-        return cls(far[within(far, mask.shape)], signed, region)
+        at = near.T[::-1] + 1.0  # rows and columns of the padded mask
+        slope = np.stack([scipy.ndimage.map_coordinates(own, at, order=1) for own in np.gradient(smooth)[::-1]], 1)
+        outward = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+        return cls(points, region, size, near, outward)
 
     def signed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns distances (P,) of points (P, 2), negative inside, and their gradients (P, 2) [px].
-
-        Beyond the picture, the distance from its border is added.
-        """
-        limit = np.array(self.distance.shape[::-1]) - 1.0
-        inside = points.clip(0.0, limit)
-        corner = np.minimum(np.floor(inside), limit - 1.0).astype(int)
-        (x, y), (j, i) = (inside - corner).T, corner.T
-        a, b, c, d = (self.distance[i + down, j + right] for down in (0, 1) for right in (0, 1))
-        value = (1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d)
-        slope = np.stack([(1 - y) * (b - a) + y * (d - c), (1 - x) * (c - a) + x * (d - b)], 1)
-        beyond = points - inside
-        far = np.linalg.norm(beyond, axis=1)
-        return value + far, np.where(beyond == 0.0, slope, beyond / np.maximum(far, 1e-12)[:, None])
+        """Returns distances (P,) of points (P, 2), negative inside, and their gradients (P, 2) [px]."""
+        _, distance, gradient = _closest(points, self.near, self.outward)
+        return distance, gradient
 
 
 @dataclass(frozen=True)
@@ -102,13 +98,18 @@ class Silhouette:
         Returns:
             Their indices (P,), the distances (P,), positive outside of the body, and their gradients (P, 2) [px].
         """
-        distance, index = cKDTree(self.pixels).query(points)
-        between, outward = points - self.pixels[index], self.outward[index]
-        side = np.where((between * outward).sum(1) < 0.0, -1.0, 1.0)
-        direct = side[:, None] * between / np.maximum(distance, 1e-12)[:, None]
-        # Within a pixel the direction of the difference is that of the sampling.
-        direct = np.where(distance[:, None] < _SMOOTH, outward, direct)
-        return index, (between * direct).sum(1), direct
+        return _closest(points, self.pixels, self.outward)
+
+
+def _closest(points: FloatArray, outline: FloatArray, outward: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Closest points of an outline (Q, 2), with unit vectors across it, to points (P, 2); see `Silhouette.closest`."""
+    distance, index = cKDTree(outline).query(points)
+    between, across = points - outline[index], outward[index]
+    side = np.where((between * across).sum(1) < 0.0, -1.0, 1.0)
+    direct = side[:, None] * between / np.maximum(distance, 1e-12)[:, None]
+    # Within a pixel the direction of the difference is that of the sampling.
+    direct = np.where(distance[:, None] < _SMOOTH, across, direct)
+    return index, (between * direct).sum(1), direct
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,11 @@ class ClosedSurface:
     triangles: IntArray  # (F, 3)
     edges: IntArray  # (E, 2)
     beside: IntArray  # (E, 2)
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh) -> "ClosedSurface":
+        """Returns the surface of a body's mesh."""
+        return cls.of(boundary_triangles(mesh))
 
     @classmethod
     def of(cls, triangles: IntArray) -> "ClosedSurface":
@@ -170,9 +176,9 @@ class ClosedSurface:
         return shapely.union_all(shapely.polygons(pixels[self.triangles[chosen]]))
 
 
-def within(points: FloatArray, shape: tuple[int, ...]) -> Mask:
-    """(P,) whether points (P, 2) lie in a picture (H, W), off its borders."""
-    return np.asarray(((points > _BORDER) & (points < np.array(shape[::-1]) - 1.0 - _BORDER)).all(1))
+def within(points: FloatArray, size: tuple[int, int]) -> Mask:
+    """(P,) whether points (P, 2) lie in a picture of a width and a height, off its borders [px]."""
+    return np.asarray(((points > _BORDER) & (points < np.array(size) - 1.0 - _BORDER)).all(1))
 
 
 def visibility(points: FloatArray, hidden: FloatArray, margin: float) -> FloatArray:

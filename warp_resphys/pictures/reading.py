@@ -1,10 +1,10 @@
 """Pictures of a scene in a folder: the places of their cameras, masks of the body, and points tracked in them.
 
-A scene's `camera.json` has `frames`, each with an `image` (a file beside it), its `time` [s], `world_to_camera` (4 x 4,
-row-major, metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are not black
-where the body is; and perhaps `fixed`, a list of clamps with the numbers of their `vertices`. docs/recordings.md has an
-example. Tracked points are tables of DeepLabCut, or any with the columns `frame`, `tip.x`, `tip.y`, or files of NumPy
-with the arrays `tracks` (T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
+A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4 x 4, row-major,
+metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is;
+and perhaps `fixed`, a list of clamps with the numbers of their `vertices`. docs/pictures.md has an example. Tracked
+points are tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays
+`tracks` (T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
 """
 
 import csv
@@ -18,7 +18,7 @@ import numpy as np
 import scipy.ndimage
 from matplotlib.colors import rgb_to_hsv
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
@@ -27,7 +27,8 @@ FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SPECKS = 2  # px, of an opening that removes them
-_COORDINATES = ("x", "y", "likelihood")
+_HEADS = ("scorer", "individuals", "bodyparts", "coords")
+_RIGID = 1e-3  # of a rotation
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Colours:
         """
         hue, saturation, value = np.moveaxis(rgb_to_hsv(image[..., :3] / 255.0), -1, 0)
         first, last = self.hue
-        right = (360.0 * hue - first) % 360.0 <= (last - first) % 360.0
+        right = (360.0 * hue - first) % 360.0 <= ((last - first) % 360.0 if last - first < 360.0 else 360.0)
         right &= (saturation >= self.saturation) & (value >= self.value)
         parts, count = scipy.ndimage.label(scipy.ndimage.binary_opening(right, iterations=_SPECKS))
         if not count:
@@ -63,9 +64,9 @@ class Colours:
 class Frame:
     """An entry of a scene's `camera.json`."""
 
+    number: int
     image: Path
-    time: float  # [s]
-    pose: FloatArray  # (4, 4) world_to_camera
+    pose: FloatArray | None  # (4, 4) world_to_camera; None where a tag shows it
     mask: Path | None = None
 
 
@@ -90,12 +91,14 @@ def read_scene(path: Path) -> SceneFile:
         raise DataFileError(f"cannot read {path} ({error}): give the cameras of a scene as JSON.") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/recordings.md).")
+        raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md).")
     groups = content.get("fixed", [])
     try:
         clamps = tuple(np.array(group["vertices"], dtype=np.int64).ravel() for group in groups)
     except (KeyError, TypeError, ValueError) as error:
         raise DataFileError(f"{path}: 'fixed' is a list of clamps, each with its 'vertices': {error}.") from error
+    if not all(len(clamp) for clamp in clamps):
+        raise DataFileError(f"{path}: a clamp of 'fixed' has no 'vertices': leave it out.")
     return SceneFile(path, tuple(_frame(path, number, entry) for number, entry in enumerate(frames)), clamps)
 
 
@@ -103,25 +106,33 @@ def _frame(path: Path, number: int, entry: Any) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("image"), str):
         raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
     try:
-        pose = np.array(entry["world_to_camera"], dtype=np.float64).reshape(4, 4)
-        time = float(entry.get("time", 0.0))
-    except (KeyError, TypeError, ValueError) as error:
+        given = entry.get("world_to_camera")
+        pose = None if given is None else np.array(given, dtype=np.float64).reshape(4, 4)
+        rigid = pose is None or (
+            np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=_RIGID)
+            and np.linalg.det(pose[:3, :3]) > 0.0
+            and np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=_RIGID)
+        )
+    except (TypeError, ValueError) as error:
+        raise DataFileError(f"{path}: frame {number}: 'world_to_camera' has 4 rows of 4 numbers ({error}).") from error
+    if not rigid:
         raise DataFileError(
-            f"{path}: frame {number} needs 'world_to_camera', 4 rows of 4 numbers, and 'time' in s ({error})."
-        ) from error
+            f"{path}: frame {number}: 'world_to_camera' is no rotation with a shift, above 0, 0, 0, 1: write it row by "
+            "row, for right-handed axes."
+        )
     mask = entry.get("mask")
-    return Frame(path.parent / entry["image"], time, pose, None if mask is None else path.parent / str(mask))
+    return Frame(number, path.parent / entry["image"], pose, None if mask is None else path.parent / str(mask))
 
 
-def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Reads a picture (H, W, 3), red, green, blue.
+def read_picture(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
+    """Reads a picture (H, W, 3), red, green and blue, as it is meant to be seen, or in another mode of Pillow.
 
     Raises:
         DataFileError: it is missing or no picture.
     """
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
+            return np.asarray(ImageOps.exif_transpose(image).convert(mode))
     except (OSError, UnidentifiedImageError) as error:
         raise DataFileError(f"cannot read the picture {path} ({error}).") from error
 
@@ -134,7 +145,9 @@ def read_mask(frame: Frame, colours: Colours | None) -> Mask:
         InputError: no part has these colours.
     """
     if frame.mask is not None:
-        return np.asarray(read_picture(frame.mask).max(-1) > 0)
+        drawn = read_picture(frame.mask, "RGBA")
+        bright = np.minimum(drawn[..., :3].max(-1), 255 * (drawn[..., 3] > 127))
+        return np.asarray(bright > 0.5 * bright.max(initial=1))  # as masks are 0 and 1, or 0 and 255, or JPEG
     if colours is None:
         raise DataFileError(
             f"{frame.image} has no mask: name one in camera.json, or give the colours of the body in data.mask."
@@ -145,54 +158,56 @@ def read_mask(frame: Frame, colours: Colours | None) -> Mask:
         raise InputError(f"{frame.image}: {error}") from None
 
 
-def read_tracked(path: Path, names: Sequence[str], least: float) -> FloatArray:
-    """Reads the pixels (T, M, 2) of M points in T frames, NaN where one was not seen.
+def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequence[int]) -> FloatArray:
+    """Reads the pixels (F, M, 2) of M points in F frames, NaN where one was not seen.
 
     Args:
         path: table or file of NumPy, see the module.
         names: of the points; the columns of a file of NumPy are in their order.
         least: likelihood or visibility below which a point counts as not seen.
+        frames: numbers of the frames, from 0.
 
     Raises:
-        DataFileError: the file is missing or damaged, or lacks a point.
+        DataFileError: the file is missing or damaged, or lacks a point or a frame.
     """
     try:
         if path.suffix == ".npz":
             arrays = read_arrays(path)
             tracks = np.asarray(arrays["tracks"], dtype=np.float64)
-            sure = np.asarray(arrays["visibility"], dtype=np.float64) if "visibility" in arrays else None
+            if tracks.ndim != 3 or tracks.shape[1:] != (len(names), 2):
+                raise ValueError(f"its tracks have the shape {tracks.shape}, not (frames, {len(names)}, 2)")
+            sure = np.asarray(arrays.get("visibility", np.ones(tracks.shape[:2])), dtype=np.float64)
+            tracks = np.where(sure.reshape(*tracks.shape[:2], 1) >= least, tracks, np.nan)
+            rows = dict(enumerate(tracks))
         else:
-            tracks, sure = _table(path, names)
-    except (OSError, KeyError, ValueError) as error:
+            rows = _table(path, names, least)
+    except (OSError, KeyError, IndexError, ValueError) as error:
         raise DataFileError(f"cannot read tracked points from {path} ({error}).") from error
-    if tracks.ndim != 3 or tracks.shape[1:] != (len(names), 2):
-        raise DataFileError(
-            f"{path} has tracks of shape {tracks.shape}: the {len(names)} points of data.points need (frames, "
-            f"{len(names)}, 2)."
-        )
-    return tracks if sure is None else np.where(sure.reshape(*tracks.shape[:2], 1) >= least, tracks, np.nan)
+    if missing := [frame for frame in frames if frame not in rows]:
+        raise DataFileError(f"{path} has no row of frame {missing[0]}.")
+    return np.stack([rows[frame] for frame in frames])
 
 
-def _table(path: Path, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Pixels (T, M, 2) and likelihoods (T, M) of a table."""
+def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArray]:
+    """Pixels (M, 2) by frame of a table whose first column has the numbers of the frames."""
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.reader(file) if row]
-    if not rows:
-        raise ValueError("it is empty")
-    if rows[0][0] == "scorer":
-        of_head = dict(zip((row[0] for row in rows[:4]), rows[:4], strict=True))
-        heads = [f"{name}.{axis}" for name, axis in zip(of_head["bodyparts"], of_head["coords"], strict=True)]
-        first = 1 + max(number for number, row in enumerate(rows[:4]) if row[0] in ("scorer", "bodyparts", "coords"))
-    else:
-        heads, first = [cell.strip() for cell in rows[0]], 1
-    missing = [name for name in names if f"{name}.x" not in heads or f"{name}.y" not in heads]
-    if missing:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+    heads, first = rows[0], 1
+    if heads[0] == "scorer":
+        of_head = {row[0]: row for row in rows[: len(_HEADS)] if row[0] in _HEADS}
+        parts = of_head["bodyparts"]
+        if len({*of_head.get("individuals", ["", ""])[1:]}) > 1:  # several animals
+            parts = [f"{animal}.{part}" for animal, part in zip(of_head["individuals"], parts, strict=True)]
+        heads = ["frame", *(f"{part}.{axis}" for part, axis in zip(parts[1:], of_head["coords"][1:], strict=True))]
+        first = len(of_head)
+    if heads[0] != "frame":
+        raise ValueError(f"its first column is '{heads[0]}', not 'frame'")
+    if missing := [name for name in names if f"{name}.x" not in heads or f"{name}.y" not in heads]:
         raise ValueError(f"it has no columns x and y of {listed(missing)}")
-    values = np.array([[float(cell) if cell.strip() else np.nan for cell in row[1:]] for row in rows[first:]])
-    columns = [
-        [heads.index(f"{name}.{axis}") - 1 if f"{name}.{axis}" in heads else -1 for axis in _COORDINATES]
-        for name in names
-    ]
-    tracks = np.stack([values[:, own[:2]] for own in columns], 1)
-    sure = np.stack([values[:, own[2]] if own[2] >= 0 else np.ones(len(values)) for own in columns], 1)
-    return tracks, sure
+    result = {}
+    for row in rows[first:]:
+        values = {head: float(cell) if cell else np.nan for head, cell in zip(heads, row, strict=True)}
+        points = np.array([[values[f"{name}.x"], values[f"{name}.y"]] for name in names])
+        sure = np.array([values.get(f"{name}.likelihood", 1.0) for name in names])
+        result[int(values["frame"])] = np.where(sure[:, None] >= least, points, np.nan)
+    return result

@@ -66,7 +66,7 @@ class Difference:
         outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
         outline_px: the same in pixels.
         overlap: common area over that of both together, outside of the clamps.
-        points_mm: mean distance of the tracked points, at their depths; None without.
+        points_mm: mean distance of the tracked points that were seen, at their depths; None without.
     """
 
     outline_mm: float | None
@@ -116,6 +116,12 @@ class SeenPose:
             raise InputError(f"{self.name}: points were tracked, but their places on the body are not known.")
 
     @property
+    def copies(self) -> int:
+        """Number of its pictures by one standing camera, which have nearly the same errors; one where it moves."""
+        first = self.photos[0].camera.pose
+        return len(self.photos) if all(torch.equal(photo.camera.pose, first) for photo in self.photos) else 1
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters that shape and pictures depend on."""
         clamps = (CLAMP_TURN, CLAMP_SHIFT) if len(self.clamps) > 1 else ()
@@ -137,8 +143,8 @@ class SeenPose:
             return sim.rest_state(1).q[0]
         own = {name: sim.tensor([v]) for name, v in values.items() if name in identifiable_parameters(sim)}
         constants = sim.prepare(constants_of(sim, own))
-        before, q = ({}, sim.rest_state(1).q[0]) if near is None else near
-        if len(self.clamps) < 2:
+        before, q = ({}, sim.rest_state(1).q[0]) if near is None else (near[0], near[1].to(sim.rest_state(1).q))
+        if not any(name in own for own in (before, values) for name in (CLAMP_TURN, CLAMP_SHIFT)):
             with torch.no_grad():
                 return sim.static_equilibrium(None, constants, start=q[None]).q[0]
         first, last = ([own.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)] for own in (before, values))
@@ -158,6 +164,11 @@ class SeenPose:
         axis = torch.nn.functional.normalize(centre - rest[first].mean(0), dim=0)
         along = rest @ axis
         low, high = along[first].max(), along[second].min()
+        if not float(high) > float(low):
+            raise InputError(
+                f"{self.name}: its clamps overlap along the line from one to the other, about which the second may be "
+                "turned: leave clamp_turn and clamp_shift out."
+            )
         return centre, axis, ((along - low) / (high - low)).clamp(0.0, 1.0)
 
     def _turned(self, q: torch.Tensor, turn: float) -> torch.Tensor:
@@ -171,9 +182,10 @@ class SeenPose:
     def _clamped(self, turn: float, shift: float) -> torch.Tensor:
         """Fixed vertices (D, 3) with the second clamp turned [rad] about the line from the first to it, and shifted."""
         sim = self.simulator
-        _, axis, share = self._between()
+        _, axis, _ = self._between()
         rest = sim.rest_state(1).q[0]
-        return (self._turned(rest, turn) + (shift * share)[:, None] * axis)[sim.fixed]
+        mine = torch.isin(sim.fixed, torch.as_tensor(self.clamps[1]).to(sim.fixed))[:, None]
+        return torch.where(mine, (self._turned(rest, turn) + shift * axis)[sim.fixed], rest[sim.fixed])
 
     def outlines(self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor) -> SeenOutline:
         """Returns the outline of the body (N, 3) in a picture that has a measured one.
@@ -184,16 +196,21 @@ class SeenPose:
             corrections: (9,) of the camera.
 
         Raises:
-            InputError: a part of the body is behind the camera.
+            InputError: a part of the body is behind the camera, or none is in the picture outside of the clamps.
         """
         assert photo.outline is not None
         pixels = photo.camera.pixels(q.double().cpu(), corrections).numpy()
         rim = self.surface.silhouette(pixels)
         simulated, measured = rim.lengths.copy(), np.ones(len(photo.outline.points))
-        simulated *= within(rim.pixels, photo.outline.distance.shape)
+        simulated *= within(rim.pixels, photo.outline.size)
         for clamp in self.clamps:
             simulated *= visibility(rim.pixels, pixels[clamp], _MARGIN)
             measured *= visibility(photo.outline.points, pixels[clamp], _MARGIN)
+        if not (simulated.any() and measured.any()):
+            raise InputError(
+                f"{photo.name} does not show the simulated body: check the lens, and world_to_camera, which takes m in "
+                "the axes of the mesh to those of the camera."
+            )
         return SeenOutline(rim, simulated, measured)
 
     def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
@@ -224,5 +241,6 @@ class SeenPose:
             places = self.points(q[None])[0]
             away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
             deep = photo.camera.seen_from(places, corrections)[:, 2].numpy()
-            points = float(np.nanmean(np.linalg.norm(away, axis=1) * deep * scale))
+            distance = np.linalg.norm(away, axis=1) * deep * scale
+            points = float(np.nanmean(distance)) if np.isfinite(distance).any() else None
         return Difference(millimetres, pixels, overlap, points)

@@ -37,8 +37,9 @@ log = logging.getLogger(__name__)
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
 _DRAWN: Final = {"simulation": TONES["simulation"].light, "sysid": "#35d0ff"}
 _MARGIN: Final = 25  # px, around the body in a figure
+_COVERED: Final = 0.5  # overlap, below which a fit has failed
 _PANEL: Final = 3.6  # inch
-_BETTER: Final = 0.9  # of the uncorrected distance, below which an identification counts as better
+_BETTER: Final = 0.9  # of the uncorrected distance, below which an identification makes a difference
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,9 @@ class PictureResult:
 
 def picture_verdict(results: Sequence[PictureResult]) -> str:
     """Returns what the identification is worth, by the poses that were kept back; by those of training without any."""
-    tested = [result for result in results if result.tested]
-    shown = tested or list(results)
-    undeformed, uncorrected, identified = (
-        float(np.mean([result.distance(model) for result in shown])) for model in _MODELS
-    )
+    tested, trained = ([own for own in results if own.tested == kept] for kept in (True, False))
+    shown = tested or trained
+    undeformed, uncorrected, identified = (_mean(shown, model) for model in _MODELS)
     count = f"{len(shown)} pose{'s' * (len(shown) > 1)}"
     which = f"{count} kept back" if tested else f"the {count} of training, as none was kept back,"
     text = (
@@ -86,9 +85,24 @@ def picture_verdict(results: Sequence[PictureResult]) -> str:
         f"{number_text(undeformed)} mm with an undeformed body; in each, the place of the body before the camera is "
         "fitted to the picture."
     )
-    if not identified < _BETTER * min(uncorrected, undeformed):
-        text += " The identification is no better than what needs none: these pictures do not show the material."
+    if abs(identified - uncorrected) < (1.0 - _BETTER) * uncorrected:
+        text += " With both materials it is nearly the same: these poses hardly depend on it, and do not test it."
+    elif not identified < min(uncorrected, undeformed):
+        text += " The identification is no better than what needs none."
+    if tested and trained:
+        own, sheet, rigid = (number_text(_mean(trained, model)) for model in ("sysid", "simulation", "undeformed"))
+        text += f" In training the three are {own}, {sheet} and {rigid} mm."
+    if lost := [own.pose for own in results if (share := own.overlap["sysid"]) is not None and share < _COVERED]:
+        text += (
+            f" {' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} hardly seen where it was simulated: check the "
+            "camera, the mesh and the mask."
+        )
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
+
+
+def _mean(results: Sequence[PictureResult], model: str) -> float:
+    """Mean distance of a model over poses [mm]."""
+    return float(np.mean([result.distance(model) for result in results]))
 
 
 def write_pictures_report(
@@ -116,7 +130,8 @@ def write_pictures_report(
     """
     results = [PictureResult(**row) for row in metrics["poses"]]
     assert run.pictures is not None
-    truth = {} if run.pictures.simulated is None else {**start, **run.pictures.simulated.material}
+    played = run.pictures.simulated
+    truth = {} if played is None else {**start, **played.material, **played.corrections}
     parameters = PageTable(
         "Parameter",
         ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"],

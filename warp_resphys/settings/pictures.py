@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from ..io.settings import Count, Many, Natural, NotNegative, Pair, Settings, Some, Vector, Word, setting
+from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
 from .mesh import LengthUnit
 from .trials import LimitSettings, different
 
@@ -31,6 +31,17 @@ class LensSettings(Settings):
         if (self.file is None) == (self.matrix is None):
             raise ValueError("file and matrix: give one of them, a calibration or K.")
         return self
+
+
+class TagSettings(Settings):
+    """A square tag on the clamp, from which the camera's place is computed in place of world_to_camera."""
+
+    dictionary: Word = setting("6x6_250", "of OpenCV's ArUco tags, such as 4x4_50 or apriltag_36h11")
+    number: Count = setting(0, "of the tag")
+    size: Positive = setting(description="of its black square", unit="m")
+    centre: Vector = setting((0.0, 0.0, 0.0), "in the axes of the mesh", "m")
+    right: Vector = setting((1.0, 0.0, 0.0), "direction of its upper edge")
+    up: Vector = setting((0.0, 1.0, 0.0), "direction of its left edge")
 
 
 class PoseSettings(Settings):
@@ -66,6 +77,7 @@ class PictureData(Settings):
     kind: Literal["pictures"]
     folder: Word | None = setting(None, "of the pictures")
     lens: LensSettings = setting(description="of the camera")
+    tag: TagSettings | None = setting(None, "on the clamp; null: frames have world_to_camera")
     stands: bool = setting(
         True, "whether the camera stands still during a pose, so that the poses of its frames differ by errors alone"
     )
@@ -96,8 +108,23 @@ class PictureData(Settings):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
         if both := [name for name in self.materials if name in self.poses]:
             raise ValueError(f"materials and data.poses both have '{both[0]}': rename one.")
+        if unseen := {self.poses[name].material for name in self.test} - {self.poses[n].material for n in self.train}:
+            raise ValueError(
+                f"test has a pose of {min(map(str, unseen))}, of which no pose is in data.train: take it out."
+            )
         if self.folder is None and self.simulated is None:
             raise ValueError("folder is not set: give the folder of the pictures.")
+        if self.folder is not None and self.simulated is not None:
+            raise ValueError("simulated is for pictures without a folder, and data.folder is set: set it to null.")
+        if self.simulated is not None:
+            for name, pose in self.poses.items():
+                if pose.mesh or pose.material or pose.points or pose.clamp_turn:
+                    raise ValueError(
+                        f"poses.{name} has a mesh, a material, points or a turned clamp, which the simulated camera "
+                        "does not play: leave them out."
+                    )
+            if len({pose.folder for pose in self.poses.values()}) < len(self.poses):
+                raise ValueError("poses share a folder: give each its own.")
         return self
 
     @property

@@ -1,0 +1,65 @@
+"""The pose of a camera from a drawn tag."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.data.camera import Lens
+from warp_resphys.io.errors import InputError
+from warp_resphys.pictures.camera import rotation
+from warp_resphys.pictures.tags import Tag
+
+cv2 = pytest.importorskip("cv2")
+MATRIX = np.array([[900.0, 0.0, 330.0], [0.0, 900.0, 250.0], [0.0, 0.0, 1.0]])
+LENS = Lens(torch.as_tensor(MATRIX))
+SIZE, PLACE = 0.06, np.array([0.02, -0.01, 0.005])  # m
+RIGHT, UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])  # the tag looks along x
+
+
+def pose(turn):
+    """world_to_camera that sees the tag from the front, turned by (3,) rad."""
+    axes = np.stack([RIGHT, -UP, np.cross(RIGHT, -UP)])
+    camera = np.eye(4)
+    camera[:3, :3] = rotation(torch.tensor(turn, dtype=torch.float64)).numpy() @ axes
+    camera[:3, 3] = np.array([0.01, -0.02, 0.6]) - camera[:3, :3] @ PLACE
+    return camera
+
+
+def picture(camera, number=7):
+    """The tag, seen by a camera, on white."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    tag = cv2.aruco.generateImageMarker(dictionary, number, 300)
+    half = SIZE / 2.0
+    corners = [PLACE + x * half * RIGHT + y * half * UP for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+    seen = np.array([MATRIX @ (camera[:3, :3] @ corner + camera[:3, 3]) for corner in corners])
+    pixels = (seen[:, :2] / seen[:, 2:]).astype(np.float32)
+    source = np.array([[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], dtype=np.float32)
+    homography = cv2.getPerspectiveTransform(source, pixels)
+    image = cv2.warpPerspective(tag, homography, (660, 500), flags=cv2.INTER_AREA, borderValue=255)
+    return np.repeat(image[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1), (-0.3, -0.7, 0.0)])
+def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
+    camera = pose(turn)
+    tag = Tag("4x4_50", 7, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
+    poses = tag.poses(picture(camera), LENS)
+    away = [np.abs(own - camera).max(0) for own in poses]
+    best = min(away, key=lambda own: own[:3].max())
+    assert best[:3].max() < 0.03
+    assert best[3] < 0.01
+    for own in poses:
+        assert own[:3, :3] @ own[:3, :3].T == pytest.approx(np.eye(3), abs=1e-9)
+        assert np.linalg.det(own[:3, :3]) > 0.0
+
+
+def test_a_tag_that_is_not_seen_has_no_pose():
+    tag = Tag("4x4_50", 3, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
+    assert tag.poses(picture(pose((0.0, 0.3, 0.0))), LENS) == []
+
+
+def test_a_tag_is_one_of_opencvs_with_two_edges():
+    with pytest.raises(InputError, match="OpenCV has no tags '9x9_1'"):
+        Tag("9x9_1", 0, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
+    with pytest.raises(InputError, match="must be perpendicular"):
+        Tag("4x4_50", 0, SIZE, tuple(PLACE), tuple(RIGHT), tuple(RIGHT))

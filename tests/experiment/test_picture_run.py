@@ -15,6 +15,7 @@ import warp_resphys
 from support.command_line import outcome, refusal
 from support.configured import composed, settings
 from support.main_job import IN_RUN
+from support.tags import draw_tag
 from warp_resphys.energies.law_files import read_law
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.picture_laboratory import noisy_mask
@@ -139,6 +140,28 @@ def test_pictures_of_a_folder(recorded):
     assert law["constants"]["density"] == 1100.0
 
 
+def test_a_tag_shows_the_camera(recorded):
+    """A frame without world_to_camera; of the two cameras that the tag allows, the one that sees the body is chosen."""
+    scene = json.loads((recorded / "pictures/beam/camera.json").read_text())
+    right = np.array(scene["frames"][1]["world_to_camera"])
+    matrix = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 180.0], [0.0, 0.0, 1.0]])
+    image = np.asarray(Image.open(recorded / "pictures/beam/02.png"))
+    place, size = np.array([-0.045, 0.015, 0.0]), 0.05
+    image = draw_tag(image, right, matrix, place, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), size, 5)
+    Image.fromarray(image).save(recorded / "pictures/beam/02.png")
+    (recorded / "pictures/beam/camera.json").write_text(json.dumps({**scene, "frames": [{"image": "02.png"}]}))
+    tag = f"data.tag={{dictionary:4x4_50,number:5,size:{size},centre:{place.tolist()}}}"
+    assert "has no 'world_to_camera': give it, or the tag of data.tag" in refusal(*RECORDED)
+    assert "does not show the tag 4 of 4x4_50" in refusal(*RECORDED, tag, "data.tag.number=4")
+    result = outcome(*RECORDED, tag)
+    assert result.code == 0, result.err
+    camera = np.array(json.loads((recorded / "run" / "identification.json").read_text())["cameras"]["beam"])
+    assert camera[:3, :3] == pytest.approx(right[:3, :3], abs=0.05)
+    assert camera[:3, 3] == pytest.approx(right[:3, 3], abs=0.02)
+    (row,) = json.loads((recorded / "run" / "metrics.json").read_text())["poses"]
+    assert row["outline_mm"]["sysid"] < 0.5
+
+
 def test_tracked_points_of_a_moving_camera(recorded):
     """Points alone, each frame before a camera of its own, whose places are known."""
     scene = json.loads((recorded / "pictures/beam/camera.json").read_text())
@@ -223,6 +246,8 @@ def test_a_limit_leaves_out_poses():
     run = parse(RunSettings, values)
     assert run.pictures.train == ("level",)
     assert [*run.pictures.poses] == ["level", "upwards"]
+    quick = settings("experiment=camera_silicone", "data.folder=x", "budget=quick").pictures
+    assert [*quick.poses] == ["hammer_blue"]  # the twisted pose is of the other material
 
 
 def test_noise_of_a_simulated_outline():

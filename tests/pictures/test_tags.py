@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from support.tags import draw_tag
 from warp_resphys.data.camera import Lens
 from warp_resphys.io.errors import InputError
 from warp_resphys.pictures.camera import rotation
 from warp_resphys.pictures.tags import Tag
 
-cv2 = pytest.importorskip("cv2")
 MATRIX = np.array([[900.0, 0.0, 330.0], [0.0, 900.0, 250.0], [0.0, 0.0, 1.0]])
 LENS = Lens(torch.as_tensor(MATRIX))
 SIZE, PLACE = 0.06, np.array([0.02, -0.01, 0.005])  # m
@@ -25,18 +25,9 @@ def pose(turn):
     return camera
 
 
-def picture(camera, number=7):
-    """The tag, seen by a camera, on white."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    tag = cv2.aruco.generateImageMarker(dictionary, number, 300)
-    half = SIZE / 2.0
-    corners = [PLACE + x * half * RIGHT + y * half * UP for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
-    seen = np.array([MATRIX @ (camera[:3, :3] @ corner + camera[:3, 3]) for corner in corners])
-    pixels = (seen[:, :2] / seen[:, 2:]).astype(np.float32)
-    source = np.array([[-0.5, -0.5], [299.5, -0.5], [299.5, 299.5], [-0.5, 299.5]], dtype=np.float32)
-    homography = cv2.getPerspectiveTransform(source, pixels)
-    image = cv2.warpPerspective(tag, homography, (660, 500), flags=cv2.INTER_AREA, borderValue=255)
-    return np.repeat(image[..., None], 3, axis=2)
+def picture(camera):
+    """The tag, seen by a camera."""
+    return draw_tag(np.full((500, 660, 3), 60, dtype=np.uint8), camera, MATRIX, PLACE, RIGHT, UP, SIZE, 7)
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1), (-0.3, -0.7, 0.0)])

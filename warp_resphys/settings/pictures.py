@@ -133,9 +133,11 @@ class PictureData(Settings):
         return None
 
     def limited(self) -> "PictureData":
-        """Returns the data with as many poses of training and of the test as the limit allows."""
+        """Returns the data with as many poses of training, and of the test of their materials, as the limit allows."""
         if self.limit is None:
             return self
-        train, test = self.train[: self.limit.train], self.test[: self.limit.test]
+        train = self.train[: self.limit.train]
+        seen = {self.poses[name].material for name in train}
+        test = tuple(name for name in self.test if self.poses[name].material in seen)[: self.limit.test]
         poses = {name: pose for name, pose in self.poses.items() if name in (*train, *test)}
         return self.model_copy(update={"train": train, "test": test, "poses": poses})

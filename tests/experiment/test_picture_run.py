@@ -214,6 +214,7 @@ def test_tracked_points_of_a_moving_camera(recorded):
         ("data.train=[other]", "train names 'other'"),
         ("identify=null", "identify is null, but data.kind is pictures"),
         ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material and trial"),
+        ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
         ("data.lens.file=calibration.yaml", "give one of them, a calibration or K"),
         ("data.folder=null", "folder is not set"),
         ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),

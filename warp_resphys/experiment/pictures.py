@@ -95,7 +95,10 @@ def check_pictures(run: RunSettings) -> None:
     read_lens(data)
     if not wanted.parameters:
         raise InputError("identify.parameters is empty: give a range for at least one parameter.")
+    known = [*run.simulation.constants, *_PLACED]
     for name, limits in wanted.parameters.items():
+        if name not in known:
+            raise InputError(f"identify.parameters names '{name}': choose from {', '.join(known)}.")
         if limits.per == "session":
             raise InputError(f"identify.parameters.{name}.per is session: pictures have all, material and trial.")
         if limits.per == "trial" and name not in _PLACED:
@@ -108,7 +111,7 @@ class _Plan:
     Args:
         settings: of the stage.
         run_dir: the run folder.
-        cameras: (4, 4) of poses whose standing camera is known, by name.
+        cameras: (4, 4) of poses whose standing camera was chosen in the identification, by name.
     """
 
     def __init__(
@@ -165,7 +168,7 @@ class _Plan:
 
         Args:
             name: of the pose.
-            known: values of parameters; first guesses of the others.
+            known: identified values of parameters; first guesses of the others.
             deforms: whether the body is simulated.
             near: its shape with similar values.
 
@@ -174,7 +177,7 @@ class _Plan:
         """
         if not self.data.stands:
             return self.poses.pose(name, None, deforms)
-        if name in self._cameras:
+        if known and name in self._cameras:
             return self.poses.pose(name, self._cameras[name], deforms)
         poses = [self.poses.pose(name, camera, deforms) for camera in self.poses.cameras_of(name)]
         guess = self.guess(self.bounds(poses[:1], lambda name, per: True), poses[:1])
@@ -188,14 +191,14 @@ class _Plan:
                 failure = error
         if failure is not None and not np.isfinite(distances).any():
             raise failure
-        self._cameras[name] = poses[int(np.argmin(distances))].photos[0].camera.pose.numpy()
         return poses[int(np.argmin(distances))]
 
     def fitted(self, name: str, model: str, identified: Values, near: Shape | None) -> tuple[SeenPose, Values, Shape]:
         """A pose with a model, the values of its parameters, and its shape.
 
         Place before the camera, tilt of gravity and clamps are fitted to it, unless they were identified with it. The
-        identified model has the identified lens; the others, which have none, fit it as well.
+        identified model has the identified lens; the others, which have none, fit it as well, and choose among the
+        cameras of the frames anew.
         """
         known = dict(identified) if model == "sysid" else {}
         pose = self.pose(name, known, model != MODELS[0], near)

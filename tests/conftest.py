@@ -15,7 +15,7 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 torch.set_num_threads(1)
 
-NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg"}  # folders of tests
+NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 

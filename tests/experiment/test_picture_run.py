@@ -64,6 +64,7 @@ def test_the_material_of_a_simulated_laboratory_comes_back(played):
     assert tested["outline_mm"]["simulation"] < tested["outline_mm"]["undeformed"]
     assert tested["overlap"]["sysid"] > 0.95
     assert "In 1 pose kept back the simulated pictures are" in result.out
+    assert "Young's modulus [kPa]: 12" in result.out
     page = (folder / "report.html").read_text()
     assert "Young&#39;s modulus" in page
     assert "upwards" in page
@@ -122,6 +123,7 @@ def test_pictures_of_a_folder(recorded):
     """Copies count once, the better of two cameras is chosen, masks are files or colours."""
     result = outcome(*RECORDED)
     assert result.code == 0, result.err
+    assert Image.open(recorded / "run" / "masks" / "beam.png").size == (640, 360)
     with read_hdf5(recorded / "run" / "pictures.h5", "pictures") as file:
         masks, frames = file["beam/masks"][:], file["beam/frames"][:]
     assert frames.tolist() == [0, 2]
@@ -134,7 +136,7 @@ def test_pictures_of_a_folder(recorded):
     assert row["outline_mm"]["sysid"] < 0.5
     assert row["outline_mm"]["sysid"] < 0.2 * row["outline_mm"]["undeformed"]
     assert 100e3 < identified["sysid"]["parameters"]["youngs_modulus@soft"] < 180e3
-    assert "as none was kept back" in result.out
+    assert "(none was kept back)" in result.out
     law = read_law(str(recorded / "run" / "law_soft.json"))
     assert law["constants"]["youngs_modulus"] == identified["sysid"]["parameters"]["youngs_modulus@soft"]
     assert law["constants"]["density"] == 1100.0
@@ -215,8 +217,9 @@ def test_tracked_points_of_a_moving_camera(recorded):
         ("identify=null", "identify is null, but data.kind is pictures"),
         ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material and trial"),
         ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
-        ("data.lens.file=calibration.yaml", "give one of them, a calibration or K"),
+        ("data.lens.file=calibration.yaml", "give one of them, a calibration or the matrix"),
         ("data.folder=null", "folder is not set"),
+        ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
         ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),
     ],
 )
@@ -272,6 +275,6 @@ def test_the_verdict_says_where_an_identification_is_no_better():
     assert "0.500" in better
     assert "hardly depend on it" in picture_verdict([result(0.95, 1.0, True)])
     assert "no better than what needs none" in picture_verdict([result(1.5, 1.0, True)])
-    assert "as none was kept back" in picture_verdict([result(0.5, 2.0, False)])
+    assert "(none was kept back)" in picture_verdict([result(0.5, 2.0, False)])
     away = replace(result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1))
     assert "a is hardly seen where it was simulated" in picture_verdict([away])

@@ -118,7 +118,7 @@ def test_deviations_are_those_of_repeated_pictures():
 
 def test_a_body_beside_the_picture_is_named():
     seen, _ = pose()
-    with pytest.raises(InputError, match="0 does not show the simulated body"):
+    with pytest.raises(InputError, match="0 does not show the simulated body where it is drawn"):
         seen.difference(seen.photos[0], seen.shape(TRUTH), {"camera_shift_1": 0.5})
 
 

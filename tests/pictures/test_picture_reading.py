@@ -63,7 +63,7 @@ def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("{", "give the cameras of a scene as JSON"),
+        ("{", "is no JSON"),
         ({"frames": []}, "has no list 'frames'"),
         ([1], "has no list 'frames'"),
         ({"frames": [{"time": 0.0}]}, "frame 0 has no 'image'"),

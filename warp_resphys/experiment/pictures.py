@@ -27,6 +27,7 @@ from ..learning.parameters import TILTS, configured_parameters, own_name, split_
 from ..pictures.camera import CORRECTIONS, PlacedCamera
 from ..pictures.misfit import PictureMisfit, values_of
 from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, SeenPose, Shape
+from ..report.identification_section import parameter_rows
 from ..report.page import NONE, number_text
 from ..report.pictures_page import PictureResult, picture_verdict, write_pictures_report
 from ..settings.pictures import PictureData
@@ -360,8 +361,8 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
     by_outline = any(result.outline_mm["sysid"] is not None for result in results)
-    title = f"Distance of {'outlines' if by_outline else 'tracked points'}"
-    heads = ["undeformed [mm]", "uncorrected [mm]", "identified [mm]", *["overlap"] * by_outline]
+    title = f"Distance of {'outlines' if by_outline else 'tracked points'} [mm]"
+    heads = ["undeformed", "uncorrected", "identified", *["overlap"] * by_outline]
     table = Table("pose", *heads, title=title)
     for result in results:
         cells = [number_text(result.distance(model)) for model in MODELS]
@@ -369,5 +370,9 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
         table.add_row(f"{result.pose} (test)" if result.tested else result.pose, *cells)
     console = Console()
     console.print(table)
+    identified = read_json(folder / IDENTIFICATION)["sysid"]
+    material = {name: v for name, v in identified["parameters"].items() if split_name(name)[0] not in _PLACED}
+    for row in parameter_rows({**identified, "parameters": material}, {}, {}):
+        console.print(f"{row.head}: {row.cells[1].text} {row.cells[1].beside}", soft_wrap=True, markup=False)
     console.print(picture_verdict(results), soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)

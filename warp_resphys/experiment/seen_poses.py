@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from ..data.camera import Lens
 from ..data.markers import bind_markers
 from ..fem.body import Body
-from ..io.atomic import digest
+from ..io.atomic import atomic_path, digest
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.stages import StageContext
@@ -103,7 +104,17 @@ def import_pictures(context: StageContext) -> None:
             create(file, f"{name}/masks", np.array(masks, dtype=bool))
             create(file, f"{name}/world_to_camera", _cameras(scene.path, frames, data), "1, m")
             create(file, f"{name}/frames", numbers)
-            log.info("import: %s has %d pictures", name, len(frames))
+            shares = [100.0 * mask.mean() for mask in masks]
+            covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
+            log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
+            if masks:
+                _show_mask(context.run_dir / "masks" / f"{name}.png", read_picture(frames[0].image), masks[0])
+
+
+def _show_mask(path: Path, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
+    """Writes a picture in which everything but the body is dark."""
+    with atomic_path(path) as partial:
+        Image.fromarray(np.where(mask[..., None], image, image // 4)).save(partial, format="png")
 
 
 def _mask(frame: Frame, colours: Colours | None) -> NDArray[np.bool_]:
@@ -138,8 +149,8 @@ def _of_one_camera(path: Path, cameras: NDArray[np.float64], data: PictureData) 
     apart = np.linalg.norm(cameras[:, 0, :3, 3] - cameras[0, 0, :3, 3], axis=1).max()
     if data.stands and apart > _MOVED:
         raise DataFileError(
-            f"{path}: the origin of the mesh is at places {100.0 * apart:.0f} cm apart before the cameras of its "
-            "frames: set data.stands=false if they are different cameras, or one that moves."
+            f"{path}: between its frames the camera moves by {100.0 * apart:.0f} cm against the origin of the mesh: "
+            "set data.stands=false if it does, or if there are several; world_to_camera is in m."
         )
     return cameras
 
@@ -237,12 +248,14 @@ class SeenPoses:
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
         if name not in self._outlines:
             self._outlines[name] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
-        photos = []
+        scene, photos = read_scene(scene_file(self.data, own, self.run_dir)), []
         for number, frame in enumerate(loaded.frames):
             pose = torch.as_tensor(loaded.cameras[number, 0] if camera is None else camera)
             tracked = None if loaded.tracked is None else loaded.tracked[number]
             placed = PlacedCamera(self.lens, pose, centre)
-            photos.append(Photo(f"{name} {frame}", placed, self._outlines[name][number], tracked))
+            photos.append(
+                Photo(f"{own.folder}/{scene.frames[frame].image.name}", placed, self._outlines[name][number], tracked)
+            )
         surface = ClosedSurface.of_mesh(mesh)
         return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points, deforms)
 

@@ -87,8 +87,10 @@ def read_scene(path: Path) -> SceneFile:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DataFileError(f"cannot read {path} ({error}): give the cameras of a scene as JSON.") from error
+    except OSError as error:
+        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DataFileError(f"{path} is no JSON ({error}): write the cameras of its pictures anew.") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md).")
@@ -203,7 +205,8 @@ def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArr
     if heads[0] != "frame":
         raise ValueError(f"its first column is '{heads[0]}', not 'frame'")
     if missing := [name for name in names if f"{name}.x" not in heads or f"{name}.y" not in heads]:
-        raise ValueError(f"it has no columns x and y of {listed(missing)}")
+        there = dict.fromkeys(head.rpartition(".")[0] for head in heads[1:])
+        raise ValueError(f"it has no columns x and y of {listed(missing)}, but of {listed([*there])}")
     result = {}
     for row in rows[first:]:
         values = {head: float(cell) if cell else np.nan for head, cell in zip(heads, row, strict=True)}

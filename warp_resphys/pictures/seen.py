@@ -208,8 +208,8 @@ class SeenPose:
             measured *= visibility(photo.outline.points, pixels[clamp], _MARGIN)
         if not (simulated.any() and measured.any()):
             raise InputError(
-                f"{photo.name} does not show the simulated body: check the lens, and world_to_camera, which takes m in "
-                "the axes of the mesh to those of the camera."
+                f"{photo.name} does not show the simulated body where it is drawn: check the mask, the lens, and "
+                "world_to_camera, which takes m in the axes of the mesh to those of the camera."
             )
         return SeenOutline(rim, simulated, measured)
 

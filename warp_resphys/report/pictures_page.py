@@ -78,7 +78,7 @@ def picture_verdict(results: Sequence[PictureResult]) -> str:
     shown = tested or trained
     undeformed, uncorrected, identified = (_mean(shown, model) for model in _MODELS)
     count = f"{len(shown)} pose{'s' * (len(shown) > 1)}"
-    which = f"{count} kept back" if tested else f"the {count} of training, as none was kept back,"
+    which = f"{count} kept back" if tested else f"{count} of training (none was kept back)"
     text = (
         f"In {which} the simulated pictures are {number_text(identified)} mm from the measured ones with the "
         f"identified parameters, {number_text(uncorrected)} mm with those of the data sheet, and "
@@ -213,7 +213,7 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
             if group not in file:
                 continue
             measured = read_array(file, f"{group}/measured")
-            axis.plot(*measured.T, linestyle="", marker=".", markersize=1.6, color="#ffffff", label="measured")
+            axis.plot(*measured.T, linestyle="", marker=".", markersize=1.0, color="#ffffff", label="measured")
             for model, colour in _DRAWN.items():
                 points, weight = (read_array(file, f"{group}/{model}{end}") for end in ("", "_weight"))
                 points = points[weight > 0.0]
@@ -229,7 +229,8 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
         legend.get_frame().set_facecolor("#8a929b")
     figure.savefig(path, dpi=170)
     caption = (
-        "The measured outline (white), with the parameters of the data sheet (orange) and the identified ones (blue)."
+        "The first picture of each pose: the measured outline (white), and those of the uncorrected simulator, which "
+        "has the parameters of the data sheet (orange), and of the identified one (blue), without what a clamp hides."
     )
     alt = "; ".join(
         f"{result.pose}: {_text(result.outline_mm['simulation'])} mm uncorrected, "

@@ -29,7 +29,7 @@ class LensSettings(Settings):
     @model_validator(mode="after")
     def _has_one(self) -> Self:
         if (self.file is None) == (self.matrix is None):
-            raise ValueError("file and matrix: give one of them, a calibration or K.")
+            raise ValueError("file and matrix: give one of them, a calibration or the matrix; null takes one out.")
         return self
 
 
@@ -103,6 +103,10 @@ class PictureData(Settings):
                 raise ValueError(f"{key} names '{unknown[0]}': data.poses has {', '.join(self.poses)}.")
         if both := [name for name in self.train if name in self.test]:
             raise ValueError(f"test names '{both[0]}', which is in data.train as well: take one out.")
+        if pointed := [name for name, pose in self.poses.items() if pose.points is not None and not self.points]:
+            raise ValueError(
+                f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
+            )
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")

@@ -122,6 +122,16 @@ def test_a_body_beside_the_picture_is_named():
         seen.difference(seen.photos[0], seen.shape(TRUTH), {"camera_shift_1": 0.5})
 
 
+def test_a_step_that_moves_the_body_out_of_the_picture_has_failed(seen):
+    photo = replace(seen.photos[0], tracked=None)
+    misfit = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
+    with pytest.raises(InputError, match="does not show the simulated body"):
+        misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5}))
+    assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.003})) is not None
+    assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5})) is None
+    assert np.isinf(misfit.losses_or_infinite(misfit.to_unit({"camera_shift_1": 0.5})[None])).all()
+
+
 def test_an_obstacle_before_the_body_hardly_matters():
     """A rod that hides a part of the beam, as wide as the beam is thick."""
     seen, mask = pose()

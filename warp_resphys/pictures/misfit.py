@@ -64,6 +64,7 @@ class PictureMisfit(BoundedMisfit):
                     else f"there is no parameter {parameter!r} to identify: choose from {', '.join(known_names)}."
                 )
         self._first: list[Shape | None] = [None] * len(self.poses) if near is None else [*near]
+        self._was_seen = False  # in every picture, with some parameters
         self.forget()
 
     @override
@@ -98,10 +99,15 @@ class PictureMisfit(BoundedMisfit):
             try:
                 q = self.shape(number, own)
                 tangents = self._tangents(number, unit, own, q) if derivatives else {}
+                for photo in pose.photos:
+                    trials += self._of_photo(pose, photo, own, q, tangents, share)
             except ConvergenceError:
                 return None
-            for photo in pose.photos:
-                trials += self._of_photo(pose, photo, own, q, tangents, share)
+            except InputError:
+                if not self._was_seen:  # Else a step went too far.
+                    raise
+                return None
+        self._was_seen = True
         return LinearMisfit(trials, *self.prior_rows(unit))
 
     def _tangents(
@@ -155,11 +161,7 @@ class PictureMisfit(BoundedMisfit):
             visible = np.asarray(np.isfinite(away).all(1))
             jacobian, away = slopes.transpose(1, 2, 0), np.where(visible[:, None], away, 0.0)
             if visible.any():
-                parts.append(
-                    _weighted(
-                        share, visible.astype(np.float64), np.where(visible[:, None], away, 0.0), jacobian, copies
-                    )
-                )
+                parts.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
         return parts
 
     def _slopes(

@@ -6,6 +6,7 @@ import torch
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.linalg.banded import BandedSolver
+from warp_resphys.linalg.bordered import BorderedSolver, hubs
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.dense import DenseSolver
 from warp_resphys.linalg.sparse import SparseSolver
@@ -34,6 +35,22 @@ def test_a_chain_is_solved_by_every_choice(name, kind):
     right = np.arange(40.0)
     solution = solver.factor(values).solve(torch.as_tensor(right).reshape(1, 40, 1))
     np.testing.assert_allclose(solution[0, :, 0].numpy(), np.linalg.solve(matrix, right), rtol=1e-10)
+
+
+def test_few_hubs_of_a_narrow_band_come_last_and_many_of_a_wide_one_do_not():
+    """A node that couples to a whole chain, and seven with far more neighbours than the others of a wide band."""
+    rows, cols = chain(400)
+    whole = np.arange(399)
+    arrow = make_linear_solver(
+        "auto", np.append(rows, np.full(399, 399)), np.append(cols, whole), 400, 3, CPU, torch.float64
+    )
+    assert isinstance(arrow, BorderedSolver)
+    count, reach, many = 600, 80, np.arange(150, 500, 55)
+    pairs = {(i, i) for i in range(count)} | {(i, j) for i in range(count) for j in range(max(i - reach, 0), i, 16)}
+    pairs |= {(max(i, j), min(i, j)) for i in many for j in range(i - 120, min(i + 120, count), 2)}
+    rows, cols = np.array(sorted(pairs)).T
+    assert len(hubs(rows, cols, count)) >= len(many)
+    assert isinstance(make_linear_solver("auto", rows, cols, count, 3, CPU, torch.float64), BandedSolver)
 
 
 def test_bad_choices_are_refused():

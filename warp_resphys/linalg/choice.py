@@ -25,6 +25,7 @@ from .tiled import TiledSolver
 LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
 MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU above which multigrid is cheaper
+BORDER_FLOPS = 44  # of an unknown beside a band, in multiplications of a banded factor
 MAX_TILED_BANDWIDTH = 600  # unknowns above which the tiles of a band hold mostly fill on a GPU
 MAX_DENSE_UNKNOWNS = 4000  # unknowns
 
@@ -64,8 +65,9 @@ def make_linear_solver(
 def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
     """Returns the name of the cheapest solver by memory and operations.
 
-    A band of width w takes n w numbers and n w^2 operations, a border of m unknowns 4 n w m more, a dense matrix n^2
-    and n^3 / 3; for wide bands a sparse factor has less fill-in. The limit on a CPU is measured (``warp-resphys
+    A band of width w takes n w numbers and n w^2 operations, a border of m unknowns 4 n w m more, each of which takes
+    eleven times as long (measured on 87 unknowns beside a band of 1,161). A dense matrix takes n^2 numbers and n^3 / 3
+    operations; for wide bands a sparse factor has less fill-in. The limit on a CPU is measured (``warp-resphys
     benchmark sizes``), those on a GPU are estimates from these counts.
     """
     unknowns, width = n_nodes * block, block * bandwidth(rows, cols, n_nodes)
@@ -73,7 +75,7 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
         costs = {"banded": unknowns * width**2}
         if len(border := hubs(rows, cols, n_nodes)):
             rest = block * bandwidth(*banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border))
-            costs["bordered"] = unknowns * rest * (rest + 4 * block * len(border))
+            costs["bordered"] = unknowns * rest * (rest + BORDER_FLOPS * block * len(border))
         name = min(costs, key=lambda solver: costs[solver])
         return name if costs[name] <= MAX_BANDED_FLOPS else "multigrid"
     if width + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):

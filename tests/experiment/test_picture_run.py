@@ -155,7 +155,7 @@ def test_a_tag_shows_the_camera(recorded):
     tag = f"data.tag={{dictionary:4x4_50,number:5,size:{size},centre:{place.tolist()}}}"
     assert "has no 'world_to_camera': give it, or the tag of data.tag" in refusal(*RECORDED)
     assert "does not show the tag 4 of 4x4_50" in refusal(*RECORDED, tag, "data.tag.number=4")
-    result = outcome(*RECORDED, tag)
+    result = outcome(*RECORDED, tag, "identify.starts=2", "identify.candidates=6")
     assert result.code == 0, result.err
     camera = np.array(json.loads((recorded / "run" / "identification.json").read_text())["cameras"]["beam"])
     assert camera[:3, :3] == pytest.approx(right[:3, :3], abs=0.05)
@@ -219,6 +219,7 @@ def test_tracked_points_of_a_moving_camera(recorded):
         ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
         ("data.lens.file=calibration.yaml", "give one of them, a calibration or the matrix"),
         ("data.folder=null", "folder is not set"),
+        ("data.poses.beam.outline=false", "poses.beam has no outline and no points"),
         ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
         ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),
     ],

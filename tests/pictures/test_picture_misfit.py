@@ -129,7 +129,9 @@ def test_a_step_that_moves_the_body_out_of_the_picture_has_failed(seen):
         misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5}))
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.003})) is not None
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5})) is None
-    assert np.isinf(misfit.losses_or_infinite(misfit.to_unit({"camera_shift_1": 0.5})[None])).all()
+    again = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
+    points = np.stack([again.to_unit({"camera_shift_1": shift}) for shift in (0.5, 0.003)])
+    assert np.isfinite(again.losses_or_infinite(points)).tolist() == [False, True]
 
 
 def test_an_obstacle_before_the_body_hardly_matters():
@@ -170,6 +172,12 @@ def test_a_turned_clamp_twists_the_body():
     near = seen.shape({"clamp_turn": math.pi - 0.3})
     again = seen.shape({"clamp_turn": math.pi, "clamp_shift": 0.004}, ({"clamp_turn": math.pi - 0.3}, near))
     assert torch.allclose(again, q, atol=1e-7)
+
+
+def test_a_picture_shows_something(seen):
+    empty = replace(seen, photos=(Photo("0", CAMERA),))
+    with pytest.raises(InputError, match="has neither an outline nor tracked points"):
+        PictureMisfit([empty], RANGES)
 
 
 def test_a_pose_has_pictures_and_places_of_its_points(seen):

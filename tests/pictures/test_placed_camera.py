@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from warp_resphys.data.camera import Lens
+from warp_resphys.dynamics.frames import rotations
 from warp_resphys.io.errors import InputError
-from warp_resphys.pictures.camera import CORRECTIONS, PlacedCamera, rotation
+from warp_resphys.pictures.camera import CORRECTIONS, PlacedCamera
 
 MATRIX = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENS = Lens(MATRIX, torch.tensor([-0.12, 0.05, 1e-3, -2e-3], dtype=torch.float64))
 POSE = torch.eye(4, dtype=torch.float64)
-POSE[:3, :3] = rotation(torch.tensor([2.9, 0.2, -0.1], dtype=torch.float64))
+POSE[:3, :3] = rotations(torch.tensor([2.9, 0.2, -0.1], dtype=torch.float64))
 POSE[:3, 3] = torch.tensor([0.02, -0.01, 0.5])
 CENTRE = torch.tensor([0.05, 0.0, 0.01], dtype=torch.float64)
 CAMERA = PlacedCamera(LENS, POSE, CENTRE)

@@ -6,8 +6,8 @@ import torch
 
 from support.tags import draw_tag
 from warp_resphys.data.camera import Lens
+from warp_resphys.dynamics.frames import rotations
 from warp_resphys.io.errors import InputError
-from warp_resphys.pictures.camera import rotation
 from warp_resphys.pictures.tags import Tag
 
 MATRIX = np.array([[900.0, 0.0, 330.0], [0.0, 900.0, 250.0], [0.0, 0.0, 1.0]])
@@ -20,7 +20,7 @@ def pose(turn):
     """world_to_camera that sees the tag from the front, turned by (3,) rad."""
     axes = np.stack([RIGHT, -UP, np.cross(RIGHT, -UP)])
     camera = np.eye(4)
-    camera[:3, :3] = rotation(torch.tensor(turn, dtype=torch.float64)).numpy() @ axes
+    camera[:3, :3] = rotations(torch.tensor(turn, dtype=torch.float64)).numpy() @ axes
     camera[:3, 3] = np.array([0.01, -0.02, 0.6]) - camera[:3, :3] @ PLACE
     return camera
 

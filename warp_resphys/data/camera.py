@@ -140,7 +140,17 @@ class CameraMarkers(Observation):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns pixels (B, M, 2), NaN for a marker behind the camera."""
         rays = self.markers(positions) @ self.matrix[:, :3].mT + self.matrix[:, 3]
-        in_front = rays[..., 2:] > 0.0
-        rays = torch.cat([rays[..., :2], torch.where(in_front, rays[..., 2:], 1.0)], -1)
-        pixels = rays[..., :2] / rays[..., 2:] if self.lens is None else self.lens.pixels(rays)
-        return torch.where(in_front, pixels, torch.nan)  # A NaN of its own would spread through the gradient.
+        return projected(rays, self.lens)
+
+
+def projected(rays: torch.Tensor, lens: Lens | None) -> torch.Tensor:
+    """Returns pixels (..., 2), NaN behind the camera.
+
+    Args:
+        rays: (..., 3) homogeneous pixels; with a lens, points in the axes of the camera [m].
+        lens: of the camera.
+    """
+    in_front = rays[..., 2:] > 0.0
+    rays = torch.cat([rays[..., :2], torch.where(in_front, rays[..., 2:], 1.0)], -1)
+    pixels = rays[..., :2] / rays[..., 2:] if lens is None else lens.pixels(rays)
+    return torch.where(in_front, pixels, torch.nan)  # A NaN of its own would spread through the gradient.

@@ -56,8 +56,8 @@ def check_run(run: RunSettings) -> None:
     """
     _check_memory(run)
     body = build_body(run, run.payload_at)
-    if run.tip is not None:
-        select_vertices(body.mesh, **run.tip.arguments())
+    assert run.tip is not None
+    select_vertices(body.mesh, **run.tip.arguments())
     simulator = build_simulator(run, run.simulation, body)
     for material in simulator.materials.values():
         check_size(body, material, run.gravity)

@@ -14,11 +14,11 @@ from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.bounds import Bounds, Prior
-from ..learning.identification import Identifier
+from ..learning.identification import Identifier, ParameterSearch
 from ..learning.parameters import configured_parameters, own_name, split_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
-from ..settings.learning import RangeSettings
+from ..settings.learning import IdentifySettings, RangeSettings
 from ..settings.stages import IdentifyStage
 from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION, RESTING
@@ -64,12 +64,12 @@ def identify(context: StageContext) -> None:
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
             known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
             guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
-            found = _search(settings, identifier, guess, kept[model], progress, wanted.starts)
+            found = search_parameters(wanted, settings.seed, identifier, guess, kept[model], progress, wanted.starts)
             for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
-                found = _search(settings, identifier, values, kept[again], progress, 1)
+                found = search_parameters(wanted, settings.seed, identifier, values, kept[again], progress, 1)
                 if not changes(before, found["loss"]):
                     break
             if (where := wanted.placement) is not None and (found["placement"] or {}).get("sessions"):
@@ -226,20 +226,33 @@ def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
     return min((limit for limit in limits if limit is not None), default=None)
 
 
-def _search(
-    settings: IdentifyStage,
-    identifier: Identifier,
+def search_parameters(
+    wanted: IdentifySettings,
+    seed: int,
+    search: ParameterSearch,
     guess: Mapping[str, float],
     kept: Checkpoint,
     progress: Progress,
     count: int,
 ) -> dict[str, Any]:
-    """`Identification` of a model from a first guess, as plain data; resumes an interrupted search."""
+    """Returns the `Identification` of a search, as plain data; resumes an interrupted one.
+
+    Args:
+        wanted: its settings.
+        seed: of the random candidates.
+        search: the search.
+        guess: first guess of each parameter.
+        kept: finished work.
+        progress: advanced by every evaluation.
+        count: number of starts.
+
+    Raises:
+        ConvergenceError: the simulation fails at every start.
+    """
     if "found" in kept.content:
         return dict(kept.content["found"])
-    wanted = settings.identify
     if "starts" not in kept.content:
-        starts = identifier.starts(guess, count, wanted.candidates, settings.seed)
+        starts = search.starts(guess, count, wanted.candidates, seed)
         kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
@@ -250,7 +263,7 @@ def _search(
         kept.keep(attempts=attempts)
 
     starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
-    kept.keep(found=asdict(identifier.run(starts, most, report, finished, keep, wanted.tolerance)))
+    kept.keep(found=asdict(search.run(starts, most, report, finished, keep, wanted.tolerance)))
     return dict(kept.content["found"])
 
 

@@ -42,10 +42,9 @@ def play_camera(context: StageContext) -> None:
         random = np.random.default_rng([settings.seed, number])
         mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
         path = scene_file(data, pose, context.run_dir)
-        path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path.parent / "00.png") as partial:
             Image.fromarray(mask).save(partial, format="png")
-        frame = {"image": "00.png", "mask": "00.png", "time": 0.0, "world_to_camera": looking.tolist()}
+        frame = {"image": "00.png", "mask": "00.png", "world_to_camera": looking.tolist()}
         write_json(path, {"name": name, "frames": [frame]})
 
 

@@ -8,11 +8,12 @@ of gravity and the clamps are fitted to the pose, as nothing else shows them.
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -20,6 +21,7 @@ from ..energies.law_files import LAW_FORMAT, unit_of
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_json, write_json
 from ..io.progress import Progress
+from ..io.resumable import forget_checkpoint
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.bounds import Bounds
 from ..learning.identification import ParameterSearch
@@ -35,7 +37,7 @@ from ..settings.run import RunSettings
 from ..settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
 from .build import simulation_device
 from .files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
-from .identify import Checkpoint, bounds_of
+from .identify import Checkpoint, bounds_of, search_parameters
 from .picture_laboratory import play_camera
 from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lens
 
@@ -119,7 +121,7 @@ class _Plan:
         self, settings: IdentifyPicturesStage, run_dir: Path, cameras: Mapping[str, Any] | None = None
     ) -> None:
         self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
-        self._cameras = {name: np.array(camera) for name, camera in (cameras or {}).items()}
+        self._cameras = {name: torch.tensor(camera, dtype=torch.float64) for name, camera in (cameras or {}).items()}
 
     def bounds(self, poses: Sequence[SeenPose], chosen: Callable[[str, str], bool]) -> dict[str, Bounds]:
         """Ranges of parameters that act on some poses, with a name for each owner.
@@ -176,23 +178,23 @@ class _Plan:
         Raises:
             InputError: none of the cameras sees the body.
         """
+        pose = replace(self.poses.pose(name), deforms=deforms)
         if not self.data.stands:
-            return self.poses.pose(name, None, deforms)
+            return pose
         if known and name in self._cameras:
-            return self.poses.pose(name, self._cameras[name], deforms)
-        poses = [self.poses.pose(name, camera, deforms) for camera in self.poses.cameras_of(name)]
-        guess = self.guess(self.bounds(poses[:1], lambda name, per: True), poses[:1])
-        values = values_of(poses[0], {**guess, **self.given(poses[:1]), **known})
-        q, distances, failure = poses[0].shape(values, near), list[float](), None
-        for pose in poses:
+            return pose.before(self._cameras[name])
+        guess = self.guess(self.bounds([pose], lambda name, per: True), [pose])
+        values = values_of(pose, {**guess, **self.given([pose]), **known})
+        q, seen, failure = pose.shape(values, near), list[tuple[float, SeenPose]](), None
+        for camera in self.poses.cameras_of(name):
+            tried = pose.before(camera)
             try:
-                distances.append(sum(pose.difference(photo, q, values).distance for photo in pose.photos))
+                seen.append((sum(tried.difference(photo, q, values).distance for photo in tried.photos), tried))
             except InputError as error:
-                distances.append(math.inf)
                 failure = error
-        if failure is not None and not np.isfinite(distances).any():
+        if failure is not None and not seen:
             raise failure
-        return poses[int(np.argmin(distances))]
+        return min(seen, key=lambda own: own[0])[1]
 
     def fitted(self, name: str, model: str, identified: Values, near: Shape | None) -> tuple[SeenPose, Values, Shape]:
         """A pose with a model, the values of its parameters, and its shape.
@@ -226,27 +228,16 @@ def identify_pictures(context: StageContext) -> None:
     poses = [plan.pose(name, {}) for name in settings.data.train]
     bounds = plan.bounds(poses, lambda name, per: True)
     misfit = PictureMisfit(poses, bounds, plan.given(poses))
-    search, guess = ParameterSearch(misfit), plan.guess(bounds, poses)
-    if "starts" not in kept.content:
-        kept.keep(starts=search.starts(guess, wanted.starts, wanted.candidates, settings.seed), attempts=[])
-    starts, attempts = kept.content["starts"], kept.content["attempts"]
-    total = wanted.starts * wanted.max_evaluations
-    with Progress(context.name, total, "evaluations at most", sum(len(a["history"]) for a in attempts)) as progress:
-
-        def report(start: int, loss: float, values: Mapping[str, float]) -> None:
-            name, value = next(iter(values.items()))
-            progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
-
-        def keep(done: list[Any]) -> None:
-            kept.keep(attempts=done)
-
-        found = search.run(starts, wanted.max_evaluations, report, attempts, keep, wanted.tolerance)
-    result = {**asdict(found), "first_guess": guess}
+    guess, total = plan.guess(bounds, poses), wanted.starts * wanted.max_evaluations
+    with Progress(context.name, total, "evaluations at most", kept.evaluations) as progress:
+        search = ParameterSearch(misfit)
+        found = search_parameters(wanted, settings.seed, search, guess, kept, progress, wanted.starts)
+    result = {**found, "first_guess": guess}
     cameras = {pose.name: pose.photos[0].camera.pose.tolist() for pose in poses if settings.data.stands}
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)
-        fitted = values_of(pose, found.parameters)
+        fitted = values_of(pose, found["parameters"])
         constants = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).constants.items()}
         law = {
             "format": LAW_FORMAT,
@@ -255,7 +246,7 @@ def identify_pictures(context: StageContext) -> None:
             "units": {key: unit_of(key) for key in constants},
         }
         write_json(context.run_dir / law_file(material), law)
-    kept.path.unlink(missing_ok=True)
+    forget_checkpoint(kept.path)
 
 
 def compare_pictures(context: StageContext) -> None:

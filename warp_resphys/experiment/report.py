@@ -84,10 +84,11 @@ def make_report(context: StageContext) -> None:
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
     learned = "resphys" in metrics["errors_mm"] and run.in_the_loop is None
+    assert run.tip is not None
     no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
         **_common_parts(run, metrics, body),
-        tip=no_vertices if trials.labels or run.tip is None else select_vertices(mesh, **run.tip.arguments()),
+        tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
         trials=trials,

@@ -192,7 +192,7 @@ class SeenPoses:
 
     def __init__(self, settings: PictureStage, run_dir: Path) -> None:
         self.settings, self.data, self.run_dir = settings, settings.data, run_dir
-        self.lens, self._outlines = read_lens(self.data), dict[str, list[Outline | None]]()
+        self.lens, self._poses = read_lens(self.data), dict[str, SeenPose]()
         with read_hdf5(run_dir / PICTURES, _KIND) as file:
             self.loaded = {
                 name: Loaded(
@@ -213,11 +213,11 @@ class SeenPoses:
         scene = read_scene(scene_file(self.data, self.data.poses[name], self.run_dir))
         return read_picture(scene.frames[self.loaded[name].frames[number]].image)
 
-    def cameras_of(self, name: str) -> list[NDArray[np.float64]]:
+    def cameras_of(self, name: str) -> list[torch.Tensor]:
         """Returns the different cameras (4, 4) of a pose's frames, from which a standing camera is chosen."""
-        different: list[NDArray[np.float64]] = []
-        for camera in self.loaded[name].cameras.reshape(-1, 4, 4):
-            if all(np.abs(camera - other).max() > _ALIKE for other in different):
+        different: list[torch.Tensor] = []
+        for camera in torch.as_tensor(self.loaded[name].cameras.reshape(-1, 4, 4)):
+            if all((camera - other).abs().max() > _ALIKE for other in different):
                 different.append(camera)
         return different
 
@@ -227,14 +227,13 @@ class SeenPoses:
         common = self.settings.simulation
         return common.changed(**{**common.constants, **constants})
 
-    def pose(self, name: str, camera: NDArray[np.float64] | None = None, deforms: bool = True) -> SeenPose:
-        """Returns a pose.
+    def pose(self, name: str) -> SeenPose:
+        """Returns a pose by its name, with a camera for each frame; of a tag, the one that fits better."""
+        if name not in self._poses:
+            self._poses[name] = self._made(name)
+        return self._poses[name]
 
-        Args:
-            name: of the pose.
-            camera: (4, 4) of all pictures; None: each has its own.
-            deforms: whether the body is simulated, or undeformed.
-        """
+    def _made(self, name: str) -> SeenPose:
         settings, own, loaded = self.settings, self.data.poses[name], self.loaded[name]
         mesh, clamps = self._mesh(name)
         fixed = np.unique(np.concatenate(clamps))
@@ -246,18 +245,15 @@ class SeenPoses:
         if own.points is not None:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
-        if name not in self._outlines:
-            self._outlines[name] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
+        outlines: list[Outline | None] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
         scene, photos = read_scene(scene_file(self.data, own, self.run_dir)), []
-        for number, frame in enumerate(loaded.frames):
-            pose = torch.as_tensor(loaded.cameras[number, 0] if camera is None else camera)
+        for number, (frame, outline) in enumerate(zip(loaded.frames, outlines, strict=True)):
+            image = f"{own.folder}/{scene.frames[frame].image.name}"
             tracked = None if loaded.tracked is None else loaded.tracked[number]
-            placed = PlacedCamera(self.lens, pose, centre)
-            photos.append(
-                Photo(f"{own.folder}/{scene.frames[frame].image.name}", placed, self._outlines[name][number], tracked)
-            )
+            camera = PlacedCamera(self.lens, torch.as_tensor(loaded.cameras[number, 0]), centre)
+            photos.append(Photo(image, camera, outline, tracked))
         surface = ClosedSurface.of_mesh(mesh)
-        return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points, deforms)
+        return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points)
 
     def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
         """Mesh of a pose, and the vertices in its clamps."""

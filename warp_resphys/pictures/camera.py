@@ -15,7 +15,8 @@ from typing import Final
 
 import torch
 
-from ..data.camera import Lens
+from ..data.camera import Lens, projected
+from ..dynamics.frames import rotations
 from ..io.errors import InputError
 
 SHIFTS: Final = ("camera_shift_1", "camera_shift_2", "camera_shift_3")  # m
@@ -59,17 +60,14 @@ class PlacedCamera:
 
     def seen_from(self, points: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns points (..., 3) of the scene in the axes of the camera, with corrections (9,) or (..., 9) [m]."""
-        away = (rotation(corrections[..., 3:6]) @ (points - self.centre)[..., None])[..., 0]
+        away = (rotations(corrections[..., 3:6]) @ (points - self.centre)[..., None])[..., 0]
         return (away + self.centre + corrections[..., :3]) @ self.pose[:3, :3].mT + self.pose[:3, 3]
 
     def pixels(self, points: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns pixels (..., 2) of points (..., 3) [m], with corrections (9,) or (..., 9); NaN behind the camera."""
-        rays = self.seen_from(points, corrections)
-        in_front = rays[..., 2:] > 0.0
-        rays = torch.cat([rays[..., :2], torch.where(in_front, rays[..., 2:], 1.0)], -1)
-        middle = self.lens.matrix[:2, 2].to(rays)
-        pixels = middle + corrections[..., 7:] + corrections[..., 6:7] * (self.lens.pixels(rays) - middle)
-        return torch.where(in_front, pixels, torch.nan)
+        middle = self.lens.matrix[:2, 2].to(points)
+        seen = projected(self.seen_from(points, corrections), self.lens)
+        return middle + corrections[..., 7:] + corrections[..., 6:7] * (seen - middle)
 
     def derivative(self, points: torch.Tensor, corrections: torch.Tensor, tangents: torch.Tensor) -> torch.Tensor:
         """Returns derivatives (K + 9, P, 2) of pixels, by K motions of the points and by the corrections [px].
@@ -85,11 +83,3 @@ class PlacedCamera:
             rows = [torch.autograd.grad(seen[:, axis].sum(), (at, own), retain_graph=True) for axis in (0, 1)]
         by_points, by_corrections = (torch.stack(own, 1) for own in zip(*rows, strict=True))  # (P, 2, 3) and (P, 2, 9)
         return torch.cat([torch.einsum("pij,kpj->kpi", by_points, tangents), by_corrections.permute(2, 0, 1)])
-
-
-def rotation(vector: torch.Tensor) -> torch.Tensor:
-    """Returns rotations (..., 3, 3) by vectors (..., 3), along their axes and by their lengths [rad]."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    return torch.linalg.matrix_exp(cross.unflatten(-1, (3, 3)))

@@ -11,6 +11,7 @@ cameras exactly. `tests/pictures/test_picture_misfit.py` compares the derivative
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
@@ -40,7 +41,7 @@ class PictureMisfit(BoundedMisfit):
         near: shapes by pose from which equilibria are sought first; None where none is known.
 
     Raises:
-        InputError: an unknown parameter or owner, or nothing to identify.
+        InputError: an unknown parameter or owner, nothing to identify, or a picture without outline and points.
     """
 
     def __init__(
@@ -52,6 +53,9 @@ class PictureMisfit(BoundedMisfit):
     ) -> None:
         super().__init__(bounds)
         self.poses, self._known = [*poses], {} if known is None else dict(known)
+        for photo in (photo for pose in self.poses for photo in pose.photos):
+            if photo.outline is None and photo.tracked is None:
+                raise InputError(f"{photo.name} has neither an outline nor tracked points: leave it out.")
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
         for name in bounds:
@@ -109,6 +113,14 @@ class PictureMisfit(BoundedMisfit):
                 return None
         self._was_seen = True
         return LinearMisfit(trials, *self.prior_rows(unit))
+
+    @override
+    def losses_or_infinite(self, points: FloatArray) -> FloatArray:
+        losses = np.full(len(points), np.inf)
+        for number, point in enumerate(points):
+            with suppress(InputError):  # A body may be out of a picture with random parameters.
+                losses[number] = super().losses_or_infinite(point[None])[0]
+        return losses
 
     def _tangents(
         self, number: int, unit: FloatArray, own: Mapping[str, float], q: torch.Tensor

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.ndimage
 import shapely
 import torch
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -27,6 +28,7 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _SMOOTH = 1.0  # px, of a mask before its contour is drawn: a contour of pixels is a staircase
+_PIXEL = 1.0  # px
 _ON = 1e-3  # px, between the border of the seen body and points that form it
 _NEAR = 0.5  # px, between points of an outline to which distances are measured
 _BORDER = 2.0  # px, at which a body is cut off by its picture
@@ -108,13 +110,13 @@ def _closest(points: FloatArray, outline: FloatArray, outward: FloatArray) -> tu
     side = np.where((between * across).sum(1) < 0.0, -1.0, 1.0)
     direct = side[:, None] * between / np.maximum(distance, 1e-12)[:, None]
     # Within a pixel the direction of the difference is that of the sampling.
-    direct = np.where(distance[:, None] < _SMOOTH, across, direct)
+    direct = np.where(distance[:, None] < _PIXEL, across, direct)
     return index, (between * direct).sum(1), direct
 
 
 @dataclass(frozen=True)
 class ClosedSurface:
-    """The closed surface of a body: F triangles, and their E edges with the two triangles at each."""
+    """The closed surface of a body: F triangles, their E edges, and the two triangles at every edge."""
 
     triangles: IntArray  # (F, 3)
     edges: IntArray  # (E, 2)
@@ -132,12 +134,10 @@ class ClosedSurface:
         Raises:
             InputError: it is not closed.
         """
-        sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        order = np.lexsort(sides.T[::-1])
-        sides, owner = sides[order], np.repeat(np.arange(len(triangles)), 3)[order]
-        if len(sides) % 2 or (sides[::2] != sides[1::2]).any():
+        beside, edges = trimesh.graph.face_adjacency(triangles, return_edges=True)
+        if 2 * len(edges) != 3 * len(triangles):
             raise InputError("the surface of the body is not closed: every edge must belong to two triangles.")
-        return cls(triangles, sides[::2], np.stack([owner[::2], owner[1::2]], 1))
+        return cls(triangles, edges, beside)
 
     def silhouette(self, pixels: FloatArray) -> Silhouette:
         """Returns the outline in a picture, as points that lie close together.

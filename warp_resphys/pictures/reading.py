@@ -72,7 +72,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene's `camera.json` says."""
+    """Content of a scene's `camera.json`."""
 
     path: Path
     frames: tuple[Frame, ...]

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 import shapely
 import torch
 
 from ..data.observation import Observation
+from ..dynamics.frames import rotations
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
@@ -28,7 +29,7 @@ _MILLI: Final = 1e3
 
 @dataclass(frozen=True)
 class Photo:
-    """What a picture shows of a body; at least one of an outline and tracked points.
+    """Outline or tracked points of a body in a picture.
 
     Attributes:
         name: of the picture.
@@ -60,7 +61,7 @@ class SeenOutline:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far a simulated picture is from a measured one.
+    """Distances between a simulated and a measured picture.
 
     Attributes:
         outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
@@ -115,6 +116,11 @@ class SeenPose:
         if self.points is None and any(photo.tracked is not None for photo in self.photos):
             raise InputError(f"{self.name}: points were tracked, but their places on the body are not known.")
 
+    def before(self, camera: torch.Tensor) -> Self:
+        """Returns the pose with all its pictures taken from one place, world_to_camera (4, 4)."""
+        placed = (replace(photo, camera=replace(photo.camera, pose=camera)) for photo in self.photos)
+        return replace(self, photos=tuple(placed))
+
     @property
     def copies(self) -> int:
         """Number of its pictures by one standing camera, which have nearly the same errors; one where it moves."""
@@ -144,15 +150,13 @@ class SeenPose:
         own = {name: sim.tensor([v]) for name, v in values.items() if name in identifiable_parameters(sim)}
         constants = sim.prepare(constants_of(sim, own))
         before, q = ({}, sim.rest_state(1).q[0]) if near is None else (near[0], near[1].to(sim.rest_state(1).q))
-        if not any(name in own for own in (before, values) for name in (CLAMP_TURN, CLAMP_SHIFT)):
-            with torch.no_grad():
-                return sim.static_equilibrium(None, constants, start=q[None]).q[0]
         first, last = ([own.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)] for own in (before, values))
-        parts = max(math.ceil(abs(last[0] - first[0]) / _TURNED), 1)
+        parts, inputs = max(math.ceil(abs(last[0] - first[0]) / _TURNED), 1), None
         with torch.no_grad():
             for turn, shift in np.linspace(first, last, parts + 1)[1:]:
-                inputs = Inputs(fixed_positions=self._clamped(turn, shift)[None])
-                q = self._turned(q, (last[0] - first[0]) / parts)
+                if any(first) or any(last):
+                    q = self._turned(q, (last[0] - first[0]) / parts)
+                    inputs = Inputs(fixed_positions=self._clamped(turn, shift)[None])
                 q = sim.static_equilibrium(inputs, constants, start=q[None]).q[0]
         return q
 
@@ -174,10 +178,8 @@ class SeenPose:
     def _turned(self, q: torch.Tensor, turn: float) -> torch.Tensor:
         """Vertices (N, 3) turned with the second clamp, in proportion to their place between the clamps."""
         centre, axis, share = self._between()
-        away = q - centre
-        cos, sin = torch.cos(turn * share)[:, None], torch.sin(turn * share)[:, None]
-        across = torch.linalg.cross(axis.expand_as(away), away)
-        return centre + cos * away + sin * across + (1.0 - cos) * (away @ axis)[:, None] * axis  # Rodrigues
+        turned = rotations((turn * share)[:, None] * axis) @ (q - centre)[..., None]
+        return centre + turned[..., 0]
 
     def _clamped(self, turn: float, shift: float) -> torch.Tensor:
         """Fixed vertices (D, 3) with the second clamp turned [rad] about the line from the first to it, and shifted."""

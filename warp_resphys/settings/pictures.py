@@ -107,6 +107,8 @@ class PictureData(Settings):
             raise ValueError(
                 f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
             )
+        if blind := [name for name, pose in self.poses.items() if not pose.outline and pose.points is None]:
+            raise ValueError(f"poses.{blind[0]} has no outline and no points: give one of them.")
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")

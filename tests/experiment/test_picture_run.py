@@ -89,9 +89,9 @@ def recorded(played, folder):
     source = played[0] / "recordings" / "level"
     pose = folder / "pictures" / "beam"
     pose.mkdir(parents=True)
-    shutil.copy(source / "00.png", pose / "00.png")
-    shutil.copy(source / "00.png", pose / "01.png")
-    mask = np.asarray(Image.open(source / "00.png"))
+    shutil.copy(source / "00_mask.png", pose / "00.png")
+    shutil.copy(source / "00_mask.png", pose / "01.png")
+    mask = np.asarray(Image.open(source / "00_mask.png"))
     Image.fromarray(np.where(mask[..., None] > 0, (30, 90, 200), (20, 20, 20)).astype(np.uint8)).save(pose / "02.png")
     right = json.loads((source / "camera.json").read_text())["frames"][0]["world_to_camera"]
     wrong = np.array(right)

@@ -19,11 +19,13 @@ from .seen_poses import read_lens, scene_file
 
 FloatArray = NDArray[np.float64]
 
+IMAGE, MASK = "00.png", "00_mask.png"
+_BODY, _BEHIND = (46, 96, 140), (24, 24, 26)  # red, green and blue of the pictures
 _CORRELATED = 2.0  # px, along an outline, of its noise
 
 
 def play_camera(context: StageContext) -> None:
-    """Writes camera.json and the masks of every pose."""
+    """Writes camera.json, a picture and a mask of every pose."""
     settings: PictureStage = context.settings
     data, played = settings.data, settings.data.simulated
     assert played is not None
@@ -42,9 +44,10 @@ def play_camera(context: StageContext) -> None:
         random = np.random.default_rng([settings.seed, number])
         mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
         path = scene_file(data, pose, context.run_dir)
-        with atomic_path(path.parent / "00.png") as partial:
-            Image.fromarray(mask).save(partial, format="png")
-        frame = {"image": "00.png", "mask": "00.png", "world_to_camera": looking.tolist()}
+        for file, drawn in ((IMAGE, np.where(mask[..., None], _BODY, _BEHIND).astype(np.uint8)), (MASK, mask)):
+            with atomic_path(path.parent / file) as partial:
+                Image.fromarray(drawn).save(partial, format="png")
+        frame = {"image": IMAGE, "mask": MASK, "world_to_camera": looking.tolist()}
         write_json(path, {"name": name, "frames": [frame]})
 
 

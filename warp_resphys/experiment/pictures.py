@@ -38,7 +38,7 @@ from ..settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
 from .build import simulation_device
 from .files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from .identify import Checkpoint, bounds_of, search_parameters
-from .picture_laboratory import play_camera
+from .picture_laboratory import IMAGE, MASK, play_camera
 from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lens
 
 log = logging.getLogger(__name__)
@@ -68,7 +68,8 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     common = {"files": {**files, **picture_files(data)}, "data": data}
     settings = PictureStage.of(run, **common)
     if data.folder is None:
-        written = tuple(f"recordings/{own.folder}/{file}" for own in data.poses.values() for file in (SCENE, "00.png"))
+        files_of_pose = (SCENE, IMAGE, MASK)
+        written = tuple(f"recordings/{own.folder}/{file}" for own in data.poses.values() for file in files_of_pose)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
     identified = IdentifyPicturesStage.of(run, **common)

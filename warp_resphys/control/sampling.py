@@ -273,18 +273,18 @@ class Source:
         robot, still = self.robot, torch.zeros_like(q)
         state = RobotState(State(q, still), robot.begin_memory(self.given(share[None])))
         hessian, inertia, free = self._elastic.linearised(state, **self.given(share[None]))
-        stiffness = (hessian - scipy.sparse.diags_array(inertia)).tocsc()
+        stiffness = (hessian - inertia).tocsc()
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()
         mass = scipy.sparse.diags_array(self.mass.cpu().numpy()[coordinates]).tocsc()
-        count = min(int(np.ceil(_MORE_MODES * modes)) + 2, len(inertia) - 2)
-        values, vectors = scipy.sparse.linalg.eigsh(stiffness, count, M=mass, sigma=0.0, v0=np.ones(len(inertia)))
+        count = min(int(np.ceil(_MORE_MODES * modes)) + 2, inertia.shape[0] - 2)
+        values, vectors = scipy.sparse.linalg.eigsh(stiffness, count, M=mass, sigma=0.0, v0=np.ones(inertia.shape[0]))
         order = np.argsort(values)[:modes]
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
         shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
         own = np.diag(values[order])
         damped, inertia = self.robot.linearised(state, **self.given(share[None]))[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
-        step = float(np.sqrt(mass.diagonal()[0] / inertia[0]))
+        step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
         damping = step * (kept.T @ ((damped - hessian) @ kept))
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)

@@ -28,6 +28,9 @@ from .description import Description
 from .inputs import Given, InputReader, inputs_of
 from .motion import Motion
 from .state import RobotState
+from .twin.estimator import FullEstimator, TwinNoise
+from .twin.kalman import Gate
+from .twin.twin import Twin
 
 SUFFIX: Final = ".safetensors"
 
@@ -102,6 +105,12 @@ class Robot:
         other = object.__new__(Robot)
         other.__dict__.update(self.__dict__)
         other._set_parameters({**self.parameters, **parameters})
+        return other
+
+    def without_force(self) -> "Robot":
+        """Returns the robot without its learned force, with the identified parameters."""
+        other = self.with_parameters()
+        other._learned = None if not self.is_data_driven else self._learned
         return other
 
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
@@ -356,6 +365,45 @@ class Robot:
             final=state,
         )
 
+    def twin(
+        self,
+        refine: Mapping[str, float] | None = None,
+        horizon: float = 0.2,
+        patience: float = 0.3,
+        modes: int = 8,
+        noise: TwinNoise | None = None,
+        gate: Gate | None = None,
+        start: RobotState | None = None,
+        **inputs: Given,
+    ) -> Twin:
+        """Returns a twin: this robot, which follows the real one by its markers and looks ahead.
+
+        Corrections excite vibrations that the midpoint rule would keep, so that BDF2 steps in its place.
+
+        Args:
+            refine: standard deviations of parameters that are refined on the way, by name, in their units.
+            horizon: of predictions [s].
+            patience: how late packets may come [s].
+            modes: vibrations in which the state is corrected.
+            noise: of markers and simulator.
+            gate: for markers that jump.
+            start: state at the first packet, one environment; the equilibrium under its commands if omitted.
+            inputs: commands before the first packet, as for `step`.
+
+        Raises:
+            InputError: an unknown input or parameter, or a network in place of the simulator.
+            ConvergenceError: there is no equilibrium.
+        """
+        robot = self if self.simulator.integrator != "midpoint" else self._integrated_by("bdf2")
+        return Twin(FullEstimator(robot, inputs, refine, modes, noise, gate, start), horizon, patience)
+
+    def _integrated_by(self, integrator: str) -> "Robot":
+        other = object.__new__(Robot)
+        other.__dict__.update(self.__dict__)
+        other.simulator = replace(self.simulator, integrator=integrator)
+        other._set_parameters(self.parameters)
+        return other
+
     # Linearisation and the network's inputs in a state
 
     def begin_memory(self, inputs: Mapping[str, Given], batch: int = 1) -> dict[str, torch.Tensor]:
@@ -366,18 +414,16 @@ class Robot:
         """Inputs (B, A) of the network beside the state in a step, as `program.condition_names` lists them."""
         return self._commands.act(state, self._read(inputs, state.batch)).conditions
 
-    def linearised(
-        self, state: RobotState, **inputs: Given
-    ) -> tuple[csc_array, NDArray[np.float64], NDArray[np.int64]]:
+    def linearised(self, state: RobotState, **inputs: Given) -> tuple[csc_array, csc_array, NDArray[np.int64]]:
         """Linearises a step of the simulator about a state, without the learned force.
 
         Returns:
-            The (3 F, 3 F) Hessian and its inertial part (3 F,) [N/m], and the numbers of the F free vertices.
+            The (3 F, 3 F) Hessian and the inertia in it [N/m], and the numbers of the F free vertices.
         """
         acting = self._commands.act(state, self._read(inputs, state.batch)).inputs
         linearised = self.simulator.linearise(state.body, acting, self.constants)
-        hessian, inertia = linearised.matrix(state.q)
-        return hessian, inertia, linearised.free.cpu().numpy()
+        hessian, _ = linearised.matrix(state.q)
+        return hessian, linearised.inertia_matrix(state.q), linearised.free.cpu().numpy()
 
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}

@@ -25,8 +25,8 @@ from ..report.figures import TONES
 from ..report.render import MEASURED
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, load, trial_names
-from ..robot.state import RobotState
 from .live import LiveRobot, range_of
+from .live_twin import LiveTwin, TwinSettings
 from .tables import show
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ _HIGHEST_PORT: Final = 65535
 _DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
 _HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
 Keys: **space** pauses, **R** resets."""
+_HELP_TWIN: Final = """Blue: the estimate. Grey: where the robot will be, if its commands stay. Dots: measured markers.
+Drag to turn the view, scroll to zoom, right-drag to move. Keys: **space** pauses, **R** starts again."""
 _SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1.0, "double": 2.0}
 
 
@@ -54,6 +56,8 @@ class ViewSettings(Settings):
     host: Word
     port: Count
     seconds: Positive | None = setting(unit="s")
+    source: Word | None
+    twin: TwinSettings
 
 
 def view(settings: ViewSettings, folder: Path) -> None:
@@ -73,11 +77,17 @@ def view(settings: ViewSettings, folder: Path) -> None:
         ) from None
     wp.config.log_level = wp.LOG_WARNING
     robot = load(Path(settings.run).expanduser(), settings.model, device=settings.device)
-    live = LiveRobot(robot)
-    if settings.trial is not None:
-        live.play_trial(settings.trial)
-    live.step()  # Compiles the kernels of a step before the page is opened.
-    live.reset()
+    live: LiveRobot | LiveTwin
+    if settings.source is not None:
+        if settings.trial is not None:
+            raise InputError("trial and source are both given: a twin follows its source; leave trial out.")
+        live = LiveTwin(robot, settings.source, settings.twin)
+    else:
+        live = LiveRobot(robot)
+        if settings.trial is not None:
+            live.play_trial(settings.trial)
+        live.step()  # Compiles the kernels of a step before the page is opened.
+        live.reset()
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with redirect_stdout(io.StringIO()):  # The address is printed below.
         server = viser.ViserServer(settings.host, port, label=robot.description.name, verbose=False)
@@ -85,11 +95,27 @@ def view(settings: ViewSettings, folder: Path) -> None:
         page = Page(server, live)
         where = "localhost" if settings.host in _EVERYWHERE else settings.host
         show(f"Open http://{where}:{server.get_port()} in a browser; Ctrl-C ends it.")
+        if isinstance(live, LiveTwin) and live.address:
+            show(f"Packets are taken at {live.address}.")
         rate = page.run(settings.seconds)
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+        if isinstance(live, LiveTwin):
+            live.close()
     show(f"{rate:.1f} pictures a second")
+    if isinstance(live, LiveTwin):
+        for line in _summary(live):
+            show(line)
+
+
+def _summary(live: LiveTwin) -> list[str]:
+    """Lines on a twin that has ended."""
+    if not live.seconds:
+        return ["no packets"]
+    half, most = np.percentile(1e3 * np.array(live.seconds), [50, 99])
+    pace = f"estimates in {half:.1f} ms (median), {most:.1f} ms (99th percentile)"
+    return [f"{pace}, steps of {1e3 * live.robot.time_step:g} ms", *live.words]
 
 
 def _free_port(host: str, port: int) -> int:
@@ -121,16 +147,16 @@ class Page:
 
     Args:
         server: that serves the page.
-        live: the robot.
+        live: the robot, or the twin.
     """
 
-    def __init__(self, server: "viser.ViserServer", live: LiveRobot) -> None:
+    def __init__(self, server: "viser.ViserServer", live: LiveRobot | LiveTwin) -> None:
         self._server, self._live = server, live
         self._requests: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
         self._holder: int | None = None  # Client that drags the body.
-        self._shown_state: RobotState | None = None
+        self._shown_state: object = None
         self._shown_trial: RecordedTrial | None = None
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
@@ -176,6 +202,9 @@ class Page:
             "/measured", none, _bytes(MEASURED), point_size=_DOT, point_shape="circle", visible=False
         )
 
+        if isinstance(live, LiveTwin):
+            return
+
         @self._body.on_drag
         async def _(event: Any) -> None:  # Without awaiting, so that events are handled in their order.
             if event.phase == "start" and self._holder is None:
@@ -195,7 +224,13 @@ class Page:
 
     def _let_go(self) -> None:
         self._holder = None
-        self._ask(self._live.let_go)
+        self._ask(self._driven.let_go)
+
+    @property
+    def _driven(self) -> LiveRobot:
+        """The robot, where it is no twin."""
+        assert isinstance(self._live, LiveRobot)
+        return self._live
 
     # Controls
 
@@ -208,7 +243,8 @@ class Page:
         server, live = self._server, self._live
         gui, robot = server.gui, live.robot
         server.gui.configure_theme(dark_mode=False, show_logo=False)
-        gui.add_markdown(f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{_HELP}")
+        text = _HELP_TWIN if isinstance(live, LiveTwin) else _HELP
+        gui.add_markdown(f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{text}")
         self._status = gui.add_markdown("")
         self._play = gui.add_button("Pause")
         self._play.on_click(lambda _: self._ask(self._toggle))
@@ -218,11 +254,19 @@ class Page:
         speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="real time")
         speed.on_update(lambda _: setattr(self, "_speed", _SPEEDS[speed.value]))
         self._trial: Any = None
+        self._sliders: dict[str, list[Any]] = {}
+        if isinstance(live, LiveRobot):
+            self._set_driving(live)
+        dark = gui.add_checkbox("Dark", False)
+        dark.on_update(lambda _: gui.configure_theme(dark_mode=dark.value, show_logo=False))
+
+    def _set_driving(self, live: LiveRobot) -> None:
+        """Controls of a robot that is driven by hand or by a trial."""
+        gui, robot = self._server.gui, live.robot
         if robot.folder is not None:
             name = _BY_HAND if live.trial is None else live.trial.name
             self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
             self._trial.on_update(lambda _: self._ask(self._choose))
-        self._sliders: dict[str, list[Any]] = {}
         for name, robot_input in robot.inputs.items():
             words = f"{robot_input.quantity.plural or robot_input.name}".capitalize() if name != BASE else "Base"
             with gui.add_folder(words, expand_by_default=robot_input.low is not None):
@@ -238,12 +282,10 @@ class Page:
                     self._ask(live.restore)
 
                 back.on_click(restore)
-        dark = gui.add_checkbox("Dark", False)
-        dark.on_update(lambda _: gui.configure_theme(dark_mode=dark.value, show_logo=False))
 
     def _slider(self, name: str, part: int) -> Any:
         """A slider for a part of an input, in the unit of its quantity for display."""
-        live, robot_input = self._live, self._live.robot.inputs[name]
+        live, robot_input = self._driven, self._driven.robot.inputs[name]
         factor = robot_input.quantity.shown_factor if robot_input.quantity.shown_unit else 1.0
         unit = robot_input.quantity.shown_unit or robot_input.unit
         unit = ("m" if part < 3 else "rad") if name == BASE else unit
@@ -261,11 +303,12 @@ class Page:
 
     def _parameter(self, name: str) -> Any:
         """A slider for a parameter."""
-        quantity, value = self._live.parameters[name]
+        live = self._driven
+        quantity, value = live.parameters[name]
         low, high = range_of(quantity, value)
         label = f"{name.replace('_', ' ')}{f' [{quantity.unit}]' if quantity.unit else ''}"
         slider = self._server.gui.add_slider(label, low, high, (high - low) / 1000.0, value)
-        slider.on_update(lambda _: self._ask(lambda: self._live.set_parameter(name, slider.value)))
+        slider.on_update(lambda _: self._ask(lambda: live.set_parameter(name, slider.value)))
         return slider
 
     def _toggle(self) -> None:
@@ -277,28 +320,28 @@ class Page:
         self._set_sliders()
 
     def _choose(self) -> None:
-        name, now = self._trial.value, _BY_HAND if self._live.trial is None else self._live.trial.name
+        name, now = self._trial.value, _BY_HAND if self._driven.trial is None else self._driven.trial.name
         if name == now:
             return
         try:
-            self._live.play_trial(None if name == _BY_HAND else name)
+            self._driven.play_trial(None if name == _BY_HAND else name)
         except ResphysError:
             self._trial.value = now
             raise
         self._set_sliders()
 
     def _by_hand(self, name: str, part: int, value: float) -> None:
-        self._live.set_input(name, part, value)
+        self._driven.set_input(name, part, value)
         if self._trial is not None and self._trial.value != _BY_HAND:
             self._trial.value = _BY_HAND
 
     def _set_sliders(self) -> None:
         """Moves the sliders to the current values of the inputs."""
         for name, sliders in self._sliders.items():
-            quantity = self._live.robot.inputs[name].quantity
+            quantity = self._driven.robot.inputs[name].quantity
             factor = quantity.shown_factor if quantity.shown_unit else 1.0
             for part, slider in enumerate(sliders):
-                value = float(np.clip(factor * self._live.inputs[name][part], slider.min, slider.max))
+                value = float(np.clip(factor * self._driven.inputs[name][part], slider.min, slider.max))
                 if abs(value - slider.value) > 0.5 * slider.step:
                     slider.value = value
 
@@ -355,12 +398,13 @@ class Page:
             self._edges.points = surface[self._sharp]
             self._dots(self._markers, live.markers)
             measured = live.measured
-            whole = measured is not None and not live.robot.labels
-            self._dots(self._measured, np.empty((0, 3)) if measured is None or whole else measured)
-            if whole and measured is not None:
-                self._target.vertices = self._shown(measured[live.surface])
-            if self._target.visible != whole:
-                self._target.visible = whole
+            whole = live.ahead if isinstance(live, LiveTwin) else None if live.robot.labels else measured
+            dots = measured is not None and (isinstance(live, LiveTwin) or bool(live.robot.labels))
+            self._dots(self._measured, measured if dots and measured is not None else np.empty((0, 3)))
+            if whole is not None:
+                self._target.vertices = self._shown(whole[live.surface])
+            if self._target.visible != (whole is not None):
+                self._target.visible = whole is not None
 
     def _dots(self, cloud: Any, points: FloatArray) -> None:
         seen = points[np.isfinite(points).all(axis=1)]
@@ -379,6 +423,8 @@ class Page:
             away = 1e3 * np.linalg.norm(where - measured, axis=1)
             if np.isfinite(away).any():
                 lines.append(f"{float(np.nanmean(away)):.2f} mm from the measurement")
+        if isinstance(live, LiveTwin):
+            lines += map(_plain, live.words)
         if live.has_left:
             lines.append("**The body is outside the training range.**")
         if live.failure:

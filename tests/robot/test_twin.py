@@ -1,0 +1,299 @@
+"""A twin follows a robot by its markers, however they come, and says what was wrong with them."""
+
+import json
+import socket
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.robot.loading import load
+from warp_resphys.robot.twin.estimator import TwinNoise
+from warp_resphys.robot.twin.kalman import Gate, conditioned, distances
+from warp_resphys.robot.twin.stream import Listener, Packet, recorded_packets
+from warp_resphys.robot.twin.tangent import StepTangent, shifted
+
+NOISE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def robot(finished):
+    return load(finished[0], "simulation")._integrated_by("bdf2")
+
+
+@pytest.fixture(scope="module")
+def swing(robot):
+    """Markers (T, N, 3) of a body that is let go from a bent shape, with noise, and its true states."""
+    start = robot.begin(external_force=pull(robot, 0.5))
+    motion = robot.rollout(start, 60)
+    noise = NOISE * np.random.default_rng(0).standard_normal(tuple(motion.q[:, 0].shape))
+    return motion.q[:, 0].numpy() + noise, motion.q[:, 0].numpy(), motion
+
+
+def pull(robot, newtons):
+    """A force on the tip, upwards and sideways (N, 3)."""
+    rest = robot.simulator.rest_positions
+    force = torch.zeros_like(rest)
+    tip = rest[:, 0] > rest[:, 0].max() - 1e-9
+    force[tip] = torch.tensor([0.0, 0.6, 0.8], dtype=rest.dtype) * newtons / tip.sum()
+    return force
+
+
+def followed(robot, frames, order=None, **settings):
+    twin = robot.twin(noise=TwinNoise(markers=NOISE), **settings)
+    for number in order or range(len(frames)):
+        twin.take(number * robot.time_step, frames[number])
+    return twin
+
+
+def test_conditioning_is_that_of_normal_variables():
+    random = np.random.default_rng(1)
+    root, slopes, residual = random.normal(size=(5, 5)), random.normal(size=(7, 5)), random.normal(size=7)
+    covariance = root @ root.T
+    covariance[2] = covariance[:, 2] = 0.0  # a quantity that is known
+    change, after = conditioned(covariance, slopes, residual, 0.3)
+    spread = slopes @ covariance @ slopes.T + 0.09 * np.eye(7)
+    gain = covariance @ slopes.T @ np.linalg.inv(spread)
+    np.testing.assert_allclose(change, gain @ residual, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(after, covariance - gain @ slopes @ covariance, rtol=1e-6, atol=1e-9)
+    away = distances(covariance, slopes[:6].reshape(2, 3, 5), residual[:6].reshape(2, 3), 0.3)
+    whole = np.sqrt(residual[:3] @ np.linalg.solve(spread[:3, :3], residual[:3]))
+    assert away[0] == pytest.approx(whole)
+
+
+def test_a_marker_that_jumps_is_left_out_until_it_stays():
+    gate, since = Gate(limit=6.0, least=1e-3, grace=0.03), np.zeros(3)
+    away, jump = np.array([50.0, 1.0, np.nan]), np.array([0.01, 0.01, np.nan])
+    for number in range(3):
+        out, stays, since = gate.judged(away, jump, since, 0.01)
+        np.testing.assert_array_equal(out, [True, False, False])
+        assert bool(stays[0]) == (number == 2)
+    assert not gate.judged(away, np.full(3, 1e-4), since, 0.01)[0].any()
+    back = gate.judged(np.ones(3), jump, since, 0.01)
+    assert not back[0].any()
+    assert not back[2].any()
+
+
+# BDF2 starts from a history that is made up, which changes the amplitude by a sixth with steps as long as these.
+@pytest.mark.parametrize(("integrator", "share"), [("implicit_euler", 0.05), ("bdf2", 0.2)])
+def test_a_step_is_linear_in_its_vibrations(robot, integrator, share):
+    robot = robot._integrated_by(integrator)
+    start = robot.begin()
+    tangent = StepTangent.of(robot, start, {}, 4)
+    count, h = len(tangent.frequencies), robot.time_step
+    still = robot.step(robot.step(start))
+    errors = np.zeros((2, count))
+    errors[:, 0] = 2e-4 / tangent.size * np.array([1.0, tangent.frequencies[0]])
+    fields = [torch.einsum("r,rni->ni", torch.as_tensor(row).to(still.q), tangent.shapes)[None] for row in errors]
+    moved, linear = shifted(still, *fields, h), errors.ravel()
+    for _ in range(10):
+        moved, still = robot.step(moved), robot.step(still)
+        linear = tangent.transition[:, : 2 * count] @ linear
+    seen = torch.einsum("r,rni->ni", torch.as_tensor(linear[:count]).to(still.q), tangent.shapes)
+    true = moved.q[0] - still.q[0]
+    assert float(true.norm(dim=1).max()) > 3e-5
+    assert float((seen - true).norm(dim=1).max()) < share * float(true.norm(dim=1).max())
+
+
+def test_a_force_shifts_the_equilibrium_by_what_it_is_named(robot):
+    tangent = StepTangent.of(robot, robot.begin(), {}, 4)
+    one = 1e-3 / tangent.size
+    shifted_by = robot.begin(external_force=one * tangent.pull[0]).q[0] - robot.begin().q[0]
+    expected = one * tangent.shapes[0]
+    assert float((shifted_by - expected).norm(dim=1).max()) < 0.05 * float(expected.norm(dim=1).max())
+
+
+def test_it_finds_a_state_that_it_was_not_given(robot, swing):
+    frames, true, _ = swing
+    twin = followed(robot, frames)
+    now = twin.now
+    off = np.linalg.norm(now.markers - true[-1], axis=1).mean()
+    free = np.linalg.norm(robot.begin().q[0].numpy() - true[-1], axis=1).mean()
+    assert off < 0.1 * free
+    assert off < 2.0 * NOISE
+    assert now.time == pytest.approx(60 * robot.time_step)
+    inside = np.abs(now.markers - true[-1]) < 1.645 * now.deviations + 1e-9
+    assert inside[true[0] != true[-1]].mean() > 0.8
+    assert twin.counts == {}
+
+
+def test_its_predictions_are_better_than_the_last_markers(robot, swing):
+    frames, _, _ = swing
+    twin = robot.twin(noise=TwinNoise(markers=NOISE), horizon=0.1)
+    assert twin.disagreement is None
+    for number, frame in enumerate(frames):
+        twin.take(number * robot.time_step, frame)
+        if number > 15:
+            ahead = twin.ahead()
+            np.testing.assert_allclose(ahead.times[-1] - ahead.times[0], 0.1)
+    off = twin.disagreement
+    assert off.predictions == 60 - 15 - 10
+    assert off.twin < 0.3 * off.held
+    assert off.twin < 0.5 * off.simulator
+    assert off.covered > 0.8
+
+
+def test_packets_that_come_late_change_nothing(robot, swing):
+    frames, _, _ = swing
+    order = list(range(40))
+    for number in range(1, 36, 5):
+        order[number], order[number + 3] = order[number + 3], order[number]
+    late, due = followed(robot, frames, order), followed(robot, frames, range(40))
+    for number in range(3):  # Estimates on the way must not matter either.
+        late.take((39 - number) * robot.time_step, np.full_like(frames[0], np.nan))
+        _ = late.now
+    assert torch.equal(late.now.state.q, due.now.state.q)
+    np.testing.assert_array_equal(late.now.markers, due.now.markers)
+    assert late.counts["packets out of order"] >= 7
+    assert not late.take(0.0, frames[0])
+    assert late.counts["packets too late"] == 1
+
+
+def test_commands_that_come_late_change_nothing(robot, swing):
+    frames, _, _ = swing
+    h, twins = robot.time_step, []
+    for late in (False, True):
+        twin = robot.twin(noise=TwinNoise(markers=NOISE))
+        for number in range(20):
+            if number == 5 and not late:
+                twin.take(5 * h, base=[0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
+            twin.take(number * h, frames[number])
+            _ = twin.now
+        if late:
+            twin.take(5 * h, base=[0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
+        twins.append(twin.now)
+    assert torch.equal(twins[0].state.q, twins[1].state.q)
+    fixed = robot.simulator.body.fixed_vertices
+    lifted = twins[0].state.q[0, fixed] - robot.simulator.rest_positions[fixed]
+    assert float(lifted[:, 2].min()) == pytest.approx(1e-3)
+
+
+def test_frames_between_the_steps_are_used_at_their_own_times(robot, swing):
+    motion, h = swing[2], robot.time_step
+    times = 1.5 * h * np.arange(39)
+    twin, late = robot.twin(noise=TwinNoise(markers=NOISE)), robot.twin(noise=TwinNoise(markers=NOISE))
+    for moment, frame in zip(times, motion.at(times)[:, 0].numpy(), strict=True):
+        twin.take(moment, frame)
+        late.take(np.ceil(moment / h - 1e-6) * h, frame)
+    now, expected = twin.now, motion.at([twin.now.time])[0, 0].numpy()
+    off = np.linalg.norm(now.markers - expected, axis=1).mean()
+    assert off < 0.5 * np.linalg.norm(late.now.markers - expected, axis=1).mean()
+    assert off < 2.0 * NOISE
+
+
+def test_markers_that_vanish_or_jump_are_left_out_and_named(robot, swing):
+    frames, true, _ = swing
+    broken = frames.copy()
+    tip = int(true[0, :, 0].argmax())
+    broken[20:26, tip] += [0.0, 0.03, 0.0]
+    broken[30:40] = np.nan
+    twin = followed(robot, broken)
+    assert twin.counts == {f"vertex_{tip} jumps": 6}
+    assert np.linalg.norm(twin.now.markers - true[-1], axis=1).mean() < 2.0 * NOISE
+
+
+def test_a_body_that_is_put_elsewhere_is_found_again(robot, swing):
+    frames, true, _ = swing
+    moved = np.concatenate([frames[40:60], frames[:60]])
+    at_tip = true[0, :, 0] > true[0, :, 0].max() - 0.01
+    moved = np.where(at_tip[:, None], moved, np.nan)
+    twin = followed(robot, moved, gate=Gate(limit=6.0, least=1e-3, grace=0.03))
+    assert twin.counts["jumps of the whole body"] == 1
+    assert np.linalg.norm(twin.now.markers - true[59], axis=1).mean() < 3.0 * NOISE
+
+
+def test_it_refines_a_parameter_as_it_runs(robot):
+    stiff = float(robot.simulator.constants["youngs_modulus"])
+    other = robot.with_parameters(youngs_modulus=1.2 * stiff)
+    motion = other.rollout(other.begin(external_force=pull(robot, 0.5)), 80)
+    frames = motion.q[:, 0].numpy()
+    frames = frames + NOISE * np.random.default_rng(2).standard_normal(frames.shape)
+    twin = followed(robot, frames, refine={"youngs_modulus": 0.3 * stiff})
+    value, deviation = twin.now.parameters["youngs_modulus"]
+    assert value == pytest.approx(1.2 * stiff, rel=0.05)
+    assert deviation < 0.1 * stiff
+    assert abs(value - 1.2 * stiff) < 3.0 * deviation
+    with pytest.raises(InputError, match="there is no parameter 'wobble'"):
+        robot.twin(refine={"wobble": 1.0})
+    with pytest.raises(InputError, match=r"refine\.youngs_modulus is -1"):
+        robot.twin(refine={"youngs_modulus": -1.0})
+
+
+def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
+    frames, _, _ = swing
+    twin = followed(robot, frames[:20])
+    for number in range(12):
+        twin.take(number * robot.time_step - 5.0, frames[number])
+    assert twin.counts["starts with an earlier clock"] == 1
+    assert twin.counts["packets too late"] == 9
+    assert -5.0 < twin.now.time < 0.0
+    twin.take(100.0, frames[0])
+    assert twin.counts["starts after a gap"] == 1
+    assert twin.now.time == 100.0
+
+
+@pytest.mark.parametrize(
+    ("packet", "message"),
+    [
+        ({"time": np.nan}, "has the time nan"),
+        ({"time": 1.0, "markers": np.zeros((2, 3))}, r"markers of shape \(2, 3\)"),
+        ({"time": 1.0, "markers": {"vertex_0": [1.0]}}, r"as the position of 'vertex_0': give x, y and z in m"),
+        ({"time": 1.0, "wind": 1.0}, "there is no input 'wind'"),
+    ],
+)
+def test_a_wrong_packet_is_one_sentence_and_is_left_out(robot, swing, packet, message):
+    twin = followed(robot, swing[0][:5])
+    before = twin.now
+    with pytest.raises(InputError, match=message):
+        twin.take(**packet)
+    assert torch.equal(before.state.q, twin.now.state.q)
+
+
+def test_millimetres_are_refused_and_unknown_markers_counted(robot, swing):
+    twin = robot.twin()
+    with pytest.raises(InputError, match="no packet"):
+        _ = twin.now
+    with pytest.raises(InputError, match="give positions in metres"):
+        twin.take(0.0, 1e3 * swing[0][0])
+    twin.take(0.0, {"vertex_3": swing[0][0][3], "nose": [0, 0, 0], "vertex_4": [None, None, None]})
+    assert twin.counts == {"unknown marker 'nose'": 1}
+    assert np.isfinite(twin.now.markers).all()
+
+
+def test_a_network_alone_has_no_twin(finished):
+    with pytest.raises(InputError, match="load another model"):
+        load(finished[0], "simfree").twin()
+
+
+def test_packets_over_udp_and_from_a_file(robot, folder):
+    listener = Listener("udp://127.0.0.1:0")
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sent = {"time": 1.5, "markers": {"vertex_0": [0.0, 0.1, None]}, "inputs": {"payload": 0.1}}
+    for text in (
+        json.dumps(sent).encode(),
+        b"{",
+        b'{"markers": {}}',
+        b'{"time": 1, "x": 2}',
+        b'{"time": 1, "inputs": 2}',
+    ):
+        sender.sendto(text, listener.address)
+    packets, until = [], time.monotonic() + 10.0
+    while sum(listener.refused.values()) + len(packets) < 5 and time.monotonic() < until:
+        packets += listener.packets()
+    assert packets == [Packet(1.5, sent["markers"], sent["inputs"])]
+    for words in ("is no JSON", "has no time", "has the field 'x'", "inputs of a packet is no object"):
+        assert sum(words in message for message in listener.refused) == 1
+    with pytest.raises(InputError, match="cannot be listened at"):
+        Listener(f"udp://127.0.0.1:{listener.address[1]}")
+    sender.close()
+    listener.close()
+    for wrong in ("tcp://127.0.0.1:1", "udp://127.0.0.1", "udp://x:y"):
+        with pytest.raises(InputError, match="give udp://HOST:PORT"):
+            Listener(wrong)
+    motion = robot.rollout(robot.begin(), 4)
+    motion.write_csv("swing.csv")
+    read = list(recorded_packets(robot, "swing.csv"))
+    assert [packet.time for packet in read] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.04])
+    np.testing.assert_allclose(read[2].markers["vertex_7"], motion.q[2, 0, 7].numpy(), atol=1e-9)

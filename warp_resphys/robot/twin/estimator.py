@@ -1,0 +1,374 @@
+r"""The state of a robot's full simulator, estimated from its markers.
+
+The simulator itself, with its learned force, carries the mean. The error of the mean is
+
+    q - q^ = Phi z + S theta~,   v - v^ = Phi w + S' theta~,
+
+with the r slowest vibrations Phi about the first state, and the derivatives S and S' of the motion by the refined
+parameters theta. For each parameter a robot with another value runs beside, so that S follows by differences (a filter
+with separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359). A force on the body, a random walk, shifts its
+equilibrium by b; and the markers sit o away from where they are bound. The covariance is that of (z, w, b, theta, o):
+an extended Kalman filter of reduced rank (Pham, Verron and Roubaud, J. Mar. Syst. 16 (1998) 323).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from ...energies.strings import PAYLOAD
+from ...io.errors import InputError, listed
+from ...learning.parameters import check_names, identifiable_parameters
+from ...stepping.state import State
+from ..inputs import FORCE, Given
+from ..state import RobotState
+from .kalman import Correction, FloatArray, Gate, conditioned, distances
+from .robots import Steppable
+from .tangent import StepTangent, shifted
+
+_DIFFERENCE: Final = 0.05  # of the robots that run beside, in deviations of their parameter
+_OPEN: Final = 1e-3  # least distance of a parameter from a bound that it must not reach, over its first value
+_UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
+_SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
+_WANDER: Final = 1.0  # time after which the force on the body is another [s]
+_SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
+_EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the body may leave
+_LARGEST: Final = 0.1  # correction of a vertex in one frame, over the size of the body
+_JUMP: Final = 0.02  # least distance of a marker that counts as a jump, over the size of the body
+
+
+@dataclass(frozen=True)
+class TwinNoise:
+    """Standard deviations from which a twin starts.
+
+    Attributes:
+        markers: of a coordinate of a marker [m].
+        simulator: of simulated markers from real ones [m]; None for the mean error in the run's test trials.
+        placement: of the markers on the body, from where they are bound [m].
+        forget: time after which a refined parameter may be another [s].
+    """
+
+    markers: float = 2e-4
+    simulator: float | None = None
+    placement: float = 1e-3
+    forget: float = 10.0
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is known of a robot after a step.
+
+    Attributes:
+        state: of 2 + P environments: the estimate, the P with another parameter, and the one without markers.
+        parameters: (P,) refined values.
+        bias: (r,) shift of the equilibrium.
+        places: (M, 3) markers from where they are bound [m].
+        covariance: (n, n) of the errors of z, w, b, parameters and places.
+        since: (M,) for how long markers have been left out [s].
+        left: (M, 3) from the corrected simulator to the markers in the last frame that was believed [m].
+    """
+
+    state: RobotState
+    parameters: FloatArray
+    bias: FloatArray
+    places: FloatArray
+    covariance: FloatArray
+    since: FloatArray
+    left: FloatArray
+
+
+class FullEstimator:
+    """Estimates the state of a robot with its own simulator.
+
+    Args:
+        robot: with a simulator.
+        inputs: constant commands under which it rests at first.
+        refine: standard deviations of the parameters to refine, by name, in their units; ``payload`` is one of them
+            where the robot has one.
+        modes: number r of vibrations.
+        noise: of markers and simulator.
+        gate: for markers that jump.
+        start: of the robot, one environment; its equilibrium under the inputs if omitted.
+
+    Raises:
+        InputError: an unknown parameter or input; a network in place of the simulator.
+        ConvergenceError: there is no equilibrium.
+    """
+
+    def __init__(
+        self,
+        robot: Steppable,
+        inputs: Mapping[str, Given],
+        refine: Mapping[str, float] | None = None,
+        modes: int = 8,
+        noise: TwinNoise | None = None,
+        gate: Gate | None = None,
+        start: RobotState | None = None,
+    ) -> None:
+        if robot.is_data_driven:
+            raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
+        self.robot, self.labels, self.time_step = robot, robot.labels, robot.time_step
+        self.noise, self._refined = noise or TwinNoise(), dict(refine or {})
+        self._check()
+        self._first = self._values(inputs)
+        self._prior = np.array([*self._refined.values()], dtype=np.float64)
+        self._apart = _DIFFERENCE * self._prior
+        rest = robot.simulator.rest_positions
+        self.size = float((rest.amax(0) - rest.amin(0)).max())
+        self._gate = gate or Gate(least=_JUMP * self.size)
+        resting = robot.begin(1, **inputs)
+        self.tangent = StepTangent.of(robot.without_force(), resting, inputs, modes)
+        self.count = robot.observe(resting).shape[1]
+        self._set_noise()
+        self._start = start
+
+    def _check(self) -> None:
+        named = [name for name in self._refined if name != PAYLOAD.name or name not in self.robot.inputs]
+        check_names(named, identifiable_parameters(self.robot.simulator))
+        for name, deviation in self._refined.items():
+            if not deviation > 0.0:
+                raise InputError(f"refine.{name} is {deviation:g}: give its standard deviation, which is positive.")
+
+    def _values(self, inputs: Mapping[str, Given]) -> FloatArray:
+        """First values (P,) of the refined parameters."""
+        simulator, values = self.robot.simulator, []
+        for name in self._refined:
+            if name == PAYLOAD.name:
+                values.append(float(torch.as_tensor(inputs.get(name, 0.0)).sum()))
+                continue
+            known = torch.as_tensor(self.robot.parameters.get(name, simulator.constants.get(name, ())))
+            if known.numel() != 1:
+                raise InputError(
+                    f"refine names {name!r}, which has no single value in this robot: refine one that it has "
+                    f"identified, {listed([*self.robot.parameters])}, or the payload."
+                )
+            values.append(float(known))
+        return np.array(values, dtype=np.float64)
+
+    def _set_noise(self) -> None:
+        """Covariance at the start, and what a step adds to it.
+
+        A unit of a coordinate moves the body by `StepTangent.size` in the root mean square. A force that is as large in
+        all modes bends the body less in the faster ones, by the square of their frequency.
+        """
+        tangent, noise, h = self.tangent, self.noise, self.time_step
+        known = self.robot.description.errors_mm.get("mean")
+        error = noise.simulator or (_SIMULATOR * self.size if known is None else 1e-3 * float(known))
+        less = (tangent.frequencies[0] / tangent.frequencies) ** 2
+        shape, force = _UNKNOWN * self.size / tangent.size * less, error / tangent.size * less
+        shaken = force * tangent.frequencies * np.sqrt(tangent.frequencies[0] * h / (2.0 * np.pi))
+        places = np.full(3 * len(self.labels), noise.placement)
+        self._unknown = np.concatenate([shape, shape * tangent.frequencies, force]) ** 2
+        self._initial = np.concatenate([self._unknown, self._prior**2, places**2])
+        self._added = np.concatenate(
+            [
+                np.zeros(len(shape)),
+                shaken**2,
+                force**2 * h / _WANDER,
+                self._prior**2 * h / noise.forget,
+                np.zeros(len(places)),
+            ]
+        )
+
+    # Steps
+
+    def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> Belief:
+        """Returns what is known at first: a robot at rest under constant commands, with large deviations.
+
+        Args:
+            inputs: commands by name.
+            refined: (P,) values of the refined parameters; those of the robot if omitted.
+
+        Raises:
+            InputError: an invalid command.
+            ConvergenceError: there is no equilibrium.
+        """
+        values = self._first if refined is None else refined
+        robot, given = self._at(values, inputs)
+        state = robot.settle(self._count, **given) if self._start is None else self._start.repeat(self._count)
+        r, markers = len(self.tangent.frequencies), self.count
+        return Belief(
+            state.detach(),
+            values,
+            np.zeros(r),
+            np.zeros((len(self.labels), 3)),
+            np.diag(self._initial),
+            np.zeros(markers),
+            np.full((markers, 3), np.nan),
+        )
+
+    @property
+    def _count(self) -> int:
+        return 2 + len(self._refined)
+
+    def _at(self, values: FloatArray, inputs: Mapping[str, Given]) -> tuple[Steppable, dict[str, Given]]:
+        """The robot with the parameters of all environments, and its commands."""
+        table = np.tile(values, (self._count, 1))
+        table[1:-1] += np.diag(self._apart)
+        table[-1] = self._first
+        columns = dict(zip(self._refined, table.T, strict=True))
+        given = dict(inputs)
+        if PAYLOAD.name in columns:
+            given[PAYLOAD.name] = columns.pop(PAYLOAD.name)[:, None]
+        changed = {name: self.robot.simulator.tensor(column) for name, column in columns.items()}
+        return self.robot.with_parameters(**changed) if changed else self.robot, given
+
+    def advance(self, belief: Belief, inputs: Mapping[str, Given]) -> Belief:
+        """Simulates a step under commands.
+
+        Raises:
+            InputError: an invalid command.
+            ConvergenceError: the step failed.
+        """
+        robot, given = self._at(belief.parameters, inputs)
+        pull = torch.einsum("r,rni->ni", self.robot.simulator.tensor(belief.bias), self.tangent.pull)
+        forces = torch.cat([pull.expand(self._count - 1, -1, -1), torch.zeros_like(pull)[None]])
+        state = robot.step(belief.state, **{**given, FORCE: forces}).detach()
+        r = len(belief.bias)
+        step = np.eye(len(belief.covariance))
+        step[: 2 * r, : 3 * r] = self.tangent.transition
+        covariance = step @ belief.covariance @ step.T + np.diag(self._added)
+        known = slice(3 * r, 3 * r + len(self._prior))
+        much = np.sqrt(np.maximum(np.diag(covariance)[known] / self._prior**2, 1.0))
+        covariance[known] /= much[:, None]
+        covariance[:, known] /= much
+        return replace(belief, state=state, covariance=covariance)
+
+    # Markers
+
+    def _seen(self, belief: Belief, ago: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Markers (M, 3) some time ago [m], their derivatives (M, 3, n), and those (M, 3) without a twin."""
+        state, tangent = belief.state, self.tangent
+        q = state.q - ago * state.v
+        amount = _SEEN_STEP * self.size / tangent.shapes.norm(dim=2).amax(1)
+        both = torch.cat([q, q[:1] + amount[:, None, None] * tangent.shapes])
+        seen = self.robot.observe(RobotState(State(both, torch.zeros_like(both)))).cpu().double().numpy()
+        now, beside, free, moved = seen[0], seen[1 : self._count - 1], seen[self._count - 1], seen[self._count :]
+        by_z = np.moveaxis((moved - now) / amount.cpu().double().numpy()[:, None, None], 0, 2)
+        by_values = np.moveaxis((beside - now) / self._apart[:, None, None], 0, 2)
+        parts = [by_z, -ago * by_z, np.zeros_like(by_z), by_values]
+        if self.labels:
+            parts.append(np.eye(belief.places.size).reshape(-1, 3, belief.places.size))
+            now = now + belief.places
+        return now, np.concatenate(parts, axis=2), free
+
+    def markers(self, belief: Belief, ago: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Returns markers (M, 3) some time ago, and the standard deviations of their coordinates [m]."""
+        now, slopes, _ = self._seen(belief, ago)
+        spread = np.einsum("min,nk,mik->mi", slopes, belief.covariance, slopes, optimize=True)
+        return now, np.sqrt(np.maximum(spread, 0.0))
+
+    def correct(self, belief: Belief, markers: FloatArray, ago: float, passed: float) -> tuple[Belief, Correction]:
+        """Conditions a belief on a frame.
+
+        Args:
+            belief: after the step in which the frame was taken.
+            markers: (M, 3) observed [m]; NaN where one is not seen.
+            ago: time from the frame to the end of the step [s].
+            passed: time since the last frame [s].
+        """
+        now, slopes, free = self._seen(belief, ago)
+        seen, residual = np.asarray(np.isfinite(markers).all(axis=1)), markers - now
+        jump = np.linalg.norm(np.where(np.isnan(belief.left), residual, residual - belief.left), axis=1)
+        away = np.full(len(seen), np.nan)
+        away[seen] = distances(belief.covariance, slopes[seen], residual[seen], self.noise.markers)
+        refused, stays, since = self._gate.judged(away, jump, belief.since, passed)
+        off, apart = (np.linalg.norm(markers - points, axis=1) for points in (now, free))
+        moved, restarted = np.zeros_like(refused), False
+        if stays.any():
+            lost = self._lost(belief)
+            now, others, _ = self._seen(lost, ago)
+            change, left = self._conditioned(lost, others[seen], (markers - now)[seen])[0], markers - now
+            restarted = bool((np.linalg.norm(left - others @ change, axis=1) < _EXPLAINED * off)[refused].mean() > 0.5)
+            if restarted:
+                belief, slopes, residual = lost, others, left
+                refused, since = moved, np.zeros_like(since)
+            elif self.labels:
+                moved, refused = stays, refused & ~stays
+                more = np.zeros(len(belief.covariance))
+                more[-belief.places.size :] = np.repeat(np.where(moved, off, 0.0) ** 2, 3)
+                belief = replace(belief, covariance=belief.covariance + np.diag(more))
+                since = np.where(moved, 0.0, since)
+        correction, belief = Correction(seen, refused, moved, restarted, off, apart), replace(belief, since=since)
+        use = seen & ~refused
+        if not use.any():
+            return belief, correction
+        change, covariance = self._conditioned(belief, slopes[use], residual[use])
+        left = np.where(use[:, None], residual - slopes @ change, np.where(seen[:, None], belief.left, np.nan))
+        return self._changed(replace(belief, covariance=covariance, left=left), change), correction
+
+    def _conditioned(self, belief: Belief, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`kalman.conditioned` for markers, with more noise where the shape would change by too much at once."""
+        deviation, r = self.noise.markers, len(belief.bias)
+        while True:
+            rows = slopes.reshape(-1, slopes.shape[2])
+            change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
+            if self._furthest(change[:r]) <= _LARGEST * self.size:  # The vibrations hold for small motions.
+                return change, covariance
+            deviation *= 2.0
+
+    def _lost(self, belief: Belief) -> Belief:
+        """A belief whose state is taken from the simulator without markers, and unknown."""
+        unknown = 3 * len(belief.bias)
+        covariance = belief.covariance.copy()
+        covariance[:unknown] = covariance[:, :unknown] = 0.0
+        covariance[:unknown, :unknown] = np.diag(self._unknown)
+        return replace(belief, state=belief.state.select([self._count - 1] * self._count), covariance=covariance)
+
+    def _changed(self, belief: Belief, change: FloatArray) -> Belief:
+        """Adds a change (n,) of the errors to a belief."""
+        r, count, tangent = len(belief.bias), len(self._refined), self.tangent
+        z, w, b, values, places = np.split(change, np.cumsum([r, r, r, count]))
+        after = np.maximum(belief.parameters + values, self._lowest())
+        values = after - belief.parameters
+        state = belief.state
+        if count:
+            share = state.q.new_tensor(values / self._apart)
+            state = state.map(lambda value, axis: _along(value, axis, share))
+        own = state.q.new_ones(self._count, 1, 1)
+        own[-1] = 0.0
+        shapes = (torch.einsum("r,rni->ni", state.q.new_tensor(x), tangent.shapes) for x in (z, w))
+        moved, faster = (own * field for field in shapes)
+        return replace(
+            belief,
+            state=shifted(state, moved, faster, self.time_step),
+            parameters=after,
+            bias=belief.bias + b,
+            places=belief.places + places.reshape(-1, 3),
+        )
+
+    def _furthest(self, z: FloatArray) -> float:
+        """Largest displacement of a vertex for coordinates (r,) [m]."""
+        moved = torch.einsum("r,rni->ni", self.tangent.shapes.new_tensor(z), self.tangent.shapes)
+        return float(moved.norm(dim=1).max())
+
+    def _lowest(self) -> FloatArray:
+        """Least values (P,) of the refined parameters."""
+        quantities = {**self.robot.simulator.parameters, PAYLOAD.name: PAYLOAD}
+        lows = [quantities[name].lower if name in quantities else -np.inf for name in self._refined]
+        return np.array(
+            [
+                low + _OPEN * max(abs(first), prior)
+                for low, first, prior in zip(lows, self._first, self._prior, strict=True)
+            ]
+        )
+
+    def refined(self, belief: Belief) -> dict[str, tuple[float, float]]:
+        """Refined values and their standard deviations, by name."""
+        first = 3 * len(belief.bias)
+        spread = np.sqrt(np.diag(belief.covariance)[first : first + len(self._refined)])
+        return {
+            name: (float(value), float(deviation))
+            for name, value, deviation in zip(self._refined, belief.parameters, spread, strict=True)
+        }
+
+
+def _along(value: torch.Tensor, axis: int, share: torch.Tensor) -> torch.Tensor:
+    """Moves a tensor of the state along those that run beside, by shares (P,) of the differences; the last stays."""
+    if not value.is_floating_point():
+        return value
+    rows = value.movedim(axis, 0)
+    step = torch.tensordot(share.to(value), rows[1 : 1 + len(share)] - rows[:1], dims=1)
+    return torch.cat([rows[:-1] + step, rows[-1:]]).movedim(0, axis)

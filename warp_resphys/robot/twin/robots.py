@@ -1,0 +1,49 @@
+"""What a twin needs of a robot: `Robot` has more, and imports this package."""
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from ...dynamics.simulator import Simulator
+from ..description import Description
+from ..inputs import RobotInput
+from ..state import RobotState
+
+
+class Steppable(Protocol):
+    """A robot that is stepped; `Robot` documents the members."""
+
+    description: Description
+    simulator: Simulator
+    time_step: float
+    labels: tuple[str, ...]
+    inputs: dict[str, RobotInput]
+    parameters: dict[str, torch.Tensor]
+
+    @property
+    def is_data_driven(self) -> bool:
+        """Whether a network replaces the simulator."""
+
+    def with_parameters(self, **parameters: torch.Tensor | float) -> "Steppable":
+        """Returns the robot with other parameters."""
+
+    def without_force(self) -> "Steppable":
+        """Returns the robot without its learned force."""
+
+    def begin(self, batch: int = 1, **inputs: Any) -> RobotState:
+        """Returns the equilibrium without the learned force."""
+
+    def settle(self, batch: int = 1, **inputs: Any) -> RobotState:
+        """Returns the equilibrium with the learned force."""
+
+    def step(self, state: RobotState, **inputs: Any) -> RobotState:
+        """Returns the state after a step."""
+
+    def observe(self, state: RobotState) -> torch.Tensor:
+        """Returns the markers (B, M, 3) [m]."""
+
+    def linearised(self, state: RobotState, **inputs: Any) -> tuple[csc_array, csc_array, NDArray[np.int64]]:
+        """Returns the Hessian of a step, the inertia in it, and the free vertices."""

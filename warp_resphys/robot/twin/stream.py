@@ -1,0 +1,202 @@
+"""Packets of markers and commands: from a recording, or from other programs over UDP."""
+
+import json
+import socket
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Self
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...data.recordings.reading import read_recording
+from ...data.registration import register_markers
+from ...data.rigid import RigidTransform
+from ...io.errors import InputError, ResphysError, listed
+from .robots import Steppable
+
+_LARGEST: Final = 65_535  # bytes of a packet
+_FIELDS: Final = ("time", "markers", "inputs")
+_FIRST: Final = 20  # frames whose median is registered
+
+
+@dataclass(frozen=True)
+class Packet:
+    """Markers and commands at a time.
+
+    Attributes:
+        time: [s].
+        markers: positions (3,) [m] by name, NaN where a marker is not seen; empty without a frame.
+        inputs: commands by name, in SI units.
+    """
+
+    time: float
+    markers: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of_text(cls, text: str | bytes) -> Self:
+        """Reads a packet of JSON: ``{"time": 1.25, "markers": {"tip": [x, y, z]}, "inputs": {"pressure": [0, 1e4]}}``.
+
+        Raises:
+            InputError: no JSON, no time, or another field.
+        """
+        try:
+            content = json.loads(text)
+        except ValueError as error:
+            raise InputError(f"a packet is no JSON ({error}): docs/twin.md describes packets.") from None
+        if not isinstance(content, dict) or not isinstance(content.get("time"), int | float):
+            raise InputError("a packet has no time: add 'time' in seconds, on one clock for all packets.")
+        for name in content:
+            if name not in _FIELDS:
+                raise InputError(f"a packet has the field {name!r}: it may have {listed(_FIELDS)}.")
+        for name in _FIELDS[1:]:
+            if not isinstance(content.get(name, {}), dict):
+                raise InputError(f"{name} of a packet is no object: give values by name.")
+        return cls(float(content["time"]), content.get("markers", {}), content.get("inputs", {}))
+
+
+def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
+    """Returns the frames of a recording with its commands, in the order of time.
+
+    Raises:
+        DataFileError: the recording cannot be read (`read_recording`).
+        InputError: it has commands of another number than the robot's one driven input.
+    """
+    recording = read_recording(Path(path).expanduser())
+    driven = [name for name in robot.inputs if name in robot.description.seen]
+    commands: Iterator[Mapping[str, Any]] = iter([{}] * len(recording.positions))
+    if recording.actuation is not None and driven:
+        parts, width = robot.inputs[driven[0]].parts, recording.actuation.shape[1]
+        if len(driven) > 1 or width != len(parts):
+            raise InputError(f"{path} has {width} inputs, and {listed(driven)} of the robot has {len(parts)} parts.")
+        commands = ({driven[0]: row} for row in recording.actuation)
+    for time, frame, inputs in zip(recording.time, recording.positions, commands, strict=True):
+        yield Packet(float(time), dict(zip(recording.labels, frame, strict=True)), inputs)
+
+
+class Listener:
+    """Receives packets of JSON over UDP, without waiting.
+
+    Args:
+        url: such as ``udp://127.0.0.1:9000``; port 0 is any.
+
+    Attributes:
+        address: host and port that it listens at.
+        refused: how often what was wrong with packets, in words.
+
+    Raises:
+        InputError: another URL, or a port that cannot be used.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.refused: Counter[str] = Counter()
+        try:
+            parts = urlsplit(url)
+            host, port = parts.hostname, parts.port
+        except ValueError:
+            host = port = None
+        if host is None or port is None or parts.scheme != "udp":
+            raise InputError(f"source is {url!r}: give udp://HOST:PORT, as udp://127.0.0.1:9000.")
+        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise InputError(f"{url} cannot be listened at ({error.strerror}): choose another port.") from None
+        self.address: tuple[str, int] = self._socket.getsockname()[:2]
+
+    def packets(self) -> Iterator[Packet]:
+        """Returns the packets that have arrived; wrong ones are counted in `refused`."""
+        while True:
+            try:
+                text = self._socket.recv(_LARGEST)
+            except (BlockingIOError, InterruptedError):
+                return
+            try:
+                yield Packet.of_text(text)
+            except InputError as error:
+                self.refused[str(error)] += 1
+
+    def close(self) -> None:
+        """Frees the port."""
+        self._socket.close()
+
+
+class Frame:
+    """Moves packets from the frame of cameras to that of the robot.
+
+    The first frames are registered, as an import does it: by the markers on what holds the robot
+    (`markers.reference`) where three of them are seen, else by all markers of the robot, which rests meanwhile.
+
+    Args:
+        robot: whose markers they are.
+        at_rest: (M, 3) markers of the robot at rest under the first commands [m].
+
+    Raises:
+        InputError: every vertex is observed, or the markers have a frame of their own.
+    """
+
+    def __init__(self, robot: Steppable, at_rest: NDArray[np.float64]) -> None:
+        settings = robot.description.markers
+        if settings is None or settings.frame == "own" or settings.plane is not None:
+            raise InputError(
+                "twin.register is true, but the run's recordings are not in the frame of the body: send markers as its "
+                "trials have them, and set twin.register to false."
+            )
+        self._residual = settings.largest_residual
+        self._places = dict(zip(robot.labels, at_rest, strict=True)) | {
+            label: np.asarray(place, dtype=np.float64) for label, place in settings.reference.items()
+        }
+        self._reference = tuple(settings.reference)
+        self._waiting: list[Packet] = []
+        self.transform: RigidTransform | None = None
+
+    def moved(self, packet: Packet) -> list[Packet]:
+        """Returns packets in the frame of the robot: none until enough have come, then those that waited, too.
+
+        Raises:
+            ResphysError: the markers cannot be registered.
+        """
+        if self.transform is None:
+            self._waiting.append(packet)
+            if sum(bool(waiting.markers) for waiting in self._waiting) < _FIRST:
+                return []
+            self._register()
+            waiting, self._waiting = self._waiting, []
+            return [self._applied(one) for one in waiting]
+        return [self._applied(packet)]
+
+    def _register(self) -> None:
+        seen = np.array(
+            [[one.markers.get(label, [np.nan] * 3) for label in self._places] for one in self._waiting if one.markers],
+            dtype=np.float64,
+        )
+        lost = np.asarray(np.isnan(seen).any(axis=-1).all(axis=0))
+        middle = np.full(seen.shape[1:], np.nan)
+        middle[~lost] = np.nanmedian(seen[:, ~lost], axis=0)
+        labels = [*self._places]
+        known = [label for label in self._reference if not lost[labels.index(label)]]
+        use = known if len(known) >= 3 else None
+        nominal = np.stack([*self._places.values()])
+        try:
+            registration = register_markers(
+                middle, nominal, labels, source="the first frames", largest_residual=self._residual, use=use
+            )
+        except ResphysError:
+            self._waiting = []
+            raise
+        self.transform = registration.transform
+
+    def _applied(self, packet: Packet) -> Packet:
+        assert self.transform is not None
+        places = {
+            label: self.transform.apply(np.asarray(place, dtype=np.float64)[None])[0]
+            for label, place in packet.markers.items()
+            if label not in self._reference
+        }
+        return replace(packet, markers=places)

@@ -1,0 +1,127 @@
+"""One step of a robot, linearised in its slowest vibrations about a state of rest.
+
+The derivatives are differences of steps, so that they contain everything that a step does: the learned force, damping,
+friction and the integrator.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+import torch
+from numpy.typing import NDArray
+
+from ...energies.materials import VISCOUS
+from ...stepping.integrators import make_integrator
+from ...stepping.state import State
+from ..inputs import FORCE, Given
+from ..state import RobotState
+from .robots import Steppable
+
+FloatArray = NDArray[np.float64]
+
+_STEP: Final = 1e-3  # of the differences, over the size of the body
+_SAME: Final = 1e-3  # relative difference of eigenvalues that belong together
+_BELOW: Final = 1e-6  # shift below zero of the eigenvalues, over the largest on the diagonal: a free body has zeros
+_SLOWEST: Final = 1.0  # least frequency of a mode, for the scale of its errors [rad/s]
+
+
+@dataclass(frozen=True)
+class StepTangent:
+    """A step in coordinates z, their rates w, and a force that shifts their equilibrium by b, all (r,).
+
+    Attributes:
+        shapes: (r, N, 3) of the vibrations, orthonormal in the mass.
+        pull: (r, N, 3) forces that shift the equilibrium by one unit of each coordinate [N].
+        frequencies: (r,) [rad/s].
+        transition: (2 r, 3 r) of (z, w) after a step by (z, w, b) before it.
+        size: root mean square displacement of the body per unit of a coordinate [m].
+    """
+
+    shapes: torch.Tensor
+    pull: torch.Tensor
+    frequencies: FloatArray
+    transition: FloatArray
+    size: float
+
+    @classmethod
+    def of(cls, robot: Steppable, state: RobotState, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
+        """Linearises a step from a state of rest, with one environment.
+
+        Args:
+            robot: with a simulator.
+            state: of rest.
+            inputs: constant commands under which it rests.
+            modes: least number r; vibrations of equal frequency are kept together.
+        """
+        simulator, h = robot.simulator, robot.time_step
+        elastic = robot.with_parameters(**{name: 0.0 for name in simulator.parameters if name.endswith(VISCOUS)})
+        values, vectors, inertia, free = _vibrations(elastic, state, inputs, modes)
+        frequencies, count = np.sqrt(np.abs(values)).clip(_SLOWEST), len(values)
+        duals = inertia @ vectors
+        spread = scipy.sparse.kron(simulator.body.coordinates.matrix, scipy.sparse.identity(3))
+        coordinates = (3 * free[:, None] + np.arange(3)).ravel()
+
+        def fields(columns: FloatArray) -> torch.Tensor:
+            whole = np.zeros((3 * simulator.body.n_vertices, count))
+            whole[coordinates] = columns
+            return simulator.tensor(whole.T.reshape(count, -1, 3))
+
+        shapes = simulator.tensor((spread @ fields(vectors).cpu().double().numpy().reshape(count, -1).T).T.copy())
+        shapes = shapes.reshape(count, -1, 3)
+        pull = fields(duals * frequencies**2)
+        size = float(shapes.norm(dim=2).square().mean().sqrt())
+        rest = simulator.rest_positions
+        amount = _STEP * float((rest.amax(0) - rest.amin(0)).max()) / shapes.norm(dim=2).amax(1)  # (r,)
+        base = robot.step(robot.step(state, **inputs), **inputs).detach()
+        rate = amount * simulator.tensor(frequencies)
+        none = torch.zeros_like(shapes)
+        moved = torch.cat([none[:1], amount[:, None, None] * shapes, none, none])
+        faster = torch.cat([none[:1], none, rate[:, None, None] * shapes, none])
+        pulled = torch.cat([none[:1], none, none, amount[:, None, None] * pull])
+        state, chosen = shifted(base.repeat(1 + 3 * count), moved, faster, h), torch.as_tensor(free, device=rest.device)
+        responses = list[FloatArray]()
+        for _ in range(2):
+            state = robot.step(state, **{**inputs, FORCE: pulled})
+            changes = ((field[1:, chosen] - field[:1, chosen]).flatten(1) for field in (state.q, state.v))
+            responses.append(np.concatenate([x.cpu().double().numpy() @ duals for x in changes], axis=1).T)
+        scale = torch.cat([amount, rate, amount]).cpu().double().numpy()
+        first, second = (response / scale for response in responses)  # (2 r, 3 r) after one and two steps
+        if state.body.previous is not None:
+            # A method of two steps: its own history has settled after one, whatever the state had before.
+            by_state = np.linalg.solve(first[:, : 2 * count].T, second[:, : 2 * count].T).T
+            first = np.hstack([by_state, second[:, 2 * count :] - by_state @ first[:, 2 * count :]])
+        return cls(shapes, pull, frequencies, first, size)
+
+
+def shifted(state: RobotState, moved: torch.Tensor, faster: torch.Tensor, time_step: float) -> RobotState:
+    """Returns a state with other positions and velocities, (B, N, 3), and a past that fits them."""
+    body = state.body
+    q, v = body.q + moved, body.v + faster
+    previous = None
+    if body.previous is not None:
+        previous = body.previous[0] + moved - time_step * faster, body.previous[1] + faster
+    return replace(state, body=State(q, v, previous, body.memory))
+
+
+def _vibrations(
+    robot: Steppable, state: RobotState, inputs: Mapping[str, Given], modes: int
+) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, NDArray[np.int64]]:
+    """Eigenvalues (r,) [1/s^2], vectors (3 F, r), mass (3 F, 3 F) of the slowest vibrations; free vertices."""
+    still = replace(state, body=State(state.q, torch.zeros_like(state.v), memory=state.body.memory))
+    hessian, mass, free = robot.linearised(still, **inputs)
+    step = make_integrator(robot.simulator.integrator).stage(still.body, robot.time_step).step
+    stiffness, mass = (hessian - mass).tocsc(), scipy.sparse.csc_array(step**2 * mass)
+    unknowns = mass.shape[0]
+    count = min(modes + 6, unknowns - 2)
+    shift = -_BELOW * float((stiffness.diagonal() / mass.diagonal()).max())
+    values, vectors = scipy.sparse.linalg.eigsh(stiffness, count, M=mass, sigma=shift, v0=np.ones(unknowns))
+    order = np.argsort(values)
+    values, vectors = values[order], vectors[:, order]
+    kept = min(modes, count)
+    while kept < count and values[kept] - values[kept - 1] < _SAME * abs(values[kept]):
+        kept += 1
+    return values[:kept], vectors[:, :kept], mass, free

@@ -1,0 +1,436 @@
+"""A robot's simulator that follows the robot as its markers come in, and looks ahead."""
+
+from bisect import insort
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from ...io.errors import ConvergenceError, InputError
+from ..inputs import Given, InputReader
+from ..state import RobotState
+from .estimator import Belief, FullEstimator
+from .kalman import Correction, FloatArray
+
+_ROUNDING: Final = 1e-6  # of times, in steps
+_LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
+_STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
+_SCORES: Final = 400  # predictions that are remembered
+_ENOUGH: Final = 20  # predictions from which intervals are scaled
+_NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
+_MOVED: Final = "jumps of the whole body"
+_FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A robot at the last step.
+
+    Attributes:
+        time: of the clock of the packets [s].
+        state: of the robot, one environment.
+        markers: (M, 3) [m].
+        deviations: (M, 3) of their coordinates [m].
+        parameters: refined values and their standard deviations, by name.
+    """
+
+    time: float
+    state: RobotState
+    markers: FloatArray
+    deviations: FloatArray
+    parameters: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A robot in the T steps to come, under constant commands.
+
+    Attributes:
+        times: (T + 1,) from the last step on [s].
+        markers: (T + 1, M, 3) [m].
+        deviations: (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions.
+        state: at the end, one environment.
+    """
+
+    times: FloatArray
+    markers: FloatArray
+    deviations: FloatArray
+    state: RobotState
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Mean distances of markers from those measured later, over the last predictions [mm].
+
+    Attributes:
+        predictions: their number.
+        twin: of the predicted markers.
+        held: of the markers as they were measured when the prediction was made.
+        simulator: of the simulator that sees no markers, at the last frames.
+        covered: share of the coordinates within 1.645 deviations, 90 % for right ones.
+    """
+
+    predictions: int
+    twin: float
+    held: float
+    simulator: float
+    covered: float
+
+
+@dataclass
+class _Interval:
+    """What happened in the step that ends at some time, and the beliefs after it."""
+
+    frames: list[tuple[float, int, FloatArray]] = field(default_factory=list)
+    predicted: Belief | None = None
+    corrected: Belief | None = None
+    corrections: list[tuple[float, Correction]] = field(default_factory=list)
+
+
+class Twin:
+    """Follows a robot; `Robot.twin` makes one.
+
+    Packets may come late: all steps since are computed again, so that the estimate is the one of packets in order.
+
+    Args:
+        estimator: of the robot.
+        horizon: of `ahead` [s].
+        patience: how late a packet may come [s].
+
+    Raises:
+        InputError: a horizon or a patience that is not positive.
+    """
+
+    def __init__(self, estimator: FullEstimator, horizon: float = 0.2, patience: float = 0.3) -> None:
+        for name, value in (("horizon", horizon), ("patience", patience)):
+            if not 0.0 < value < np.inf:
+                raise InputError(f"{name} is {value:g}: give seconds, more than zero.")
+        self.estimator, self.horizon, self.patience = estimator, horizon, patience
+        self.labels, self._h = estimator.labels, estimator.time_step
+        self._keep = int(np.ceil(patience / self._h)) + 1
+        names = self.labels or [f"vertex_{number}" for number in range(estimator.count)]
+        self._numbers = {label: number for number, label in enumerate(names)}
+        self._reader = InputReader(estimator.robot.inputs, estimator.robot.simulator)
+        self._scores: deque[tuple[float, float, float]] = deque(maxlen=_SCORES)
+        self._ratios: deque[FloatArray] = deque(maxlen=_SCORES)
+        self._free: deque[float] = deque(maxlen=_SCORES)
+        self._counts: dict[str, int] = {}
+        self._packets = self._stale = 0
+        self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
+        self._again = False
+        self._origin: float | None = None
+
+    def _start(self, time: float, commands: dict[str, Given]) -> None:
+        refined = None if self._origin is None or self._done < 0 else self._belief_at(self._done).parameters
+        belief = self.estimator.begin(commands, refined)
+        self._origin, self._newest = time, 0
+        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(commands))]
+        self._steps = {0: _Interval(predicted=belief)}
+        self._simulated, self._done = 0, -1
+        self._pending: list[tuple[Prediction, FloatArray]] = []
+
+    # Packets
+
+    def take(self, time: float, markers: Mapping[str, ArrayLike] | ArrayLike | None = None, **inputs: Given) -> bool:
+        """Takes a packet: markers seen, and commands that hold from then on.
+
+        Args:
+            time: when they were seen or commanded, on one clock for all packets [s].
+            markers: positions [m] by name, or (M, 3) in the order of `labels` with NaN for those that were not seen.
+            inputs: by name, as for `Robot.step`; those that are not given stay.
+
+        Returns:
+            Whether it came in time; a packet older than `patience` is counted and left out.
+
+        Raises:
+            InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
+        """
+        if not np.isfinite(time):
+            raise InputError(f"a packet has the time {time}: give seconds.")
+        commands: dict[str, Given] = {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
+        self._packets += 1
+        frame = None if markers is None else self._frame(markers)
+        if self._origin is None or self._is_other_clock(time):
+            held = {} if self._origin is None else self._commanded(np.inf)
+            self._start(time, {**held, **commands})
+            if frame is not None:
+                self._check_unit(frame)
+            commands = {}
+        assert self._origin is not None
+        number = int(np.ceil((time - self._origin) / self._h - _ROUNDING))
+        if number <= max(self._newest - self._keep, -1):
+            self._count("packets too late")
+            return False
+        if commands:
+            self._commands.append((time, self._packets, commands))
+            self._commands.sort(key=lambda entry: entry[:2])
+            self._simulated, self._done = min(self._simulated, number), min(self._done, number)
+        for new in range(self._newest + 1, number + 1):
+            self._steps[new] = _Interval()
+        if number < self._newest:
+            self._count("packets out of order")
+        self._newest = max(self._newest, number)
+        if frame is not None:
+            insort(self._steps[number].frames, (time, self._packets, frame), key=lambda entry: entry[:2])
+            self._done = min(self._done, number - 1)
+            self._simulated = min(self._simulated, number)
+        return True
+
+    def restart(self, why: str) -> None:
+        """Starts again with the next packet, from rest and with the refined parameters; `counts` has the reason."""
+        self._count(f"starts {why}")
+        self._again = True
+
+    def _belief_at(self, number: int) -> Belief:
+        belief = self._steps[number].corrected
+        assert belief is not None
+        return belief
+
+    def _is_other_clock(self, time: float) -> bool:
+        """Whether the twin starts again: after a gap, or where the clock of the packets was set back."""
+        assert self._origin is not None
+        if self._again:
+            self._again = False
+            return True
+        now = self._origin + self._newest * self._h
+        if time > now + _LONGEST_GAP:
+            self._count("starts after a gap")
+            return True
+        self._stale = self._stale + 1 if time < now - self.patience - self._h else 0
+        if self._stale >= _STALE:
+            self._count("starts with an earlier clock")
+            self._stale = 0
+            return True
+        return False
+
+    def _count(self, what: str) -> None:
+        self._counts[what] = self._counts.get(what, 0) + 1
+
+    def _frame(self, markers: Mapping[str, ArrayLike] | ArrayLike) -> FloatArray:
+        count = self.estimator.count
+        if isinstance(markers, Mapping):
+            frame = np.full((count, 3), np.nan)
+            for label, place in markers.items():
+                if label not in self._numbers:
+                    self._count(f"unknown marker {label!r}")
+                    continue
+                frame[self._numbers[label]] = self._place(place, label)
+            return frame
+        frame = np.asarray(markers, dtype=np.float64)
+        if frame.shape != (count, 3):
+            raise InputError(f"a packet has markers of shape {frame.shape}: give ({count}, 3), or positions by name.")
+        return np.where(np.isfinite(frame).all(axis=1)[:, None], frame, np.nan)
+
+    @staticmethod
+    def _place(place: ArrayLike, label: str) -> FloatArray:
+        try:
+            position = np.array([np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))])
+        except (TypeError, ValueError):
+            position = np.empty(0)
+        if position.shape != (3,):
+            raise InputError(f"a packet has {place!r} as the position of {label!r}: give x, y and z in m.")
+        return position if np.isfinite(position).all() else np.full(3, np.nan)
+
+    def _check_unit(self, frame: FloatArray) -> None:
+        belief = self._steps[0].predicted
+        assert belief is not None
+        expected = self.estimator.markers(belief)[0]
+        off = np.linalg.norm(frame - expected, axis=1)
+        if np.isfinite(off).any() and np.nanmedian(off) > _FAR * self.estimator.size:
+            self._origin = None
+            raise InputError(
+                f"the first markers are {np.nanmedian(off):.3g} m from the robot: give positions in metres, in the "
+                "frame of the run's recordings."
+            )
+
+    # Estimates
+
+    def _update(self) -> int:
+        """Computes what packets have changed; returns the number of the last step."""
+        if self._origin is None:
+            raise InputError("the twin has seen no packet: give it one by take().")
+        with torch.no_grad():
+            for number in range(self._done + 1, self._newest + 1):
+                interval = self._steps[number]
+                if number > self._simulated:
+                    interval.predicted = self._advanced(self._belief_at(number - 1), number)
+                    self._simulated = number
+                self._corrected(interval, number)
+                self._done = number
+        for number in [number for number in self._steps if number <= self._newest - self._keep]:
+            self._forget(self._steps.pop(number))
+        oldest = self._origin + min(self._steps) * self._h
+        old = [entry for entry in self._commands if entry[0] <= oldest]
+        self._commands[: len(old)] = [(-np.inf, 0, self._commanded(oldest))]
+        return self._newest
+
+    def _commanded(self, time: float) -> dict[str, Given]:
+        """The commands that hold at a time."""
+        held = dict[str, Given]()
+        for since, _, commands in self._commands:
+            if since <= time + _ROUNDING * self._h:
+                held |= commands
+        return held
+
+    def _advanced(self, belief: Belief, number: int) -> Belief:
+        assert self._origin is not None
+        commands = self._commanded(self._origin + (number - 1) * self._h)
+        try:
+            return self.estimator.advance(belief, commands)
+        except ConvergenceError:
+            self._count("failed steps, after which the robot was taken to be at rest")
+            return self.estimator.begin(commands, belief.parameters)
+
+    def _corrected(self, interval: _Interval, number: int) -> None:
+        belief, interval.corrections = interval.predicted, []
+        assert belief is not None
+        assert self._origin is not None
+        end = self._origin + number * self._h
+        last = max((time for n in (number - 1, number - 2) for time, *_ in self._frames_of(n)), default=None)
+        for time, _, frame in interval.frames:
+            passed = self._h if last is None else time - last
+            belief, correction = self.estimator.correct(belief, frame, max(end - time, 0.0), passed)
+            interval.corrections.append((time, correction))
+            last = time
+        interval.corrected = belief
+
+    def _frames_of(self, number: int) -> list[tuple[float, int, FloatArray]]:
+        return self._steps[number].frames if number in self._steps else []
+
+    def _forget(self, interval: _Interval) -> None:
+        """Counts what happened in a step that no packet can change any more."""
+        for _, correction in interval.corrections:
+            self._tell(correction, self._counts)
+            if correction.free is not None and np.isfinite(correction.free).any():
+                self._free.append(1e3 * float(np.nanmean(correction.free)))
+
+    def _tell(self, correction: Correction, counts: dict[str, int]) -> None:
+        for word, chosen in (("jumps", correction.refused), ("has moved on the body", correction.moved)):
+            for number in np.flatnonzero(chosen):
+                what = f"{[*self._numbers][number]} {word}"
+                counts[what] = counts.get(what, 0) + 1
+        if correction.restarted:
+            counts[_MOVED] = counts.get(_MOVED, 0) + 1
+
+    @property
+    def now(self) -> Estimate:
+        """The robot after the last packet.
+
+        Raises:
+            InputError: there was no packet.
+        """
+        belief = self._belief_at(self._update())
+        assert self._origin is not None
+        markers, deviations = self.estimator.markers(belief)
+        return Estimate(
+            self._origin + self._newest * self._h,
+            belief.state.select([0]),
+            markers,
+            deviations,
+            self.estimator.refined(belief),
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often something was wrong with packets, in words."""
+        if self._origin is None:
+            return {}
+        self._update()
+        counts = dict(self._counts)
+        for interval in self._steps.values():
+            for _, correction in interval.corrections:
+                self._tell(correction, counts)
+        return counts
+
+    def ahead(self, seconds: float | None = None, **inputs: Given) -> Prediction:
+        """Simulates what comes, under the last commands or others.
+
+        Predictions under the last commands are compared with the markers that come (`disagreement`).
+
+        Args:
+            seconds: `horizon` if omitted.
+            inputs: commands that differ.
+
+        Raises:
+            InputError: an invalid input; or there was no packet.
+            ConvergenceError: a step failed.
+        """
+        belief = self._belief_at(self._update())
+        assert self._origin is not None
+        commands = {**self._commanded(np.inf), **inputs}
+        steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - _ROUNDING)), 1)
+        markers, state = [self.estimator.markers(belief)[0]], belief
+        with torch.no_grad():
+            for _ in range(steps):
+                state = self.estimator.advance(state, commands)
+                markers.append(self.estimator.markers(state)[0])
+        times = self._origin + self._h * (self._newest + np.arange(steps + 1, dtype=np.float64))
+        deviations = self.estimator.markers(state)[1]
+        prediction = Prediction(times, np.stack(markers), self._scale * deviations, state.state.select([0]))
+        seen = self._last_seen()
+        if not inputs and seconds is None and seen is not None:
+            self._pending.append((Prediction(times, prediction.markers, deviations, prediction.state), seen))
+        return prediction
+
+    def _last_seen(self) -> FloatArray | None:
+        """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""
+        frames = [frame for number in sorted(self._steps) for *_, frame in self._steps[number].frames]
+        if not frames:
+            return None
+        seen = frames[0].copy()
+        for frame in frames[1:]:
+            seen = np.where(np.isnan(frame), seen, frame)
+        return seen
+
+    # Disagreement
+
+    @property
+    def _scale(self) -> float:
+        """Factor of the deviations of predictions by which past ones would have been right."""
+        self._score()
+        return self._known_scale
+
+    @property
+    def _known_scale(self) -> float:
+        if len(self._ratios) < _ENOUGH:
+            return 1.0
+        return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
+
+    def _score(self) -> None:
+        """Compares predictions with the frames at their end."""
+        assert self._origin is not None
+        left = []
+        for prediction, seen in self._pending:
+            number = round((prediction.times[-1] - self._origin) / self._h)
+            if number > self._newest:
+                left.append((prediction, seen))
+                continue
+            for time, _, frame in self._frames_of(number)[-1:]:
+                share = (prediction.times[-1] - time) / self._h
+                expected = (1.0 - share) * prediction.markers[-1] + share * prediction.markers[-2]
+                off = frame - expected
+                usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
+                if usable.any():
+                    ratio = off[usable] / np.hypot(prediction.deviations[usable], self.estimator.noise.markers)
+                    away = (np.linalg.norm(x[usable], axis=1).mean() for x in (off, frame - seen))
+                    twin, held = (1e3 * float(x) for x in away)
+                    self._scores.append((twin, held, float((np.abs(ratio) < _NINETY * self._known_scale).mean())))
+                    self._ratios.append(ratio.ravel())
+        self._pending = left
+
+    @property
+    def disagreement(self) -> Disagreement | None:
+        """How far the last predictions were off; None before one has come to its end."""
+        if self._origin is None:
+            return None
+        self._update()
+        self._score()
+        if not self._scores:
+            return None
+        twin, held, covered = np.mean(self._scores, axis=0)
+        free = float(np.mean(self._free)) if self._free else float("nan")
+        return Disagreement(len(self._scores), float(twin), float(held), free, float(covered))

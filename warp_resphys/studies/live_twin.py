@@ -1,0 +1,216 @@
+"""A twin in the viewer: a robot that follows another one, or a recording of it, in real time."""
+
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io.errors import InputError, ResphysError, listed
+from ..io.settings import Positive, Settings, setting
+from ..mesh.mesh import boundary_triangles, surface_vertices
+from ..robot.loading import recorded_trial, trial_names
+from ..robot.robot import Robot
+from ..robot.twin.estimator import TwinNoise
+from ..robot.twin.stream import Frame, Listener, Packet, recorded_packets
+from ..robot.twin.twin import Estimate, Prediction
+from ..stepping.quantity import Quantity
+
+FloatArray = NDArray[np.float64]
+_REMEMBERED: Final = 2000  # computing times
+_BEHIND: Final = 1.0  # time of packets that have piled up [s]
+_EVERY: Final = 0.1  # between predictions [s]
+
+
+class TwinSettings(Settings):
+    """The settings ``twin`` of the command ``view``, whose configuration explains them."""
+
+    horizon: Positive = setting(unit="s")
+    patience: Positive = setting(unit="s")
+    align: bool
+    refine: dict[str, Positive]
+    noise: Positive = setting(unit="m")
+
+
+def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
+    """Returns the frames of a trial of the robot's run, with its commands.
+
+    Raises:
+        InputError: there is no such trial.
+    """
+    trial, names = recorded_trial(robot, name), robot.labels
+    for moment, frame in zip(trial.times, trial.markers, strict=True):
+        number = int(moment / robot.time_step + 1e-6)
+        commands = {}
+        for key, value in trial.inputs.items():
+            series = np.asarray(value)
+            commands[key] = (series[min(number, len(series) - 1)] if series.ndim == 3 else series).ravel()
+        labels = names or [f"vertex_{vertex}" for vertex in range(len(frame))]
+        yield Packet(float(moment), dict(zip(labels, frame, strict=True)), commands)
+
+
+class LiveTwin:
+    """A twin that is stepped like `live.LiveRobot`, and shown in its place.
+
+    Args:
+        robot: with one environment.
+        source: ``udp://HOST:PORT``, a trial of the robot's run, or a file of a recording.
+        settings: of the twin.
+
+    Attributes:
+        size, surface, faces: as of `live.LiveRobot`.
+        time: of the last packet [s].
+        seconds: computing times of the last packets [s].
+        failure: why the twin ended; empty while it runs.
+    """
+
+    inputs: ClassVar[Mapping[str, FloatArray]] = {}
+    parameters: ClassVar[Mapping[str, tuple[Quantity, float]]] = {}
+    trial = None
+    follows: ClassVar[bool] = True
+
+    def __init__(self, robot: Robot, source: str, settings: TwinSettings) -> None:
+        self.robot, self._source, self._settings = robot, source, settings
+        mesh = robot.simulator.body.mesh
+        self.size = float(np.ptp(mesh.vertices, axis=0).max())
+        self.surface = surface_vertices(mesh)
+        self.faces = np.searchsorted(self.surface, boundary_triangles(mesh))
+        self._listener = Listener(source) if "://" in source else None
+        self.seconds: deque[float] = deque(maxlen=_REMEMBERED)
+        self.reset()
+
+    @property
+    def address(self) -> str:
+        """Where packets are listened for; empty for a recording."""
+        return "" if self._listener is None else "udp://{}:{}".format(*self._listener.address)
+
+    def reset(self) -> None:
+        """Starts the recording again, or forgets what was estimated."""
+        settings, robot = self._settings, self.robot
+        noise = TwinNoise(markers=settings.noise)
+        self.twin = robot.twin(settings.refine, settings.horizon, settings.patience, noise=noise)
+        self._recorded = self._packets_of_recording()
+        self._next = None if self._recorded is None else next(self._recorded, None)
+        self._clock = 0.0 if self._next is None else self._next.time
+        self._frame: Frame | None = None
+        self._estimate: Estimate | None = None
+        self._prediction: Prediction | None = None
+        self._seen: Mapping[str, Any] = {}
+        self._predicted_at = -np.inf
+        self.time, self.failure, self.state = self._clock, "", object()
+
+    def _packets_of_recording(self) -> Iterator[Packet] | None:
+        if self._listener is not None:
+            return None
+        names = () if self.robot.folder is None else trial_names(self.robot)
+        if self._source in names:
+            return trial_packets(self.robot, self._source)
+        if not Path(self._source).expanduser().exists():
+            known = f", a trial of the run ({listed(names)})" if names else ""
+            raise InputError(f"source is {self._source!r}: give udp://HOST:PORT{known}, or a file of a recording.")
+        return recorded_packets(self.robot, self._source)
+
+    # Views of the state
+
+    @property
+    def positions(self) -> FloatArray:
+        """Estimated positions (N, 3) of the vertices [m]."""
+        state = self.robot.simulator.rest_positions if self._estimate is None else self._estimate.state.q[0]
+        return np.asarray(state.double().cpu().numpy())
+
+    @property
+    def ahead(self) -> FloatArray | None:
+        """Predicted positions (N, 3) of the vertices [m]."""
+        return None if self._prediction is None else self._prediction.state.q[0].double().cpu().numpy()
+
+    @property
+    def markers(self) -> FloatArray:
+        """Estimated markers (M, 3) [m]; empty where every vertex is observed."""
+        return np.empty((0, 3)) if self._estimate is None or not self.robot.labels else self._estimate.markers
+
+    @property
+    def measured(self) -> FloatArray | None:
+        """Markers (M, 3) of the last packet [m]; NaN for those that were not seen."""
+        if not self._seen or not self.robot.labels:
+            return None
+        return np.array([self._seen.get(label, [np.nan] * 3) for label in self.robot.labels], dtype=np.float64)
+
+    @property
+    def has_left(self) -> bool:
+        """Whether the state is outside the training range of the learned force."""
+        return self._estimate is not None and bool(self._estimate.state.left[0])
+
+    @property
+    def words(self) -> list[str]:
+        """What the twin has to say: refined parameters, disagreement, faults of packets."""
+        lines = [] if self._estimate is not None else ["Waiting for packets."]
+        if self._estimate is not None:
+            for name, (value, deviation) in self._estimate.parameters.items():
+                lines.append(f"{name.replace('_', ' ')} {value:.4g} ± {deviation:.2g}")
+        off = self.twin.disagreement
+        if off is not None:
+            lines.append(
+                f"{self.twin.horizon:g} s ahead: {off.twin:.2f} mm off; markers held {off.held:.2f} mm; "
+                f"{100 * off.covered:.0f} % in intervals of 90 %"
+            )
+            lines.append(f"simulator without markers: {off.simulator:.2f} mm off")
+        faults = self.twin.counts | (dict(self._listener.refused) if self._listener is not None else {})
+        return [*lines, *(f"{what}: {count} times" for what, count in faults.items())]
+
+    # Time
+
+    def step(self) -> bool:
+        """Takes the packets of a time step; returns False where there are none."""
+        if self.failure:
+            return False
+        began, packets = time.perf_counter(), list(self._arrived())
+        if not packets:
+            return self._next is not None
+        try:
+            for packet in packets:
+                self.twin.take(packet.time, packet.markers or None, **packet.inputs)
+                self._seen = packet.markers or self._seen
+            self._estimate = self.twin.now
+            self.seconds.append(time.perf_counter() - began)
+            self.time = self._estimate.time
+            if self.time - self._predicted_at >= _EVERY or self.time < self._predicted_at:
+                self._prediction, self._predicted_at = self.twin.ahead(), self.time
+        except ResphysError as error:
+            if self._listener is None:
+                self.failure = f"Stopped: {error}"
+                return False
+            self._listener.refused[str(error)] += 1
+        self.state = object()
+        return True
+
+    def _arrived(self) -> Iterator[Packet]:
+        for packet in self._due():
+            if not self._settings.align:
+                yield packet
+                continue
+            if self._frame is None:
+                at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
+                self._frame = Frame(self.robot, at_rest.double().cpu().numpy())
+            yield from self._frame.moved(packet)
+
+    def _due(self) -> Iterator[Packet]:
+        if self._listener is not None:
+            packets = list(self._listener.packets())
+            if len(packets) > 1 and packets[-1].time - packets[0].time > _BEHIND:
+                self.twin.restart("after it had fallen behind")
+                packets = packets[-1:]
+            yield from packets
+            return
+        self._clock += self.robot.time_step
+        assert self._recorded is not None
+        while self._next is not None and self._next.time <= self._clock:
+            yield self._next
+            self._next = next(self._recorded, None)
+
+    def close(self) -> None:
+        """Frees the port."""
+        if self._listener is not None:
+            self._listener.close()

@@ -75,6 +75,8 @@ from .robot.loading import trial_names as trial_names
 from .robot.motion import Motion as Motion
 from .robot.robot import Robot as Robot
 from .robot.state import RobotState as RobotState
+from .robot.twin.estimator import TwinNoise as TwinNoise
+from .robot.twin.twin import Twin as Twin
 from .stepping.inputs import Inputs as Inputs
 from .stepping.quantity import Quantity as Quantity
 from .stepping.state import State as State

@@ -76,10 +76,8 @@ def test_a_marker_that_jumps_is_left_out_until_it_stays():
     assert not back[2].any()
 
 
-# BDF2 starts from a history that is made up, which changes the amplitude by a sixth with steps as long as these.
-@pytest.mark.parametrize(("integrator", "share"), [("implicit_euler", 0.05), ("bdf2", 0.2)])
-def test_a_step_is_linear_in_its_vibrations(robot, integrator, share):
-    robot = robot._integrated_by(integrator)
+def test_a_step_is_linear_in_its_vibrations(robot):
+    robot = robot._integrated_by("implicit_euler")
     start = robot.begin()
     tangent = StepTangent.of(robot, start, {}, 4)
     count, h = len(tangent.frequencies), robot.time_step
@@ -94,7 +92,7 @@ def test_a_step_is_linear_in_its_vibrations(robot, integrator, share):
     seen = torch.einsum("r,rni->ni", torch.as_tensor(linear[:count]).to(still.q), tangent.shapes)
     true = moved.q[0] - still.q[0]
     assert float(true.norm(dim=1).max()) > 3e-5
-    assert float((seen - true).norm(dim=1).max()) < share * float(true.norm(dim=1).max())
+    assert float((seen - true).norm(dim=1).max()) < 0.05 * float(true.norm(dim=1).max())
 
 
 def test_a_force_shifts_the_equilibrium_by_what_it_is_named(robot):
@@ -172,15 +170,15 @@ def test_commands_that_come_late_change_nothing(robot, swing):
 
 def test_frames_between_the_steps_are_used_at_their_own_times(robot, swing):
     motion, h = swing[2], robot.time_step
-    times = 1.5 * h * np.arange(39)
+    times, off = 1.5 * h * np.arange(30), list[float]()
     twin, late = robot.twin(noise=TwinNoise(markers=NOISE)), robot.twin(noise=TwinNoise(markers=NOISE))
     for moment, frame in zip(times, motion.at(times)[:, 0].numpy(), strict=True):
         twin.take(moment, frame)
         late.take(np.ceil(moment / h - 1e-6) * h, frame)
-    now, expected = twin.now, motion.at([twin.now.time])[0, 0].numpy()
-    off = np.linalg.norm(now.markers - expected, axis=1).mean()
-    assert off < 0.5 * np.linalg.norm(late.now.markers - expected, axis=1).mean()
-    assert off < 2.0 * NOISE
+        if moment > 10 * h:
+            expected = motion.at([twin.now.time])[0, 0].numpy()
+            off += [np.linalg.norm(at.now.markers - expected, axis=1).mean() for at in (twin, late)]
+    assert np.mean(off[::2]) < 0.5 * np.mean(off[1::2])
 
 
 def test_markers_that_vanish_or_jump_are_left_out_and_named(robot, swing):
@@ -190,7 +188,7 @@ def test_markers_that_vanish_or_jump_are_left_out_and_named(robot, swing):
     broken[20:26, tip] += [0.0, 0.03, 0.0]
     broken[30:40] = np.nan
     twin = followed(robot, broken)
-    assert twin.counts == {f"vertex_{tip} jumps": 6}
+    assert twin.counts == {"a vertex jumps": 6}
     assert np.linalg.norm(twin.now.markers - true[-1], axis=1).mean() < 2.0 * NOISE
 
 
@@ -202,6 +200,29 @@ def test_a_body_that_is_put_elsewhere_is_found_again(robot, swing):
     twin = followed(robot, moved, gate=Gate(limit=6.0, least=1e-3, grace=0.03))
     assert twin.counts["jumps of the whole body"] == 1
     assert np.linalg.norm(twin.now.markers - true[59], axis=1).mean() < 3.0 * NOISE
+
+
+def test_a_marker_that_slips_is_followed_to_its_new_place(robot, swing):
+    true = swing[1]
+    along = np.argsort(true[0, :, 0])
+    chosen = [int(along[len(along) * share // 8]) for share in (3, 5, 6, 7)]
+    marked = robot.with_parameters()
+    marked.labels = ("root", "middle", "far", "tip")
+    marked._observe = lambda q: q[:, chosen]
+    frames = true[:, chosen] + NOISE * np.random.default_rng(3).standard_normal((61, 4, 3))
+    frames[25:, 1] += [0.0, 0.02, 0.0]
+    noise = TwinNoise(markers=NOISE, placement=1e-3)
+    twin = marked.twin(noise=noise, gate=Gate(limit=6.0, least=1e-3, grace=0.03))
+    for number, frame in enumerate(frames):
+        twin.take(number * robot.time_step, dict(zip(marked.labels, frame, strict=True)))
+    assert twin.counts["middle has moved on the body"] == 1
+    assert twin.counts["middle jumps"] >= 2
+    now = twin.now
+    np.testing.assert_allclose(now.markers[1] - true[-1, chosen[1]], [0.0, 0.02, 0.0], atol=1e-3)
+    others = [0, 2, 3]
+    assert np.linalg.norm(now.markers - true[-1, chosen], axis=1)[others].max() < 5e-4
+    body = np.linalg.norm(now.state.q[0].numpy() - true[-1], axis=1)
+    assert body.mean() < 1e-3
 
 
 def test_it_refines_a_parameter_as_it_runs(robot):

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -166,35 +166,45 @@ class LiveTwin:
         """Takes the packets of a time step; returns False where there are none."""
         if self.failure:
             return False
-        began, packets = time.perf_counter(), list(self._arrived())
-        if not packets:
-            return self._next is not None
-        try:
-            for packet in packets:
-                self.twin.take(packet.time, packet.markers or None, **packet.inputs)
-                self._seen = packet.markers or self._seen
-            self._estimate = self.twin.now
+        began, taken = time.perf_counter(), 0
+        for packet in self._due():
+            taken += self._tried(self._take, packet)
+        if taken and not self.failure and self._tried(self._estimated):
             self.seconds.append(time.perf_counter() - began)
-            self.time = self._estimate.time
-            if self.time - self._predicted_at >= _EVERY or self.time < self._predicted_at:
-                self._prediction, self._predicted_at = self.twin.ahead(), self.time
+            self._tried(self._predicted)
+        self.state = object() if taken else self.state
+        return bool(taken) or (self._next is not None and not self.failure)
+
+    def _tried(self, task: Callable[..., None], *arguments: Any) -> bool:
+        """Does a task; an error ends what plays a recording, and is counted for packets of others."""
+        try:
+            task(*arguments)
         except ResphysError as error:
             if self._listener is None:
                 self.failure = f"Stopped: {error}"
-                return False
-            self._listener.refused[str(error)] += 1
-        self.state = object()
+            else:
+                self._listener.refused[str(error)] += 1
+            return False
         return True
 
-    def _arrived(self) -> Iterator[Packet]:
-        for packet in self._due():
-            if not self._settings.align:
-                yield packet
-                continue
-            if self._frame is None:
-                at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
-                self._frame = Frame(self.robot, at_rest.double().cpu().numpy())
-            yield from self._frame.moved(packet)
+    def _take(self, packet: Packet) -> None:
+        for moved in [packet] if not self._settings.align else self._aligned(packet):
+            self.twin.take(moved.time, moved.markers or None, **moved.inputs)
+            self._seen = moved.markers or self._seen
+
+    def _estimated(self) -> None:
+        self._estimate = self.twin.now if self.twin.has_begun else None
+        self.time = self.time if self._estimate is None else self._estimate.time
+
+    def _predicted(self) -> None:
+        if self._estimate is not None and not 0.0 <= self.time - self._predicted_at < _EVERY:
+            self._prediction, self._predicted_at = self.twin.ahead(), self.time
+
+    def _aligned(self, packet: Packet) -> list[Packet]:
+        if self._frame is None:
+            at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
+            self._frame = Frame(self.robot, at_rest.double().cpu().numpy())
+        return self._frame.moved(packet)
 
     def _due(self) -> Iterator[Packet]:
         if self._listener is not None:

@@ -34,6 +34,10 @@ _UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump,
 _SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
 _WANDER: Final = 1.0  # time after which the force on the body is another [s]
 _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
+_MEDIAN: Final = 2.366  # of the squared distance of a marker, chi-squared with three degrees of freedom
+_ADAPTED: Final = 0.2  # share of a frame in the variance of steps, as a power
+_FURTHER: Final = (0.1, 100.0)  # range of a frame's squared distance
+_SHAKEN: Final = (0.03, 1000.0)  # range of the factor
 _EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the body may leave
 _LARGEST: Final = 0.1  # correction of a vertex in one frame, over the size of the body
 _JUMP: Final = 0.02  # least distance of a marker that counts as a jump, over the size of the body
@@ -67,7 +71,8 @@ class Belief:
         places: (M, 3) markers from where they are bound [m].
         covariance: (n, n) of the errors of z, w, b, parameters and places.
         since: (M,) for how long markers have been left out [s].
-        left: (M, 3) from the corrected simulator to the markers in the last frame that was believed [m].
+        shaken: factor of the variance that a step adds, by which past frames would have been as far off as expected.
+        left: (M, 3) what was left of the distance of markers when they were last believed [m]; NaN for never.
     """
 
     state: RobotState
@@ -77,6 +82,7 @@ class Belief:
     covariance: FloatArray
     since: FloatArray
     left: FloatArray
+    shaken: float = 1.0
 
 
 class FullEstimator:
@@ -118,8 +124,8 @@ class FullEstimator:
         rest = robot.simulator.rest_positions
         self.size = float((rest.amax(0) - rest.amin(0)).max())
         self._gate = gate or Gate(least=_JUMP * self.size)
-        resting = robot.begin(1, **inputs)
-        self.tangent = StepTangent.of(robot.without_force(), resting, inputs, modes)
+        resting = robot.settle(1, **inputs)
+        self.tangent = StepTangent.of(robot, resting, inputs, modes)
         self.count = robot.observe(resting).shape[1]
         self._set_noise()
         self._start = start
@@ -229,7 +235,8 @@ class FullEstimator:
         r = len(belief.bias)
         step = np.eye(len(belief.covariance))
         step[: 2 * r, : 3 * r] = self.tangent.transition
-        covariance = step @ belief.covariance @ step.T + np.diag(self._added)
+        added = self._added * np.where(np.arange(len(step)) < 3 * r, belief.shaken, 1.0)
+        covariance = step @ belief.covariance @ step.T + np.diag(added)
         known = slice(3 * r, 3 * r + len(self._prior))
         much = np.sqrt(np.maximum(np.diag(covariance)[known] / self._prior**2, 1.0))
         covariance[known] /= much[:, None]
@@ -271,20 +278,19 @@ class FullEstimator:
         """
         now, slopes, free = self._seen(belief, ago)
         seen, residual = np.asarray(np.isfinite(markers).all(axis=1)), markers - now
-        jump = np.linalg.norm(np.where(np.isnan(belief.left), residual, residual - belief.left), axis=1)
+        jump = np.linalg.norm(residual - belief.left, axis=1)  # NaN for markers that were never believed: these are.
         away = np.full(len(seen), np.nan)
         away[seen] = distances(belief.covariance, slopes[seen], residual[seen], self.noise.markers)
         refused, stays, since = self._gate.judged(away, jump, belief.since, passed)
         off, apart = (np.linalg.norm(markers - points, axis=1) for points in (now, free))
-        moved, restarted = np.zeros_like(refused), False
-        if stays.any():
+        moved, restarted = np.zeros_like(refused), bool(seen.sum() > 1 and refused.sum() > 0.5 * seen.sum())
+        if restarted or stays.any():
             lost = self._lost(belief)
-            now, others, _ = self._seen(lost, ago)
-            change, left = self._conditioned(lost, others[seen], (markers - now)[seen])[0], markers - now
-            restarted = bool((np.linalg.norm(left - others @ change, axis=1) < _EXPLAINED * off)[refused].mean() > 0.5)
+            change, _ = self._conditioned(lost, slopes[seen], residual[seen])
+            explained = np.linalg.norm(residual - slopes @ change, axis=1) < _EXPLAINED * off
+            restarted = restarted or bool(explained[refused].mean() > 0.5)
             if restarted:
-                belief, slopes, residual = lost, others, left
-                refused, since = moved, np.zeros_like(since)
+                belief, refused, since = lost, moved, np.zeros_like(since)
             elif self.labels:
                 moved, refused = stays, refused & ~stays
                 more = np.zeros(len(belief.covariance))
@@ -292,11 +298,12 @@ class FullEstimator:
                 belief = replace(belief, covariance=belief.covariance + np.diag(more))
                 since = np.where(moved, 0.0, since)
         correction, belief = Correction(seen, refused, moved, restarted, off, apart), replace(belief, since=since)
+        belief = replace(belief, shaken=_shaken(belief.shaken, away))
         use = seen & ~refused
         if not use.any():
             return belief, correction
         change, covariance = self._conditioned(belief, slopes[use], residual[use])
-        left = np.where(use[:, None], residual - slopes @ change, np.where(seen[:, None], belief.left, np.nan))
+        left = np.where(use[:, None], residual - slopes @ change, belief.left)
         return self._changed(replace(belief, covariance=covariance, left=left), change), correction
 
     def _conditioned(self, belief: Belief, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -310,12 +317,12 @@ class FullEstimator:
             deviation *= 2.0
 
     def _lost(self, belief: Belief) -> Belief:
-        """A belief whose state is taken from the simulator without markers, and unknown."""
+        """A belief with a state that may be far off."""
         unknown = 3 * len(belief.bias)
         covariance = belief.covariance.copy()
         covariance[:unknown] = covariance[:, :unknown] = 0.0
         covariance[:unknown, :unknown] = np.diag(self._unknown)
-        return replace(belief, state=belief.state.select([self._count - 1] * self._count), covariance=covariance)
+        return replace(belief, covariance=covariance)
 
     def _changed(self, belief: Belief, change: FloatArray) -> Belief:
         """Adds a change (n,) of the errors to a belief."""
@@ -363,6 +370,14 @@ class FullEstimator:
             name: (float(value), float(deviation))
             for name, value, deviation in zip(self._refined, belief.parameters, spread, strict=True)
         }
+
+
+def _shaken(before: float, away: FloatArray) -> float:
+    """Adapts `Belief.shaken` to a frame with markers (M,) at some distances from where they were expected, or NaN."""
+    if np.isnan(away).all():
+        return before
+    far = float(np.nanmedian(away)) ** 2 / _MEDIAN
+    return float(np.clip(before * np.clip(far, *_FURTHER) ** _ADAPTED, *_SHAKEN))
 
 
 def _along(value: torch.Tensor, axis: int, share: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,8 @@
 """One step of a robot, linearised in its slowest vibrations about a state of rest.
 
-The derivatives are differences of steps, so that they contain everything that a step does: the learned force, damping,
-friction and the integrator.
+The derivatives are central differences of steps, so that they contain everything that a step does: the learned force,
+damping, friction and the integrator. They are as wide as the errors that a twin corrects, since a learned force may
+change by more within less, and is clipped.
 """
 
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ from .robots import Steppable
 
 FloatArray = NDArray[np.float64]
 
-_STEP: Final = 1e-3  # of the differences, over the size of the body
+_STEP: Final = 1e-2  # of the central differences, over the size of the body
 _SAME: Final = 1e-3  # relative difference of eigenvalues that belong together
 _BELOW: Final = 1e-6  # shift below zero of the eigenvalues, over the largest on the diagonal: a free body has zeros
 _SLOWEST: Final = 1.0  # least frequency of a mode, for the scale of its errors [rad/s]
@@ -79,22 +80,16 @@ class StepTangent:
         base = robot.step(robot.step(state, **inputs), **inputs).detach()
         rate = amount * simulator.tensor(frequencies)
         none = torch.zeros_like(shapes)
-        moved = torch.cat([none[:1], amount[:, None, None] * shapes, none, none])
-        faster = torch.cat([none[:1], none, rate[:, None, None] * shapes, none])
-        pulled = torch.cat([none[:1], none, none, amount[:, None, None] * pull])
-        state, chosen = shifted(base.repeat(1 + 3 * count), moved, faster, h), torch.as_tensor(free, device=rest.device)
-        responses = list[FloatArray]()
-        for _ in range(2):
-            state = robot.step(state, **{**inputs, FORCE: pulled})
-            changes = ((field[1:, chosen] - field[:1, chosen]).flatten(1) for field in (state.q, state.v))
-            responses.append(np.concatenate([x.cpu().double().numpy() @ duals for x in changes], axis=1).T)
+        moved = torch.cat([amount[:, None, None] * shapes, none, none])
+        faster = torch.cat([none, rate[:, None, None] * shapes, none])
+        pulled = torch.cat([none, none, amount[:, None, None] * pull])
+        moved, faster, pulled = (torch.cat([fields, -fields]) for fields in (moved, faster, pulled))
+        after = robot.step(shifted(base.repeat(6 * count), moved, faster, h), **{**inputs, FORCE: pulled}).body
+        chosen = torch.as_tensor(free, device=rest.device)
+        changes = ((0.5 * (x[: 3 * count] - x[3 * count :])[:, chosen]).flatten(1) for x in (after.q, after.v))
+        response = np.concatenate([x.cpu().double().numpy() @ duals for x in changes], axis=1).T  # (2 r, 3 r)
         scale = torch.cat([amount, rate, amount]).cpu().double().numpy()
-        first, second = (response / scale for response in responses)  # (2 r, 3 r) after one and two steps
-        if state.body.previous is not None:
-            # A method of two steps: its own history has settled after one, whatever the state had before.
-            by_state = np.linalg.solve(first[:, : 2 * count].T, second[:, : 2 * count].T).T
-            first = np.hstack([by_state, second[:, 2 * count :] - by_state @ first[:, 2 * count :]])
-        return cls(shapes, pull, frequencies, first, size)
+        return cls(shapes, pull, frequencies, response / scale, size)
 
 
 def shifted(state: RobotState, moved: torch.Tensor, faster: torch.Tensor, time_step: float) -> RobotState:

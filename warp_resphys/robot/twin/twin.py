@@ -251,8 +251,9 @@ class Twin:
 
     def _update(self) -> int:
         """Computes what packets have changed; returns the number of the last step."""
-        if self._origin is None:
+        if not self.has_begun:
             raise InputError("the twin has seen no packet: give it one by take().")
+        assert self._origin is not None
         with torch.no_grad():
             for number in range(self._done + 1, self._newest + 1):
                 interval = self._steps[number]
@@ -311,10 +312,15 @@ class Twin:
     def _tell(self, correction: Correction, counts: dict[str, int]) -> None:
         for word, chosen in (("jumps", correction.refused), ("has moved on the body", correction.moved)):
             for number in np.flatnonzero(chosen):
-                what = f"{[*self._numbers][number]} {word}"
+                what = f"{self.labels[number] if self.labels else 'a vertex'} {word}"
                 counts[what] = counts.get(what, 0) + 1
         if correction.restarted:
             counts[_MOVED] = counts.get(_MOVED, 0) + 1
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was a packet."""
+        return self._origin is not None
 
     @property
     def now(self) -> Estimate:

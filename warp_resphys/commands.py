@@ -67,6 +67,11 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "benchmark locking": Command(
             "deflection of an arm, by element and refinement", "studies.locking:locking_study"
         ),
+        "benchmark twin": Command(
+            "a twin on a run's trials: computing times and errors of predictions",
+            "studies.twin_study:twin_study",
+            word="run",
+        ),
         "verify": Command(
             "simulate reference trajectories, and compare every vertex", "studies.verification:verify", words="files"
         ),

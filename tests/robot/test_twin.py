@@ -12,7 +12,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load
 from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.robot.twin.kalman import Gate, conditioned, distances
-from warp_resphys.robot.twin.stream import Listener, Packet, recorded_packets
+from warp_resphys.robot.twin.stream import Listener, recorded_packets
 from warp_resphys.robot.twin.tangent import StepTangent, shifted
 
 NOISE = 1e-4
@@ -258,17 +258,19 @@ def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
 @pytest.mark.parametrize(
     ("packet", "message"),
     [
-        ({"time": np.nan}, "has the time nan"),
-        ({"time": 1.0, "markers": np.zeros((2, 3))}, r"markers of shape \(2, 3\)"),
-        ({"time": 1.0, "markers": {"vertex_0": [1.0]}}, r"as the position of 'vertex_0': give x, y and z in m"),
-        ({"time": 1.0, "wind": 1.0}, "there is no input 'wind'"),
+        ((np.nan, None, {}), "has the time nan"),
+        ((-1e300, None, {}), "has the time -1e"),
+        ((0.05, np.zeros((2, 3)), {}), r"markers of shape \(2, 3\)"),
+        ((0.05, {"vertex_0": [1.0]}, {}), r"as the position of 'vertex_0': give x, y and z in m"),
+        ((0.05, None, {"wind": 1.0}), "there is no input 'wind'"),
+        ((0.05, None, {"time": 1.0}), "there is no input 'time'"),
     ],
 )
 def test_a_wrong_packet_is_one_sentence_and_is_left_out(robot, swing, packet, message):
     twin = followed(robot, swing[0][:5])
     before = twin.now
     with pytest.raises(InputError, match=message):
-        twin.take(**packet)
+        twin.take(packet[0], packet[1], **packet[2])
     assert torch.equal(before.state.q, twin.now.state.q)
 
 
@@ -292,20 +294,26 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     listener = Listener("udp://127.0.0.1:0")
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sent = {"time": 1.5, "markers": {"vertex_0": [0.0, 0.1, None]}, "inputs": {"payload": 0.1}}
-    for text in (
-        json.dumps(sent).encode(),
-        b"{",
-        b'{"markers": {}}',
-        b'{"time": 1, "x": 2}',
-        b'{"time": 1, "inputs": 2}',
-    ):
+    wrong = [b"{", b'{"markers": {}}', b'{"time": 1, "x": 2}', b'{"time": 1, "inputs": 2}', b"[" * 50_000]
+    wrong += [b'{"time": 1, "inputs": {"payload": [1%s]}}' % (b"0" * 400), b'{"time": 1, "markers": {"vertex_0": [1]}}']
+    for text in (json.dumps(sent).encode(), *wrong):
         sender.sendto(text, listener.address)
     packets, until = [], time.monotonic() + 10.0
-    while sum(listener.refused.values()) + len(packets) < 5 and time.monotonic() < until:
+    while sum(listener.refused.values()) + len(packets) < 1 + len(wrong) and time.monotonic() < until:
         packets += listener.packets()
-    assert packets == [Packet(1.5, sent["markers"], sent["inputs"])]
-    for words in ("is no JSON", "has no time", "has the field 'x'", "inputs of a packet is no object"):
+    (packet,) = packets
+    assert (packet.time, packet.inputs) == (1.5, {"payload": 0.1})
+    np.testing.assert_array_equal(packet.markers["vertex_0"], [0.0, 0.1, np.nan])
+    assert sum(listener.refused.values()) == len(wrong)
+    for words in (
+        "as payload: give a number",
+        "no position of 'vertex_0'",
+        "has no time",
+        "has the field 'x'",
+        "no object",
+    ):
         assert sum(words in message for message in listener.refused) == 1
+    assert sum("is no JSON" in message for message in listener.refused) == 2
     with pytest.raises(InputError, match="cannot be listened at"):
         Listener(f"udp://127.0.0.1:{listener.address[1]}")
     sender.close()
@@ -318,3 +326,56 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     read = list(recorded_packets(robot, "swing.csv"))
     assert [packet.time for packet in read] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.04])
     np.testing.assert_allclose(read[2].markers["vertex_7"], motion.q[2, 0, 7].numpy(), atol=1e-9)
+
+
+def test_a_command_that_cannot_be_done_is_left_out(robot, swing):
+    h, frames = robot.time_step, swing[0]
+    twin = robot.twin(noise=TwinNoise(markers=NOISE))
+    for number in range(10):
+        commands = {"base": [0.0, 0.0, 0.03, 0.0, 0.0, 0.0]} if number == 5 else {}
+        twin.take(number * h, frames[number], **commands)
+        assert twin.now.time == pytest.approx(number * h)
+    (fault,) = twin.counts
+    assert fault.startswith("a command was left out: base moves by 30 mm in a step")
+    same = followed(robot, frames, range(10))
+    assert torch.equal(twin.now.state.q, same.now.state.q)
+
+
+def test_commands_hold_however_late_and_from_the_start(robot):
+    h, lifted = robot.time_step, [0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]
+    fixed = robot.simulator.body.fixed_vertices
+    before = robot.twin(base=lifted)
+    before.take(0.0)
+    low = float(robot.simulator.rest_positions[fixed, 2].min())
+    assert float(before.now.state.q[0, fixed, 2].min()) - low == pytest.approx(2e-3)
+    late = robot.twin()
+    late.take(0.0)
+    late.take(60 * h)
+    assert not late.take(5 * h, base=lifted)
+    late.take(61 * h)
+    assert float(late.now.state.q[0, fixed, 2].min()) - low == pytest.approx(2e-3)
+
+
+def test_a_restart_keeps_commands_and_parameters(robot, swing):
+    stiff = float(robot.simulator.constants["youngs_modulus"])
+    twin = followed(robot, swing[0][:30], refine={"youngs_modulus": 0.3 * stiff})
+    refined = twin.now.parameters["youngs_modulus"][0]
+    assert refined != stiff
+    twin.restart("on request")
+    with pytest.raises(InputError, match="give positions in metres"):
+        twin.take(0.31, 1e3 * swing[0][31])
+    assert twin.now.time < 0.31
+    twin.take(0.32)
+    assert twin.now.time == pytest.approx(0.32)
+    assert twin.now.parameters["youngs_modulus"][0] == refined
+    assert twin.counts["starts on request"] == 1
+
+
+def test_rare_predictions_are_scored_too(robot, swing):
+    twin = robot.twin(noise=TwinNoise(markers=NOISE), horizon=0.05, patience=0.05)
+    for number, frame in enumerate(swing[0]):
+        twin.take(number * robot.time_step, frame)
+        _ = twin.now
+        if number == 10:
+            twin.ahead()
+    assert twin.disagreement.predictions == 1

@@ -107,12 +107,6 @@ class Robot:
         other._set_parameters({**self.parameters, **parameters})
         return other
 
-    def without_force(self) -> "Robot":
-        """Returns the robot without its learned force, with the identified parameters."""
-        other = self.with_parameters()
-        other._learned = None if not self.is_data_driven else self._learned
-        return other
-
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
         """Returns a robot with the material of this one on another body, without learned force and markers.
 

@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -16,12 +17,12 @@ from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
 from ..robot.twin.estimator import TwinNoise
 from ..robot.twin.stream import Frame, Listener, Packet, recorded_packets
-from ..robot.twin.twin import Estimate, Prediction
+from ..robot.twin.twin import Estimate, Prediction, Twin
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
-_BEHIND: Final = 1.0  # time of packets that have piled up [s]
+_BEHIND: Final = 1.0  # time since packets were last taken, after which the twin starts again [s]
 _EVERY: Final = 0.1  # between predictions [s]
 
 
@@ -33,6 +34,14 @@ class TwinSettings(Settings):
     align: bool
     refine: dict[str, Positive]
     noise: Positive = setting(unit="m")
+
+    def twin_of(self, robot: Robot) -> Twin:
+        """Returns a twin with these settings.
+
+        Raises:
+            InputError: the robot has no such parameter, or no simulator.
+        """
+        return robot.twin(self.refine, self.horizon, self.patience, noise=TwinNoise(markers=self.noise))
 
 
 def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
@@ -70,7 +79,6 @@ class LiveTwin:
     inputs: ClassVar[Mapping[str, FloatArray]] = {}
     parameters: ClassVar[Mapping[str, tuple[Quantity, float]]] = {}
     trial = None
-    follows: ClassVar[bool] = True
 
     def __init__(self, robot: Robot, source: str, settings: TwinSettings) -> None:
         self.robot, self._source, self._settings = robot, source, settings
@@ -90,8 +98,7 @@ class LiveTwin:
     def reset(self) -> None:
         """Starts the recording again, or forgets what was estimated."""
         settings, robot = self._settings, self.robot
-        noise = TwinNoise(markers=settings.noise)
-        self.twin = robot.twin(settings.refine, settings.horizon, settings.patience, noise=noise)
+        self.twin = settings.twin_of(robot)
         self._recorded = self._packets_of_recording()
         self._next = None if self._recorded is None else next(self._recorded, None)
         self._clock = 0.0 if self._next is None else self._next.time
@@ -99,7 +106,7 @@ class LiveTwin:
         self._estimate: Estimate | None = None
         self._prediction: Prediction | None = None
         self._seen: Mapping[str, Any] = {}
-        self._predicted_at = -np.inf
+        self._predicted_at, self._drained = -np.inf, time.perf_counter()
         self.time, self.failure, self.state = self._clock, "", object()
 
     def _packets_of_recording(self) -> Iterator[Packet] | None:
@@ -183,7 +190,7 @@ class LiveTwin:
             if self._listener is None:
                 self.failure = f"Stopped: {error}"
             else:
-                self._listener.refused[str(error)] += 1
+                self._listener.refuse(error)
             return False
         return True
 
@@ -208,10 +215,12 @@ class LiveTwin:
 
     def _due(self) -> Iterator[Packet]:
         if self._listener is not None:
-            packets = list(self._listener.packets())
-            if len(packets) > 1 and packets[-1].time - packets[0].time > _BEHIND:
+            packets, now = list(self._listener.packets()), time.perf_counter()
+            if len(packets) > 1 and now - self._drained > _BEHIND:
                 self.twin.restart("after it had fallen behind")
-                packets = packets[-1:]
+                held = {name: value for packet in packets for name, value in packet.inputs.items()}
+                packets = [replace(packets[-1], inputs=held)]
+            self._drained = now
             yield from packets
             return
         self._clock += self.robot.time_step

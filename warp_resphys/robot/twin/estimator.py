@@ -19,8 +19,9 @@ import numpy as np
 import torch
 
 from ...energies.strings import PAYLOAD
-from ...io.errors import InputError, listed
+from ...io.errors import ConvergenceError, InputError, listed
 from ...learning.parameters import check_names, identifiable_parameters
+from ...stepping.quantity import Quantity
 from ...stepping.state import State
 from ..inputs import FORCE, Given
 from ..state import RobotState
@@ -92,7 +93,7 @@ class FullEstimator:
         robot: with a simulator.
         inputs: constant commands under which it rests at first.
         refine: standard deviations of the parameters to refine, by name, in their units; ``payload`` is one of them
-            where the robot has one.
+            where the robot has one, and then starts from the first command and ignores later ones.
         modes: number r of vibrations.
         noise: of markers and simulator.
         gate: for markers that jump.
@@ -115,7 +116,7 @@ class FullEstimator:
     ) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
-        self.robot, self.labels, self.time_step = robot, robot.labels, robot.time_step
+        self.robot, self.labels, self.time_step, self.inputs = robot, robot.labels, robot.time_step, dict(inputs)
         self.noise, self._refined = noise or TwinNoise(), dict(refine or {})
         self._check()
         self._first = self._values(inputs)
@@ -124,7 +125,7 @@ class FullEstimator:
         rest = robot.simulator.rest_positions
         self.size = float((rest.amax(0) - rest.amin(0)).max())
         self._gate = gate or Gate(least=_JUMP * self.size)
-        resting = robot.settle(1, **inputs)
+        resting = _at_rest(robot, 1, inputs)
         self.tangent = StepTangent.of(robot, resting, inputs, modes)
         self.count = robot.observe(resting).shape[1]
         self._set_noise()
@@ -191,9 +192,11 @@ class FullEstimator:
             InputError: an invalid command.
             ConvergenceError: there is no equilibrium.
         """
+        self._first = self._values(inputs)
         values = self._first if refined is None else refined
         robot, given = self._at(values, inputs)
-        state = robot.settle(self._count, **given) if self._start is None else self._start.repeat(self._count)
+        state = _at_rest(robot, self._count, given) if self._start is None else self._start.repeat(self._count)
+        self._start = None
         r, markers = len(self.tangent.frequencies), self.count
         return Belief(
             state.detach(),
@@ -308,11 +311,11 @@ class FullEstimator:
 
     def _conditioned(self, belief: Belief, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """`kalman.conditioned` for markers, with more noise where the shape would change by too much at once."""
-        deviation, r = self.noise.markers, len(belief.bias)
+        deviation = self.noise.markers
         while True:
             rows = slopes.reshape(-1, slopes.shape[2])
             change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
-            if self._furthest(change[:r]) <= _LARGEST * self.size:  # The vibrations hold for small motions.
+            if self._furthest(belief, change) <= _LARGEST * self.size:  # The vibrations hold for small motions.
                 return change, covariance
             deviation *= 2.0
 
@@ -328,7 +331,7 @@ class FullEstimator:
         """Adds a change (n,) of the errors to a belief."""
         r, count, tangent = len(belief.bias), len(self._refined), self.tangent
         z, w, b, values, places = np.split(change, np.cumsum([r, r, r, count]))
-        after = np.maximum(belief.parameters + values, self._lowest())
+        after = np.clip(belief.parameters + values, *self._range())
         values = after - belief.parameters
         state = belief.state
         if count:
@@ -346,21 +349,21 @@ class FullEstimator:
             places=belief.places + places.reshape(-1, 3),
         )
 
-    def _furthest(self, z: FloatArray) -> float:
-        """Largest displacement of a vertex for coordinates (r,) [m]."""
-        moved = torch.einsum("r,rni->ni", self.tangent.shapes.new_tensor(z), self.tangent.shapes)
+    def _furthest(self, belief: Belief, change: FloatArray) -> float:
+        """Largest displacement of a vertex by a change (n,) of the errors [m]."""
+        r, count, q = len(belief.bias), len(self._refined), belief.state.q
+        moved = torch.einsum("r,rni->ni", q.new_tensor(change[:r]), self.tangent.shapes)
+        share = q.new_tensor(change[3 * r : 3 * r + count] / self._apart)
+        moved = moved + torch.einsum("p,pni->ni", share, q[1:-1] - q[:1])
         return float(moved.norm(dim=1).max())
 
-    def _lowest(self) -> FloatArray:
-        """Least values (P,) of the refined parameters."""
-        quantities = {**self.robot.simulator.parameters, PAYLOAD.name: PAYLOAD}
-        lows = [quantities[name].lower if name in quantities else -np.inf for name in self._refined]
-        return np.array(
-            [
-                low + _OPEN * max(abs(first), prior)
-                for low, first, prior in zip(lows, self._first, self._prior, strict=True)
-            ]
-        )
+    def _range(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest values (P,) of the refined parameters."""
+        known = {**self.robot.simulator.parameters, PAYLOAD.name: PAYLOAD}
+        quantities = [known.get(name, Quantity(name, "")) for name in self._refined]
+        far = _OPEN * np.maximum(np.abs(self._first), self._prior)
+        low, high = (np.array([getattr(one, end) for one in quantities]) for end in ("lower", "upper"))
+        return low + far, high - far - self._apart
 
     def refined(self, belief: Belief) -> dict[str, tuple[float, float]]:
         """Refined values and their standard deviations, by name."""
@@ -370,6 +373,14 @@ class FullEstimator:
             name: (float(value), float(deviation))
             for name, value, deviation in zip(self._refined, belief.parameters, spread, strict=True)
         }
+
+
+def _at_rest(robot: Steppable, batch: int, inputs: Mapping[str, Given]) -> RobotState:
+    """The equilibrium under constant commands, without the learned force where there is none with it."""
+    try:
+        return robot.settle(batch, **inputs)
+    except ConvergenceError:
+        return robot.begin(batch, **inputs)
 
 
 def _shaken(before: float, away: FloatArray) -> float:

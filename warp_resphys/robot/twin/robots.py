@@ -30,9 +30,6 @@ class Steppable(Protocol):
     def with_parameters(self, **parameters: torch.Tensor | float) -> "Steppable":
         """Returns the robot with other parameters."""
 
-    def without_force(self) -> "Steppable":
-        """Returns the robot without its learned force."""
-
     def begin(self, batch: int = 1, **inputs: Any) -> RobotState:
         """Returns the equilibrium without the learned force."""
 

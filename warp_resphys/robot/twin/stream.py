@@ -20,6 +20,9 @@ from .robots import Steppable
 
 _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs")
+_MOST: Final = 1e12  # of numbers in a packet
+_LONGEST: Final = 1000  # packets that wait for the registration
+_KINDS: Final = 30  # of faults that are counted
 _FIRST: Final = 20  # frames whose median is registered
 
 
@@ -46,8 +49,8 @@ class Packet:
         """
         try:
             content = json.loads(text)
-        except ValueError as error:
-            raise InputError(f"a packet is no JSON ({error}): docs/twin.md describes packets.") from None
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"a packet is no JSON ({str(error)[:80]}): docs/twin.md describes packets.") from None
         if not isinstance(content, dict) or not isinstance(content.get("time"), int | float):
             raise InputError("a packet has no time: add 'time' in seconds, on one clock for all packets.")
         for name in content:
@@ -56,7 +59,31 @@ class Packet:
         for name in _FIELDS[1:]:
             if not isinstance(content.get(name, {}), dict):
                 raise InputError(f"{name} of a packet is no object: give values by name.")
-        return cls(float(content["time"]), content.get("markers", {}), content.get("inputs", {}))
+        markers = {label: _position(label, place) for label, place in content.get("markers", {}).items()}
+        return cls(_number("time", content["time"]), markers, _values(content.get("inputs", {})))
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST:
+        return float(value)
+    raise InputError(f"a packet has {str(value)[:40]} as {name}: give a number.")
+
+
+def _position(label: str, place: Any) -> tuple[float, ...]:
+    if not isinstance(place, list) or len(place) != 3:
+        raise InputError(f"a packet has no position of {label!r}: give x, y and z in m, or null for each.")
+    return tuple(np.nan if value is None else _number(label, value) for value in place)
+
+
+def _values(inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Commands, which are numbers, lists of numbers, or numbers by part."""
+    read = dict[str, Any]()
+    for name, value in inputs.items():
+        if isinstance(value, dict):
+            read[name] = {part: _number(name, one) for part, one in value.items()}
+        else:
+            read[name] = [_number(name, one) for one in value] if isinstance(value, list) else _number(name, value)
+    return read
 
 
 def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
@@ -120,7 +147,12 @@ class Listener:
             try:
                 yield Packet.of_text(text)
             except InputError as error:
-                self.refused[str(error)] += 1
+                self.refuse(error)
+
+    def refuse(self, error: ResphysError) -> None:
+        """Counts what was wrong with a packet."""
+        what = str(error)
+        self.refused[what if what in self.refused or len(self.refused) < _KINDS else "other faults of packets"] += 1
 
     def close(self) -> None:
         """Frees the port."""
@@ -145,8 +177,8 @@ class Frame:
         settings = robot.description.markers
         if settings is None or settings.frame == "own" or settings.plane is not None:
             raise InputError(
-                "twin.register is true, but the run's recordings are not in the frame of the body: send markers as its "
-                "trials have them, and set twin.register to false."
+                "twin.align is true, but the run's recordings are not in the frame of the body: send markers as its "
+                "trials have them, and set twin.align to false."
             )
         self._residual = settings.largest_residual
         self._places = dict(zip(robot.labels, at_rest, strict=True)) | {
@@ -163,7 +195,7 @@ class Frame:
             ResphysError: the markers cannot be registered.
         """
         if self.transform is None:
-            self._waiting.append(packet)
+            self._waiting = [*self._waiting[-_LONGEST:], packet]
             if sum(bool(waiting.markers) for waiting in self._waiting) < _FIRST:
                 return []
             self._register()

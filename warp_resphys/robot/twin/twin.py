@@ -16,13 +16,15 @@ from ..state import RobotState
 from .estimator import Belief, FullEstimator
 from .kalman import Correction, FloatArray
 
-_ROUNDING: Final = 1e-6  # of times, in steps
+_ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
 _LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
 _STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
 _SCORES: Final = 400  # predictions that are remembered
 _ENOUGH: Final = 20  # predictions from which intervals are scaled
 _NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
 _MOVED: Final = "jumps of the whole body"
+_LATEST: Final = 1e12  # of times [s]
+_KINDS: Final = 30  # of faults that are counted
 _FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
 
 
@@ -89,6 +91,8 @@ class _Interval:
     predicted: Belief | None = None
     corrected: Belief | None = None
     corrections: list[tuple[float, Correction]] = field(default_factory=list)
+    before: float | None = None  # time of the last frame before this interval
+    last: float | None = None  # time of the last frame until its end
 
 
 class Twin:
@@ -119,23 +123,30 @@ class Twin:
         self._ratios: deque[FloatArray] = deque(maxlen=_SCORES)
         self._free: deque[float] = deque(maxlen=_SCORES)
         self._counts: dict[str, int] = {}
+        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
+        self._steps: dict[int, _Interval] = {}
+        self._pending: list[tuple[Prediction, FloatArray]] = []
+        self._refined: FloatArray | None = None
         self._packets = self._stale = 0
         self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
         self._again = False
         self._origin: float | None = None
 
-    def _start(self, time: float, commands: dict[str, Given]) -> None:
-        refined = None if self._origin is None or self._done < 0 else self._belief_at(self._done).parameters
-        belief = self.estimator.begin(commands, refined)
-        self._origin, self._newest = time, 0
-        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(commands))]
+    def _start(self, time: float, commands: dict[str, Given], frame: FloatArray | None) -> None:
+        belief = self.estimator.begin(commands, self._refined)
+        if frame is not None:
+            self._check_unit(frame, belief)
+        for interval in self._steps.values():
+            self._forget(interval)
+        self._origin, self._newest, self._again, self._stale = time, 0, False, 0
+        self._commands = [(-np.inf, 0, commands)]
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
-        self._pending: list[tuple[Prediction, FloatArray]] = []
+        self._pending = []
 
     # Packets
 
-    def take(self, time: float, markers: Mapping[str, ArrayLike] | ArrayLike | None = None, **inputs: Given) -> bool:
+    def take(self, time: float, markers: Mapping[str, ArrayLike] | ArrayLike | None = None, /, **inputs: Given) -> bool:
         """Takes a packet: markers seen, and commands that hold from then on.
 
         Args:
@@ -144,31 +155,32 @@ class Twin:
             inputs: by name, as for `Robot.step`; those that are not given stay.
 
         Returns:
-            Whether it came in time; a packet older than `patience` is counted and left out.
+            Whether it came in time. The markers of a packet older than `patience` are left out, and its commands hold
+            from the oldest step that is still known.
 
         Raises:
             InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
         """
-        if not np.isfinite(time):
+        if not abs(time) < _LATEST:
             raise InputError(f"a packet has the time {time}: give seconds.")
         commands: dict[str, Given] = {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
         self._packets += 1
         frame = None if markers is None else self._frame(markers)
         if self._origin is None or self._is_other_clock(time):
-            held = {} if self._origin is None else self._commanded(np.inf)
-            self._start(time, {**held, **commands})
-            if frame is not None:
-                self._check_unit(frame)
+            self._start(time, {**self._commanded(np.inf), **commands}, frame)
             commands = {}
         assert self._origin is not None
         number = int(np.ceil((time - self._origin) / self._h - _ROUNDING))
-        if number <= max(self._newest - self._keep, -1):
-            self._count("packets too late")
-            return False
+        oldest = max(self._newest - self._keep + 1, 0)
+        too_late = number < oldest
         if commands:
             self._commands.append((time, self._packets, commands))
             self._commands.sort(key=lambda entry: entry[:2])
-            self._simulated, self._done = min(self._simulated, number), min(self._done, number)
+            changed = max(number, oldest)
+            self._simulated, self._done = min(self._simulated, changed), min(self._done, changed)
+        if too_late:
+            self._count("packets too late")
+            return False
         for new in range(self._newest + 1, number + 1):
             self._steps[new] = _Interval()
         if number < self._newest:
@@ -182,8 +194,9 @@ class Twin:
 
     def restart(self, why: str) -> None:
         """Starts again with the next packet, from rest and with the refined parameters; `counts` has the reason."""
-        self._count(f"starts {why}")
-        self._again = True
+        if self.has_begun:
+            self._count(f"starts {why}")
+            self._again = True
 
     def _belief_at(self, number: int) -> Belief:
         belief = self._steps[number].corrected
@@ -194,7 +207,6 @@ class Twin:
         """Whether the twin starts again: after a gap, or where the clock of the packets was set back."""
         assert self._origin is not None
         if self._again:
-            self._again = False
             return True
         now = self._origin + self._newest * self._h
         if time > now + _LONGEST_GAP:
@@ -203,11 +215,11 @@ class Twin:
         self._stale = self._stale + 1 if time < now - self.patience - self._h else 0
         if self._stale >= _STALE:
             self._count("starts with an earlier clock")
-            self._stale = 0
             return True
         return False
 
     def _count(self, what: str) -> None:
+        what = what if what in self._counts or len(self._counts) < _KINDS else "other faults"
         self._counts[what] = self._counts.get(what, 0) + 1
 
     def _frame(self, markers: Mapping[str, ArrayLike] | ArrayLike) -> FloatArray:
@@ -229,19 +241,15 @@ class Twin:
     def _place(place: ArrayLike, label: str) -> FloatArray:
         try:
             position = np.array([np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))])
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             position = np.empty(0)
         if position.shape != (3,):
             raise InputError(f"a packet has {place!r} as the position of {label!r}: give x, y and z in m.")
         return position if np.isfinite(position).all() else np.full(3, np.nan)
 
-    def _check_unit(self, frame: FloatArray) -> None:
-        belief = self._steps[0].predicted
-        assert belief is not None
-        expected = self.estimator.markers(belief)[0]
-        off = np.linalg.norm(frame - expected, axis=1)
+    def _check_unit(self, frame: FloatArray, belief: Belief) -> None:
+        off = np.linalg.norm(frame - self.estimator.markers(belief)[0], axis=1)
         if np.isfinite(off).any() and np.nanmedian(off) > _FAR * self.estimator.size:
-            self._origin = None
             raise InputError(
                 f"the first markers are {np.nanmedian(off):.3g} m from the robot: give positions in metres, in the "
                 "frame of the run's recordings."
@@ -262,12 +270,23 @@ class Twin:
                     self._simulated = number
                 self._corrected(interval, number)
                 self._done = number
+        self._refined = self._belief_at(self._newest).parameters
+        self._score()
         for number in [number for number in self._steps if number <= self._newest - self._keep]:
             self._forget(self._steps.pop(number))
-        oldest = self._origin + min(self._steps) * self._h
-        old = [entry for entry in self._commands if entry[0] <= oldest]
-        self._commands[: len(old)] = [(-np.inf, 0, self._commanded(oldest))]
+        self._commands = self._needed(self._origin + min(self._steps) * self._h)
         return self._newest
+
+    def _needed(self, oldest: float) -> list[tuple[float, int, dict[str, Given]]]:
+        """Commands without those that others had followed before a time."""
+        latest = dict[str, tuple[float, int, dict[str, Given]]]()
+        later = []
+        for since, order, commands in self._commands:
+            if since > oldest:
+                later.append((since, order, commands))
+            else:
+                latest |= {name: (since, order, {name: value}) for name, value in commands.items()}
+        return [*sorted(latest.values(), key=lambda entry: entry[:2]), *later]
 
     def _commanded(self, time: float) -> dict[str, Given]:
         """The commands that hold at a time."""
@@ -279,25 +298,34 @@ class Twin:
 
     def _advanced(self, belief: Belief, number: int) -> Belief:
         assert self._origin is not None
-        commands = self._commanded(self._origin + (number - 1) * self._h)
-        try:
-            return self.estimator.advance(belief, commands)
-        except ConvergenceError:
-            self._count("failed steps, after which the robot was taken to be at rest")
-            return self.estimator.begin(commands, belief.parameters)
+        start = self._origin + (number - 1) * self._h
+        while True:
+            commands = self._commanded(start)
+            try:
+                return self.estimator.advance(belief, commands)
+            except ConvergenceError:
+                self._count("failed steps, after which the robot was taken to be at rest")
+                return self.estimator.begin(commands, belief.parameters)
+            except InputError as error:  # Such as a base that moves too fast: what was commanded last is forgotten.
+                held = [entry for entry in self._commands if entry[0] <= start + _ROUNDING * self._h]
+                if not held:
+                    raise
+                self._commands.remove(held[-1])
+                self._count(f"a command was left out: {error}")
 
     def _corrected(self, interval: _Interval, number: int) -> None:
         belief, interval.corrections = interval.predicted, []
         assert belief is not None
         assert self._origin is not None
         end = self._origin + number * self._h
-        last = max((time for n in (number - 1, number - 2) for time, *_ in self._frames_of(n)), default=None)
+        interval.before = self._steps[number - 1].last if number - 1 in self._steps else interval.before
+        last = interval.before
         for time, _, frame in interval.frames:
             passed = self._h if last is None else time - last
             belief, correction = self.estimator.correct(belief, frame, max(end - time, 0.0), passed)
             interval.corrections.append((time, correction))
             last = time
-        interval.corrected = belief
+        interval.corrected, interval.last = belief, last
 
     def _frames_of(self, number: int) -> list[tuple[float, int, FloatArray]]:
         return self._steps[number].frames if number in self._steps else []
@@ -397,11 +425,6 @@ class Twin:
     @property
     def _scale(self) -> float:
         """Factor of the deviations of predictions by which past ones would have been right."""
-        self._score()
-        return self._known_scale
-
-    @property
-    def _known_scale(self) -> float:
         if len(self._ratios) < _ENOUGH:
             return 1.0
         return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
@@ -412,7 +435,7 @@ class Twin:
         left = []
         for prediction, seen in self._pending:
             number = round((prediction.times[-1] - self._origin) / self._h)
-            if number > self._newest:
+            if number > self._newest or (not self._frames_of(number) and number > self._newest - self._keep):
                 left.append((prediction, seen))
                 continue
             for time, _, frame in self._frames_of(number)[-1:]:
@@ -424,7 +447,7 @@ class Twin:
                     ratio = off[usable] / np.hypot(prediction.deviations[usable], self.estimator.noise.markers)
                     away = (np.linalg.norm(x[usable], axis=1).mean() for x in (off, frame - seen))
                     twin, held = (1e3 * float(x) for x in away)
-                    self._scores.append((twin, held, float((np.abs(ratio) < _NINETY * self._known_scale).mean())))
+                    self._scores.append((twin, held, float((np.abs(ratio) < _NINETY * self._scale).mean())))
                     self._ratios.append(ratio.ravel())
         self._pending = left
 
@@ -434,7 +457,6 @@ class Twin:
         if self._origin is None:
             return None
         self._update()
-        self._score()
         if not self._scores:
             return None
         twin, held, covered = np.mean(self._scores, axis=0)

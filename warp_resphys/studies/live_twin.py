@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -10,7 +11,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.errors import InputError, ResphysError, listed
+from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.loading import recorded_trial, trial_names
@@ -22,6 +23,11 @@ from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
+_ADVICE: Final = {
+    "twin": "the twin is the best",
+    "held": "the twin is no better than markers held: rely on these",
+    "simulator": "the twin is no better: rely on the simulator",
+}
 _BEHIND: Final = 1.0  # time since packets were last taken, after which the twin starts again [s]
 _EVERY: Final = 0.1  # between predictions [s]
 
@@ -163,7 +169,7 @@ class LiveTwin:
                 f"{self.twin.horizon:g} s ahead: {off.twin:.2f} mm off; markers held {off.held:.2f} mm; "
                 f"{100 * off.covered:.0f} % in intervals of 90 %"
             )
-            lines.append(f"simulator without markers: {off.simulator:.2f} mm off")
+            lines.append(f"simulator without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best]}")
         faults = self.twin.counts | (dict(self._listener.refused) if self._listener is not None else {})
         return [*lines, *(f"{what}: {count} times" for what, count in faults.items())]
 
@@ -205,7 +211,9 @@ class LiveTwin:
 
     def _predicted(self) -> None:
         if self._estimate is not None and not 0.0 <= self.time - self._predicted_at < _EVERY:
-            self._prediction, self._predicted_at = self.twin.ahead(), self.time
+            self._prediction, self._predicted_at = None, self.time
+            with suppress(ConvergenceError):  # The twin counts it.
+                self._prediction = self.twin.ahead()
 
     def _aligned(self, packet: Packet) -> list[Packet]:
         if self._frame is None:

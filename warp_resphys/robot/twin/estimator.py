@@ -319,6 +319,11 @@ class FullEstimator:
                 return change, covariance
             deviation *= 2.0
 
+    def without_markers(self, belief: Belief) -> Belief:
+        """Returns a belief in the state of the simulator that sees no markers, without a force, and unknown."""
+        state = belief.state.select([self._count - 1] * self._count)
+        return replace(self._lost(belief), state=state, bias=np.zeros_like(belief.bias))
+
     def _lost(self, belief: Belief) -> Belief:
         """A belief with a state that may be far off."""
         unknown = 3 * len(belief.bias)

@@ -82,6 +82,12 @@ class Disagreement:
     simulator: float
     covered: float
 
+    @property
+    def best(self) -> str:
+        """The best of them: ``twin``, ``held`` or ``simulator``."""
+        errors = {"twin": self.twin, "held": self.held, "simulator": self.simulator}
+        return min(errors, key=lambda name: np.nan_to_num(errors[name], nan=np.inf))
+
 
 @dataclass
 class _Interval:
@@ -304,14 +310,21 @@ class Twin:
             try:
                 return self.estimator.advance(belief, commands)
             except ConvergenceError:
-                self._count("failed steps, after which the robot was taken to be at rest")
-                return self.estimator.begin(commands, belief.parameters)
+                self._count("failed steps, after which the state was that of the simulator without markers")
+                return self._without_markers(belief, commands)
             except InputError as error:  # Such as a base that moves too fast: what was commanded last is forgotten.
                 held = [entry for entry in self._commands if entry[0] <= start + _ROUNDING * self._h]
                 if not held:
                     raise
                 self._commands.remove(held[-1])
                 self._count(f"a command was left out: {error}")
+
+    def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
+        """A step from the state of the simulator without markers; at rest, if that fails as well."""
+        try:
+            return self.estimator.advance(self.estimator.without_markers(belief), commands)
+        except ConvergenceError:
+            return self.estimator.begin(commands, belief.parameters)
 
     def _corrected(self, interval: _Interval, number: int) -> None:
         belief, interval.corrections = interval.predicted, []
@@ -400,7 +413,11 @@ class Twin:
         markers, state = [self.estimator.markers(belief)[0]], belief
         with torch.no_grad():
             for _ in range(steps):
-                state = self.estimator.advance(state, commands)
+                try:
+                    state = self.estimator.advance(state, commands)
+                except ConvergenceError:
+                    self._count("predictions that failed")
+                    raise
                 markers.append(self.estimator.markers(state)[0])
         times = self._origin + self._h * (self._newest + np.arange(steps + 1, dtype=np.float64))
         deviations = self.estimator.markers(state)[1]

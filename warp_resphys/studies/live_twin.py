@@ -17,8 +17,8 @@ from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
 from ..robot.twin.estimator import TwinNoise
-from ..robot.twin.stream import Frame, Listener, Packet, recorded_packets
-from ..robot.twin.twin import Estimate, Prediction, Twin
+from ..robot.twin.stream import Alignment, Listener, Packet, recorded_packets
+from ..robot.twin.twin import Estimate, Forecast, Twin
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
@@ -108,9 +108,9 @@ class LiveTwin:
         self._recorded = self._packets_of_recording()
         self._next = None if self._recorded is None else next(self._recorded, None)
         self._clock = 0.0 if self._next is None else self._next.time
-        self._frame: Frame | None = None
+        self._alignment: Alignment | None = None
         self._estimate: Estimate | None = None
-        self._prediction: Prediction | None = None
+        self._prediction: Forecast | None = None
         self._seen: Mapping[str, Any] = {}
         self._predicted_at, self._drained = -np.inf, time.perf_counter()
         self.time, self.failure, self.state = self._clock, "", object()
@@ -216,10 +216,10 @@ class LiveTwin:
                 self._prediction = self.twin.ahead()
 
     def _aligned(self, packet: Packet) -> list[Packet]:
-        if self._frame is None:
+        if self._alignment is None:
             at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
-            self._frame = Frame(self.robot, at_rest.double().cpu().numpy())
-        return self._frame.moved(packet)
+            self._alignment = Alignment(self.robot, at_rest.double().cpu().numpy())
+        return self._alignment.moved(packet)
 
     def _due(self) -> Iterator[Packet]:
         if self._listener is not None:

@@ -159,7 +159,7 @@ class Listener:
         self._socket.close()
 
 
-class Frame:
+class Alignment:
     """Moves packets from the frame of cameras to that of the robot.
 
     The first frames are registered, as an import does it: by the markers on what holds the robot

@@ -48,7 +48,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Prediction:
+class Forecast:
     """A robot in the T steps to come, under constant commands.
 
     Attributes:
@@ -131,7 +131,7 @@ class Twin:
         self._counts: dict[str, int] = {}
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
         self._steps: dict[int, _Interval] = {}
-        self._pending: list[tuple[Prediction, FloatArray]] = []
+        self._pending: list[tuple[Forecast, FloatArray]] = []
         self._refined: FloatArray | None = None
         self._packets = self._stale = 0
         self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
@@ -393,7 +393,7 @@ class Twin:
                 self._tell(correction, counts)
         return counts
 
-    def ahead(self, seconds: float | None = None, **inputs: Given) -> Prediction:
+    def ahead(self, seconds: float | None = None, **inputs: Given) -> Forecast:
         """Simulates what comes, under the last commands or others.
 
         Predictions under the last commands are compared with the markers that come (`disagreement`).
@@ -421,10 +421,10 @@ class Twin:
                 markers.append(self.estimator.markers(state)[0])
         times = self._origin + self._h * (self._newest + np.arange(steps + 1, dtype=np.float64))
         deviations = self.estimator.markers(state)[1]
-        prediction = Prediction(times, np.stack(markers), self._scale * deviations, state.state.select([0]))
+        prediction = Forecast(times, np.stack(markers), self._scale * deviations, state.state.select([0]))
         seen = self._last_seen()
         if not inputs and seconds is None and seen is not None:
-            self._pending.append((Prediction(times, prediction.markers, deviations, prediction.state), seen))
+            self._pending.append((Forecast(times, prediction.markers, deviations, prediction.state), seen))
         return prediction
 
     def _last_seen(self) -> FloatArray | None:

@@ -41,6 +41,7 @@ _FURTHER: Final = (0.1, 100.0)  # range of a frame's squared distance
 _SHAKEN: Final = (0.03, 1000.0)  # range of the factor
 _EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the body may leave
 _LARGEST: Final = 0.1  # correction of a vertex in one frame, over the size of the body
+_DOUBLINGS: Final = 40  # of the noise of a frame, after which it is left out
 _JUMP: Final = 0.02  # least distance of a marker that counts as a jump, over the size of the body
 
 
@@ -311,13 +312,13 @@ class FullEstimator:
 
     def _conditioned(self, belief: Belief, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """`kalman.conditioned` for markers, with more noise where the shape would change by too much at once."""
-        deviation = self.noise.markers
-        while True:
-            rows = slopes.reshape(-1, slopes.shape[2])
+        deviation, rows = self.noise.markers, slopes.reshape(-1, slopes.shape[2])
+        for _ in range(_DOUBLINGS):
             change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
             if self._furthest(belief, change) <= _LARGEST * self.size:  # The vibrations hold for small motions.
                 return change, covariance
             deviation *= 2.0
+        return np.zeros(len(belief.covariance)), belief.covariance
 
     def without_markers(self, belief: Belief) -> Belief:
         """Returns a belief in the state of the simulator that sees no markers, without a force, and unknown."""

@@ -83,7 +83,7 @@ def test_its_page_shows_the_estimate_and_what_comes(robot):
         assert page.run(1.5) > 0.0
         assert page._target.visible
         assert "ahead" in page._status.content
-        assert _summary(live)[0].startswith("estimates in ")
+        assert _summary(live)[0].startswith("an estimate for a packet in ")
     finally:
         server.stop()
 
@@ -94,3 +94,16 @@ def test_the_command_ends_with_a_summary(finished, capsys):
     code, err = end_of(cli.main, "warp-resphys", "view", run, "source=150 g", "trial=150 g", "port=0", "seconds=1")
     assert code == 2
     assert "trial and source are both given" in err
+
+
+def test_a_summary_says_why_no_packet_was_taken(robot):
+    live = LiveTwin(robot, "udp://127.0.0.1:0", SETTINGS)
+    host, port = live.address.removeprefix("udp://").split(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b'{"time": 1, "markers": {"vertex_0": [1000, 0, 0]}}', (host, int(port)))
+    until_time = time.monotonic() + 20.0
+    while len(live.words) < 2 and time.monotonic() < until_time:
+        live.step()
+    live.close()
+    assert _summary(live)[0] == "no frames"
+    assert any("give positions in metres" in line for line in _summary(live))

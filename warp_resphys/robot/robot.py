@@ -388,6 +388,8 @@ class Robot:
             InputError: an unknown input or parameter, or a network in place of the simulator.
             ConvergenceError: there is no equilibrium.
         """
+        if noise is not None and not isinstance(noise, TwinNoise):
+            raise InputError(f"noise is {noise!r}: give warp_resphys.TwinNoise(markers={noise!r}).")
         robot = self if self.simulator.integrator != "midpoint" else self._integrated_by("bdf2")
         return Twin(FullEstimator(robot, inputs, refine, modes, noise, gate, start), horizon, patience)
 

@@ -18,11 +18,13 @@ from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
 from ..robot.twin.estimator import TwinNoise
 from ..robot.twin.stream import Alignment, Listener, Packet, recorded_packets
-from ..robot.twin.twin import Estimate, Forecast, Twin
+from ..robot.twin.twin import JUMPS, Estimate, Forecast, Twin
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
+_SHARE: Final = 4.0  # time between two predictions, over what one takes
+_LOST: Final = 5  # jumps of the whole body that hint at another frame or unit
 _ADVICE: Final = {
     "twin": "the twin is the best",
     "held": "the twin is no better than markers held: rely on these",
@@ -112,7 +114,7 @@ class LiveTwin:
         self._estimate: Estimate | None = None
         self._prediction: Forecast | None = None
         self._seen: Mapping[str, Any] = {}
-        self._predicted_at, self._drained = -np.inf, time.perf_counter()
+        self._predicted_at, self._drained, self._spent = -np.inf, time.perf_counter(), 0.0
         self.time, self.failure, self.state = self._clock, "", object()
 
     def _packets_of_recording(self) -> Iterator[Packet] | None:
@@ -170,6 +172,8 @@ class LiveTwin:
                 f"{100 * off.covered:.0f} % in intervals of 90 %"
             )
             lines.append(f"simulator without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best]}")
+        if self.twin.counts.get(JUMPS, 0) > _LOST:
+            lines.append("Many jumps of the whole body: are packets in metres, in the robot's frame? (twin.align=true)")
         faults = self.twin.counts | (dict(self._listener.refused) if self._listener is not None else {})
         return [*lines, *(f"{what}: {count} times" for what, count in faults.items())]
 
@@ -183,7 +187,7 @@ class LiveTwin:
         for packet in self._due():
             taken += self._tried(self._take, packet)
         if taken and not self.failure and self._tried(self._estimated):
-            self.seconds.append(time.perf_counter() - began)
+            self.seconds.append((time.perf_counter() - began) / taken)
             self._tried(self._predicted)
         self.state = object() if taken else self.state
         return bool(taken) or (self._next is not None and not self.failure)
@@ -210,10 +214,13 @@ class LiveTwin:
         self.time = self.time if self._estimate is None else self._estimate.time
 
     def _predicted(self) -> None:
-        if self._estimate is not None and not 0.0 <= self.time - self._predicted_at < _EVERY:
+        every = max(_EVERY, _SHARE * self._spent)
+        if self._estimate is not None and not 0.0 <= self.time - self._predicted_at < every:
+            began = time.perf_counter()
             self._prediction, self._predicted_at = None, self.time
             with suppress(ConvergenceError):  # The twin counts it.
                 self._prediction = self.twin.ahead()
+            self._spent = time.perf_counter() - began
 
     def _aligned(self, packet: Packet) -> list[Packet]:
         if self._alignment is None:

@@ -111,11 +111,12 @@ def view(settings: ViewSettings, folder: Path) -> None:
 
 def _summary(live: LiveTwin) -> list[str]:
     """Lines on a twin that has ended."""
+    lines = [*live.words, *[live.failure][: bool(live.failure)]]
     if not live.seconds:
-        return ["no packets"]
+        return ["no frames", *lines]
     half, most = np.percentile(1e3 * np.array(live.seconds), [50, 99])
-    pace = f"estimates in {half:.1f} ms (median), {most:.1f} ms (99th percentile)"
-    return [f"{pace}, steps of {1e3 * live.robot.time_step:g} ms", *live.words]
+    pace = f"an estimate for a packet in {half:.1f} ms (median), {most:.1f} ms (99th percentile)"
+    return [f"{pace}, steps of {1e3 * live.robot.time_step:g} ms", *lines]
 
 
 def _free_port(host: str, port: int) -> int:

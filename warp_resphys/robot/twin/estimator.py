@@ -54,12 +54,20 @@ class TwinNoise:
         simulator: of simulated markers from real ones [m]; None for the mean error in the run's test trials.
         placement: of the markers on the body, from where they are bound [m].
         forget: time after which a refined parameter may be another [s].
+
+    Raises:
+        InputError: one that is not positive.
     """
 
     markers: float = 2e-4
     simulator: float | None = None
     placement: float = 1e-3
     forget: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None and not value > 0.0:
+                raise InputError(f"noise.{name} is {value:g}: it must be positive.")
 
 
 @dataclass(frozen=True)

@@ -70,9 +70,11 @@ def _number(name: str, value: Any) -> float:
 
 
 def _position(label: str, place: Any) -> tuple[float, ...]:
+    if place is None:
+        return (np.nan,) * 3
     if not isinstance(place, list) or len(place) != 3:
         raise InputError(f"a packet has no position of {label!r}: give x, y and z in m, or null for each.")
-    return tuple(np.nan if value is None else _number(label, value) for value in place)
+    return tuple(np.nan if value is None or value != value else _number(label, value) for value in place)
 
 
 def _values(inputs: Mapping[str, Any]) -> dict[str, Any]:

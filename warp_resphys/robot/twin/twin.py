@@ -4,6 +4,7 @@ from bisect import insort
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,7 @@ _STALE: Final = 10  # packets in order, all too old, after which the clock has b
 _SCORES: Final = 400  # predictions that are remembered
 _ENOUGH: Final = 20  # predictions from which intervals are scaled
 _NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
-_MOVED: Final = "jumps of the whole body"
+JUMPS: Final = "jumps of the whole body"
 _LATEST: Final = 1e12  # of times [s]
 _KINDS: Final = 30  # of faults that are counted
 _FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
@@ -135,7 +136,7 @@ class Twin:
         self._refined: FloatArray | None = None
         self._packets = self._stale = 0
         self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
-        self._again = False
+        self._again = self._framed = False
         self._origin: float | None = None
 
     def _start(self, time: float, commands: dict[str, Given], frame: FloatArray | None) -> None:
@@ -144,7 +145,7 @@ class Twin:
             self._check_unit(frame, belief)
         for interval in self._steps.values():
             self._forget(interval)
-        self._origin, self._newest, self._again, self._stale = time, 0, False, 0
+        self._origin, self._newest, self._again, self._stale, self._framed = time, 0, False, 0, False
         self._commands = [(-np.inf, 0, commands)]
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
@@ -167,7 +168,7 @@ class Twin:
         Raises:
             InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
         """
-        if not abs(time) < _LATEST:
+        if not isinstance(time, Real) or not abs(time) < _LATEST:
             raise InputError(f"a packet has the time {time}: give seconds.")
         commands: dict[str, Given] = {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
         self._packets += 1
@@ -175,6 +176,9 @@ class Twin:
         if self._origin is None or self._is_other_clock(time):
             self._start(time, {**self._commanded(np.inf), **commands}, frame)
             commands = {}
+        elif frame is not None and not self._framed:
+            self._check_unit(frame, next(one for one in map(self._known_at, self._steps) if one is not None))
+        self._framed = self._framed or frame is not None
         assert self._origin is not None
         number = int(np.ceil((time - self._origin) / self._h - _ROUNDING))
         oldest = max(self._newest - self._keep + 1, 0)
@@ -203,6 +207,9 @@ class Twin:
         if self.has_begun:
             self._count(f"starts {why}")
             self._again = True
+
+    def _known_at(self, number: int) -> Belief | None:
+        return self._steps[number].predicted
 
     def _belief_at(self, number: int) -> Belief:
         belief = self._steps[number].corrected
@@ -356,7 +363,7 @@ class Twin:
                 what = f"{self.labels[number] if self.labels else 'a vertex'} {word}"
                 counts[what] = counts.get(what, 0) + 1
         if correction.restarted:
-            counts[_MOVED] = counts.get(_MOVED, 0) + 1
+            counts[JUMPS] = counts.get(JUMPS, 0) + 1
 
     @property
     def has_begun(self) -> bool:
@@ -406,6 +413,8 @@ class Twin:
             InputError: an invalid input; or there was no packet.
             ConvergenceError: a step failed.
         """
+        if seconds is not None and not 0.0 < seconds < np.inf:
+            raise InputError(f"seconds is {seconds}: give the length of the prediction, more than zero.")
         belief = self._belief_at(self._update())
         assert self._origin is not None
         commands = {**self._commanded(np.inf), **inputs}

@@ -90,7 +90,7 @@ def test_its_page_shows_the_estimate_and_what_comes(robot):
         server.stop()
 
 
-def test_the_command_ends_with_a_summary(finished, capsys):
+def test_a_trial_and_a_source_are_not_both_given(finished):
     pytest.importorskip("viser")
     run = f"run={finished[0]}"
     code, err = end_of(cli.main, "warp-resphys", "view", run, "source=150 g", "trial=150 g", "port=0", "seconds=1")

@@ -7,7 +7,7 @@ import pytest
 
 from support.main_job import end_of
 from warp_resphys import cli
-from warp_resphys.robot.twin.twin import Disagreement
+from warp_resphys.robot.twin.scores import Disagreement
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..robot.twin.kalman import conditioned
 from .polynomials import Monomials
 from .reduced import ReducedModel, ReducedState
 from .world import FloatArray
@@ -83,11 +84,8 @@ class Estimator:
         slopes = np.zeros((int(seen.sum()), 3 * r))
         slopes[:, :r] = model.point_slopes(self.state.z, Monomials(self.state.acting))[0][0, seen]
         expected = (model.observe(self.state)[0] + self.offset)[seen]
-        spread = slopes @ self._covariance @ slopes.T + self._noise.observed**2 * np.eye(len(slopes))
-        gain = np.linalg.solve(spread, slopes @ self._covariance).T
-        change = gain @ (markers.ravel()[seen] - expected)
-        self._covariance = (np.eye(3 * r) - gain @ slopes) @ self._covariance
-        self._covariance = 0.5 * (self._covariance + self._covariance.T)
+        residual = markers.ravel()[seen] - expected
+        change, self._covariance = conditioned(self._covariance, slopes, residual, self._noise.observed)
         z, v = self.state.z + change[:r], self.state.v + change[r : 2 * r]
         self.state = replace(self.state, z=z, v=v)
         self.bias = self.bias + change[2 * r :]

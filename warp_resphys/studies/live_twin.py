@@ -17,8 +17,9 @@ from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
 from ..robot.twin.estimator import TwinNoise
+from ..robot.twin.scores import Forecast
 from ..robot.twin.stream import Alignment, Listener, Packet, recorded_packets
-from ..robot.twin.twin import JUMPS, Estimate, Forecast, Twin
+from ..robot.twin.twin import JUMPS, Estimate, Twin
 from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
@@ -100,7 +101,7 @@ class LiveTwin:
 
     @property
     def address(self) -> str:
-        """Where packets are listened for; empty for a recording."""
+        """URL at which packets are taken; empty for a recording."""
         return "" if self._listener is None else "udp://{}:{}".format(*self._listener.address)
 
     def reset(self) -> None:
@@ -160,7 +161,7 @@ class LiveTwin:
 
     @property
     def words(self) -> list[str]:
-        """What the twin has to say: refined parameters, disagreement, faults of packets."""
+        """Lines of text on refined parameters, disagreement and faults of packets."""
         lines = [] if self._estimate is not None else ["Waiting for packets."]
         if self._estimate is not None:
             for name, (value, deviation) in self._estimate.parameters.items():
@@ -174,7 +175,7 @@ class LiveTwin:
             lines.append(f"simulator without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best]}")
         if self.twin.counts.get(JUMPS, 0) > _LOST:
             lines.append("Many jumps of the whole body: are packets in metres, in the robot's frame? (twin.align=true)")
-        faults = self.twin.counts | (dict(self._listener.refused) if self._listener is not None else {})
+        faults = self.twin.counts | (self._listener.refused if self._listener is not None else {})
         return [*lines, *(f"{what}: {count} times" for what, count in faults.items())]
 
     # Time
@@ -200,7 +201,7 @@ class LiveTwin:
             if self._listener is None:
                 self.failure = f"Stopped: {error}"
             else:
-                self._listener.refuse(error)
+                self._listener.refused.add(str(error))
             return False
         return True
 

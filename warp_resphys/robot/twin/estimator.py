@@ -72,7 +72,7 @@ class TwinNoise:
 
 @dataclass(frozen=True)
 class Belief:
-    """What is known of a robot after a step.
+    """Estimate of a robot's state after a step, with its covariance.
 
     Attributes:
         state: of 2 + P environments: the estimate, the P with another parameter, and the one without markers.
@@ -191,7 +191,7 @@ class FullEstimator:
     # Steps
 
     def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> Belief:
-        """Returns what is known at first: a robot at rest under constant commands, with large deviations.
+        """Returns the first belief: a robot at rest under constant commands, with large deviations.
 
         Args:
             inputs: commands by name.

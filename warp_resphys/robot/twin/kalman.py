@@ -33,9 +33,7 @@ def conditioned(
     scaled = covariance / size / size[:, None]
     root = size[:, None] * np.linalg.cholesky(scaled + _JITTER * np.eye(len(size)))
     seen = (slopes @ root).T / deviation
-    gained = root @ scipy.linalg.cho_solve(
-        scipy.linalg.cho_factor(np.eye(len(size)) + seen @ seen.T), np.eye(len(size))
-    )
+    gained = scipy.linalg.solve(np.eye(len(size)) + seen @ seen.T, root.T, assume_a="pos").T
     after = gained @ root.T
     return gained @ (seen @ residual) / deviation, 0.5 * (after + after.T)
 

@@ -1,4 +1,4 @@
-"""What a twin needs of a robot: `Robot` has more, and imports this package."""
+"""Protocol of the robots that a twin can follow; `Robot` has these methods, and imports this package."""
 
 from typing import Any, Protocol
 

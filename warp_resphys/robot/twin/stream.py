@@ -22,7 +22,7 @@ _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs")
 _MOST: Final = 1e12  # of numbers in a packet
 _LONGEST: Final = 1000  # packets that wait for the registration
-_KINDS: Final = 30  # of faults that are counted
+_KINDS: Final = 30  # of faults that are counted apart
 _FIRST: Final = 20  # frames whose median is registered
 
 
@@ -107,6 +107,14 @@ def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
         yield Packet(float(time), dict(zip(recording.labels, frame, strict=True)), inputs)
 
 
+class Faults(Counter[str]):
+    """Numbers of faults by their descriptions; beyond 30 descriptions, the others count together."""
+
+    def add(self, what: str) -> None:
+        """Counts a fault."""
+        self[what if what in self or len(self) < _KINDS else "other faults"] += 1
+
+
 class Listener:
     """Receives packets of JSON over UDP, without waiting.
 
@@ -115,14 +123,14 @@ class Listener:
 
     Attributes:
         address: host and port that it listens at.
-        refused: how often what was wrong with packets, in words.
+        refused: faults of packets that were left out.
 
     Raises:
         InputError: another URL, or a port that cannot be used.
     """
 
     def __init__(self, url: str) -> None:
-        self.refused: Counter[str] = Counter()
+        self.refused = Faults()
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
@@ -149,12 +157,7 @@ class Listener:
             try:
                 yield Packet.of_text(text)
             except InputError as error:
-                self.refuse(error)
-
-    def refuse(self, error: ResphysError) -> None:
-        """Counts what was wrong with a packet."""
-        what = str(error)
-        self.refused[what if what in self.refused or len(self.refused) < _KINDS else "other faults of packets"] += 1
+                self.refused.add(str(error))
 
     def close(self) -> None:
         """Frees the port."""

@@ -3,7 +3,7 @@
 from bisect import insort
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Final
 
@@ -16,16 +16,14 @@ from ..inputs import Given, InputReader
 from ..state import RobotState
 from .estimator import Belief, FullEstimator
 from .kalman import Correction, FloatArray
+from .scores import REMEMBERED, Disagreement, Forecast, Scores
+from .stream import Faults
 
 _ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
 _LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
 _STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
-_SCORES: Final = 400  # predictions that are remembered
-_ENOUGH: Final = 20  # predictions from which intervals are scaled
-_NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
 JUMPS: Final = "jumps of the whole body"
 _LATEST: Final = 1e12  # of times [s]
-_KINDS: Final = 30  # of faults that are counted
 _FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
 
 
@@ -48,51 +46,9 @@ class Estimate:
     parameters: Mapping[str, tuple[float, float]]
 
 
-@dataclass(frozen=True)
-class Forecast:
-    """A robot in the T steps to come, under constant commands.
-
-    Attributes:
-        times: (T + 1,) from the last step on [s].
-        markers: (T + 1, M, 3) [m].
-        deviations: (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions.
-        state: at the end, one environment.
-    """
-
-    times: FloatArray
-    markers: FloatArray
-    deviations: FloatArray
-    state: RobotState
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """Mean distances of markers from those measured later, over the last predictions [mm].
-
-    Attributes:
-        predictions: their number.
-        twin: of the predicted markers.
-        held: of the markers as they were measured when the prediction was made.
-        simulator: of the simulator that sees no markers, at the last frames.
-        covered: share of the coordinates within 1.645 deviations, 90 % for right ones.
-    """
-
-    predictions: int
-    twin: float
-    held: float
-    simulator: float
-    covered: float
-
-    @property
-    def best(self) -> str:
-        """The best of them: ``twin``, ``held`` or ``simulator``."""
-        errors = {"twin": self.twin, "held": self.held, "simulator": self.simulator}
-        return min(errors, key=lambda name: np.nan_to_num(errors[name], nan=np.inf))
-
-
 @dataclass
 class _Interval:
-    """What happened in the step that ends at some time, and the beliefs after it."""
+    """Frames taken during a step, and the beliefs after it: as simulated, and as corrected by the frames."""
 
     frames: list[tuple[float, int, FloatArray]] = field(default_factory=list)
     predicted: Belief | None = None
@@ -126,13 +82,11 @@ class Twin:
         names = self.labels or [f"vertex_{number}" for number in range(estimator.count)]
         self._numbers = {label: number for number, label in enumerate(names)}
         self._reader = InputReader(estimator.robot.inputs, estimator.robot.simulator)
-        self._scores: deque[tuple[float, float, float]] = deque(maxlen=_SCORES)
-        self._ratios: deque[FloatArray] = deque(maxlen=_SCORES)
-        self._free: deque[float] = deque(maxlen=_SCORES)
-        self._counts: dict[str, int] = {}
+        self._scores = Scores(estimator.noise.markers)
+        self._free: deque[float] = deque(maxlen=REMEMBERED)
+        self._counts = Faults()
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
         self._steps: dict[int, _Interval] = {}
-        self._pending: list[tuple[Forecast, FloatArray]] = []
         self._refined: FloatArray | None = None
         self._packets = self._stale = 0
         self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
@@ -149,7 +103,7 @@ class Twin:
         self._commands = [(-np.inf, 0, commands)]
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
-        self._pending = []
+        self._scores.pending = []
 
     # Packets
 
@@ -189,12 +143,12 @@ class Twin:
             changed = max(number, oldest)
             self._simulated, self._done = min(self._simulated, changed), min(self._done, changed)
         if too_late:
-            self._count("packets too late")
+            self._counts.add("packets too late")
             return False
         for new in range(self._newest + 1, number + 1):
             self._steps[new] = _Interval()
         if number < self._newest:
-            self._count("packets out of order")
+            self._counts.add("packets out of order")
         self._newest = max(self._newest, number)
         if frame is not None:
             insort(self._steps[number].frames, (time, self._packets, frame), key=lambda entry: entry[:2])
@@ -205,7 +159,7 @@ class Twin:
     def restart(self, why: str) -> None:
         """Starts again with the next packet, from rest and with the refined parameters; `counts` has the reason."""
         if self.has_begun:
-            self._count(f"starts {why}")
+            self._counts.add(f"starts {why}")
             self._again = True
 
     def _known_at(self, number: int) -> Belief | None:
@@ -223,17 +177,13 @@ class Twin:
             return True
         now = self._origin + self._newest * self._h
         if time > now + _LONGEST_GAP:
-            self._count("starts after a gap")
+            self._counts.add("starts after a gap")
             return True
         self._stale = self._stale + 1 if time < now - self.patience - self._h else 0
         if self._stale >= _STALE:
-            self._count("starts with an earlier clock")
+            self._counts.add("starts with an earlier clock")
             return True
         return False
-
-    def _count(self, what: str) -> None:
-        what = what if what in self._counts or len(self._counts) < _KINDS else "other faults"
-        self._counts[what] = self._counts.get(what, 0) + 1
 
     def _frame(self, markers: Mapping[str, ArrayLike] | ArrayLike) -> FloatArray:
         count = self.estimator.count
@@ -241,7 +191,7 @@ class Twin:
             frame = np.full((count, 3), np.nan)
             for label, place in markers.items():
                 if label not in self._numbers:
-                    self._count(f"unknown marker {label!r}")
+                    self._counts.add(f"unknown marker {label!r}")
                     continue
                 frame[self._numbers[label]] = self._place(place, label)
             return frame
@@ -284,7 +234,7 @@ class Twin:
                 self._corrected(interval, number)
                 self._done = number
         self._refined = self._belief_at(self._newest).parameters
-        self._score()
+        self._scores.compare(self._frame_at_end)
         for number in [number for number in self._steps if number <= self._newest - self._keep]:
             self._forget(self._steps.pop(number))
         self._commands = self._needed(self._origin + min(self._steps) * self._h)
@@ -317,14 +267,14 @@ class Twin:
             try:
                 return self.estimator.advance(belief, commands)
             except ConvergenceError:
-                self._count("failed steps, after which the state was that of the simulator without markers")
+                self._counts.add("failed steps, after which the state was that of the simulator without markers")
                 return self._without_markers(belief, commands)
             except InputError as error:  # Such as a base that moves too fast: what was commanded last is forgotten.
                 held = [entry for entry in self._commands if entry[0] <= start + _ROUNDING * self._h]
                 if not held:
                     raise
                 self._commands.remove(held[-1])
-                self._count(f"a command was left out: {error}")
+                self._counts.add(f"a command was left out: {error}")
 
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
         """A step from the state of the simulator without markers; at rest, if that fails as well."""
@@ -357,13 +307,12 @@ class Twin:
             if correction.free is not None and np.isfinite(correction.free).any():
                 self._free.append(1e3 * float(np.nanmean(correction.free)))
 
-    def _tell(self, correction: Correction, counts: dict[str, int]) -> None:
+    def _tell(self, correction: Correction, counts: Faults) -> None:
         for word, chosen in (("jumps", correction.refused), ("has moved on the body", correction.moved)):
             for number in np.flatnonzero(chosen):
-                what = f"{self.labels[number] if self.labels else 'a vertex'} {word}"
-                counts[what] = counts.get(what, 0) + 1
+                counts.add(f"{self.labels[number] if self.labels else 'a vertex'} {word}")
         if correction.restarted:
-            counts[JUMPS] = counts.get(JUMPS, 0) + 1
+            counts.add(JUMPS)
 
     @property
     def has_begun(self) -> bool:
@@ -390,15 +339,15 @@ class Twin:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often something was wrong with packets, in words."""
+        """Numbers of faults of packets and of restarts, by their descriptions."""
         if self._origin is None:
             return {}
         self._update()
-        counts = dict(self._counts)
+        counts = self._counts.copy()
         for interval in self._steps.values():
             for _, correction in interval.corrections:
                 self._tell(correction, counts)
-        return counts
+        return dict(counts)
 
     def ahead(self, seconds: float | None = None, **inputs: Given) -> Forecast:
         """Simulates what comes, under the last commands or others.
@@ -425,16 +374,31 @@ class Twin:
                 try:
                     state = self.estimator.advance(state, commands)
                 except ConvergenceError:
-                    self._count("predictions that failed")
+                    self._counts.add("predictions that failed")
                     raise
                 markers.append(self.estimator.markers(state)[0])
         times = self._origin + self._h * (self._newest + np.arange(steps + 1, dtype=np.float64))
         deviations = self.estimator.markers(state)[1]
-        prediction = Forecast(times, np.stack(markers), self._scale * deviations, state.state.select([0]))
+        prediction = Forecast(times, np.stack(markers), self._scores.scale * deviations, state.state.select([0]))
         seen = self._last_seen()
         if not inputs and seconds is None and seen is not None:
-            self._pending.append((Forecast(times, prediction.markers, deviations, prediction.state), seen))
+            self._scores.pending.append((replace(prediction, deviations=deviations), seen))
         return prediction
+
+    def _frame_at_end(self, forecast: Forecast) -> tuple[float, FloatArray] | None:
+        """The last frame in the step at the end of a forecast, and its time; None before it can be known.
+
+        Raises:
+            LookupError: there was none.
+        """
+        assert self._origin is not None
+        number = round((forecast.times[-1] - self._origin) / self._h)
+        frames = self._frames_of(number)
+        if number > self._newest or (not frames and number > self._newest - self._keep):
+            return None
+        if not frames:
+            raise LookupError
+        return frames[-1][0], frames[-1][2]
 
     def _last_seen(self) -> FloatArray | None:
         """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""
@@ -449,42 +413,9 @@ class Twin:
     # Disagreement
 
     @property
-    def _scale(self) -> float:
-        """Factor of the deviations of predictions by which past ones would have been right."""
-        if len(self._ratios) < _ENOUGH:
-            return 1.0
-        return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
-
-    def _score(self) -> None:
-        """Compares predictions with the frames at their end."""
-        assert self._origin is not None
-        left = []
-        for prediction, seen in self._pending:
-            number = round((prediction.times[-1] - self._origin) / self._h)
-            if number > self._newest or (not self._frames_of(number) and number > self._newest - self._keep):
-                left.append((prediction, seen))
-                continue
-            for time, _, frame in self._frames_of(number)[-1:]:
-                share = (prediction.times[-1] - time) / self._h
-                expected = (1.0 - share) * prediction.markers[-1] + share * prediction.markers[-2]
-                off = frame - expected
-                usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
-                if usable.any():
-                    ratio = off[usable] / np.hypot(prediction.deviations[usable], self.estimator.noise.markers)
-                    away = (np.linalg.norm(x[usable], axis=1).mean() for x in (off, frame - seen))
-                    twin, held = (1e3 * float(x) for x in away)
-                    self._scores.append((twin, held, float((np.abs(ratio) < _NINETY * self._scale).mean())))
-                    self._ratios.append(ratio.ravel())
-        self._pending = left
-
-    @property
     def disagreement(self) -> Disagreement | None:
         """How far the last predictions were off; None before one has come to its end."""
         if self._origin is None:
             return None
         self._update()
-        if not self._scores:
-            return None
-        twin, held, covered = np.mean(self._scores, axis=0)
-        free = float(np.mean(self._free)) if self._free else float("nan")
-        return Disagreement(len(self._scores), float(twin), float(held), free, float(covered))
+        return self._scores.disagreement(float(np.mean(self._free)) if self._free else float("nan"))

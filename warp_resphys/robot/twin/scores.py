@@ -1,0 +1,120 @@
+"""Predictions of a twin, compared with the markers that come."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ..state import RobotState
+from .kalman import FloatArray
+
+REMEMBERED: Final = 400  # predictions
+_ENOUGH: Final = 20  # predictions from which intervals are scaled
+_NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A robot in the T steps to come, under constant commands.
+
+    Attributes:
+        times: (T + 1,) from the last step on [s].
+        markers: (T + 1, M, 3) [m].
+        deviations: (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions.
+        state: at the end, one environment.
+    """
+
+    times: FloatArray
+    markers: FloatArray
+    deviations: FloatArray
+    state: RobotState
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Mean distances of markers from those measured later, over the last predictions [mm].
+
+    Attributes:
+        predictions: their number.
+        twin: of the predicted markers.
+        held: of the markers as they were measured when the prediction was made.
+        simulator: of the simulator that sees no markers, at the last frames.
+        covered: share of the coordinates within 1.645 deviations, 90 % for right ones.
+    """
+
+    predictions: int
+    twin: float
+    held: float
+    simulator: float
+    covered: float
+
+    @property
+    def best(self) -> str:
+        """The best of them: ``twin``, ``held`` or ``simulator``."""
+        errors = {"twin": self.twin, "held": self.held, "simulator": self.simulator}
+        return min(errors, key=lambda name: np.nan_to_num(errors[name], nan=np.inf))
+
+
+class Scores:
+    """Errors of the last predictions.
+
+    Args:
+        noise: standard deviation of a coordinate of a marker [m].
+
+    Attributes:
+        pending: predictions that have not come to their end, with unscaled deviations, and the markers (M, 3) that were
+            last seen when they were made [m].
+    """
+
+    def __init__(self, noise: float) -> None:
+        self._noise = noise
+        self.pending: list[tuple[Forecast, FloatArray]] = []
+        self._errors: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)
+        self._ratios: deque[FloatArray] = deque(maxlen=REMEMBERED)
+
+    @property
+    def scale(self) -> float:
+        """Factor of the deviations of predictions by which past ones would have been right."""
+        if len(self._ratios) < _ENOUGH:
+            return 1.0
+        return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
+
+    def compare(self, frame_at_end: Callable[[Forecast], tuple[float, FloatArray] | None]) -> None:
+        """Compares pending predictions with the frames at their end.
+
+        Args:
+            frame_at_end: returns time and markers (M, 3) [m] of the frame in the last step of a prediction, None where
+                it may still come, and raises LookupError where it cannot.
+        """
+        left = []
+        for forecast, seen in self.pending:
+            try:
+                at_end = frame_at_end(forecast)
+            except LookupError:
+                continue
+            if at_end is None:
+                left.append((forecast, seen))
+            else:
+                self._add(forecast, seen, *at_end)
+        self.pending = left
+
+    def _add(self, forecast: Forecast, seen: FloatArray, time: float, frame: FloatArray) -> None:
+        before, end = forecast.times[-2:]
+        share = (end - time) / (end - before)
+        off = frame - ((1.0 - share) * forecast.markers[-1] + share * forecast.markers[-2])
+        usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
+        if not usable.any():
+            return
+        ratio = off[usable] / np.hypot(forecast.deviations[usable], self._noise)
+        twin, held = (1e3 * float(np.linalg.norm(x[usable], axis=1).mean()) for x in (off, frame - seen))
+        self._errors.append((twin, held, float((np.abs(ratio) < _NINETY * self.scale).mean())))
+        self._ratios.append(ratio.ravel())
+
+    def disagreement(self, simulator: float) -> Disagreement | None:
+        """Returns mean errors, beside that of the simulator without markers [mm]; None without predictions."""
+        if not self._errors:
+            return None
+        twin, held, covered = np.mean(self._errors, axis=0)
+        return Disagreement(len(self._errors), float(twin), float(held), simulator, float(covered))

@@ -3,6 +3,7 @@
 import json
 import socket
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,12 +81,12 @@ def test_a_step_is_linear_in_its_vibrations(robot):
     robot = robot._integrated_by("implicit_euler")
     start = robot.begin()
     tangent = StepTangent.of(robot, start, {}, 4)
-    count, h = len(tangent.frequencies), robot.time_step
+    count = len(tangent.frequencies)
     still = robot.step(robot.step(start))
     errors = np.zeros((2, count))
     errors[:, 0] = 2e-4 / tangent.size * np.array([1.0, tangent.frequencies[0]])
     fields = [torch.einsum("r,rni->ni", torch.as_tensor(row).to(still.q), tangent.shapes)[None] for row in errors]
-    moved, linear = shifted(still, *fields, h), errors.ravel()
+    moved, linear = shifted(robot, still, *fields), errors.ravel()
     for _ in range(10):
         moved, still = robot.step(moved), robot.step(still)
         linear = tangent.transition[:, : 2 * count] @ linear
@@ -379,3 +380,54 @@ def test_rare_predictions_are_scored_too(robot, swing):
         if number == 10:
             twin.ahead()
     assert twin.disagreement.predictions == 1
+
+
+def test_predictions_follow_a_plan_of_commands(robot):
+    h, lifted = robot.time_step, [0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]
+    fixed, rest = robot.simulator.body.fixed_vertices, robot.simulator.rest_positions
+    twin = robot.twin(horizon=4 * h)
+    twin.plan([(9 * h, {"base": [0.0] * 6}), (3 * h, {"base": lifted})])
+    twin.take(0.0)
+    ahead = twin.ahead().markers
+    height = ahead[:, fixed, 2] - rest[fixed, 2].numpy()
+    np.testing.assert_allclose(height.mean(axis=1), [0.0, 0.0, 0.0, 0.0, 2e-3], atol=1e-6)
+    twin.take(5 * h)
+    assert float((twin.now.state.q[0, fixed] - rest[fixed]).abs().max()) == 0.0  # a plan is no command
+    with pytest.raises(InputError, match="there is no input 'wind'"):
+        twin.plan([(0.1, {"wind": 1.0})])
+    assert twin.ahead(7 * h).markers[1, fixed[0], 2] - rest[fixed[0], 2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_its_transition_follows_the_body(robot):
+    """In a bent body a step has other derivatives than at rest; after a turn of renewals the twin has them."""
+    robot = robot._integrated_by("implicit_euler")
+    force, estimator = pull(robot, 8.0), robot.twin(modes=4).estimator
+    belief = estimator.begin({})
+    count = len(belief.bias)
+    while belief.turn or belief.transition is estimator.tangent.transition:
+        for _ in range(8):
+            belief = estimator.advance(belief, {"external_force": force})
+    for _ in range(3 * count):
+        belief = estimator.advance(belief, {"external_force": force})
+    moved, faster, pulled = estimator.tangent.changes(range(3 * count))
+    after = robot.step(
+        shifted(robot, belief.state.select([0] * 6 * count), moved, faster), external_force=force + pulled
+    )
+    expected = estimator.tangent.slopes(after, range(3 * count))
+    off, first = (np.abs(x - expected)[:count, :count].max() for x in (belief.transition, estimator.tangent.transition))
+    assert first > 0.03
+    assert off < 0.1 * first
+
+
+def test_it_goes_on_from_the_simulator_where_that_is_closer(robot):
+    still = robot.begin().q[0].numpy()
+    twin = robot.twin(noise=TwinNoise(markers=NOISE))
+    for number in range(40):
+        twin.take(number * robot.time_step, still)
+        _ = twin.now
+        if number == 10:  # a wrong estimate that markers alone would take long to mend
+            belief = twin._belief_at(twin._newest)
+            size = twin.estimator.tangent.size
+            twin._steps[twin._newest].corrected = replace(belief, bias=belief.bias + 0.05 / size, turn=0)
+    assert twin.counts["it went on from the simulator without markers, which was closer"] >= 1
+    assert np.linalg.norm(twin.now.markers - still, axis=1).mean() < 1e-4

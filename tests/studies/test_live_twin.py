@@ -14,7 +14,7 @@ from warp_resphys.robot.loading import load, recorded_trial
 from warp_resphys.studies.live_twin import LiveTwin, TwinSettings
 from warp_resphys.studies.view import Page, _summary
 
-SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4)
+SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False)
 
 
 @pytest.fixture

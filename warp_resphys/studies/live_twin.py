@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +43,7 @@ class TwinSettings(Settings):
     align: bool
     refine: dict[str, Positive]
     noise: Positive = setting(unit="m")
+    planned: bool
 
     def twin_of(self, robot: Robot) -> Twin:
         """Returns a twin with these settings.
@@ -68,6 +69,13 @@ def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
             commands[key] = (series[min(number, len(series) - 1)] if series.ndim == 3 else series).ravel()
         labels = names or [f"vertex_{vertex}" for vertex in range(len(frame))]
         yield Packet(float(moment), dict(zip(labels, frame, strict=True)), commands)
+
+
+def planned_packets(packets: Iterable[Packet]) -> Iterator[Packet]:
+    """Returns packets of which the first has the commands of all as its plan."""
+    first, *others = packets
+    yield replace(first, plan=[(packet.time, packet.inputs) for packet in (first, *others) if packet.inputs])
+    yield from others
 
 
 class LiveTwin:
@@ -109,6 +117,8 @@ class LiveTwin:
         settings, robot = self._settings, self.robot
         self.twin = settings.twin_of(robot)
         self._recorded = self._packets_of_recording()
+        if self._recorded is not None and settings.planned:
+            self._recorded = planned_packets(self._recorded)
         self._next = None if self._recorded is None else next(self._recorded, None)
         self._clock = 0.0 if self._next is None else self._next.time
         self._alignment: Alignment | None = None
@@ -208,6 +218,8 @@ class LiveTwin:
     def _take(self, packet: Packet) -> None:
         for moved in [packet] if not self._settings.align else self._aligned(packet):
             self.twin.take(moved.time, moved.markers or None, **moved.inputs)
+            if moved.plan is not None:
+                self.twin.plan(moved.plan)
             self._seen = moved.markers or self._seen
 
     def _estimated(self) -> None:

@@ -63,9 +63,11 @@ def followed(robot: Robot, name: str, settings: TwinSettings, every: float) -> d
         share ``covered`` by intervals of 90 %, the number of ``predictions``, the ``best`` of the three, and
         ``counts`` of what was wrong.
     """
-    twin = settings.twin_of(robot)
+    twin, packets = settings.twin_of(robot), list(trial_packets(robot, name))
+    if settings.planned:
+        twin.plan((packet.time, packet.inputs) for packet in packets)
     seconds, ahead, next_one = list[float](), list[float](), 0.0
-    for packet in trial_packets(robot, name):
+    for packet in packets:
         began = time.perf_counter()
         twin.take(packet.time, packet.markers, **packet.inputs)
         now = twin.now

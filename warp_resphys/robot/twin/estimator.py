@@ -17,23 +17,26 @@ from typing import Final
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ...energies.strings import PAYLOAD
 from ...io.errors import ConvergenceError, InputError, listed
 from ...learning.parameters import check_names, identifiable_parameters
 from ...stepping.quantity import Quantity
 from ...stepping.state import State
-from ..inputs import FORCE, Given
+from ..inputs import Given
 from ..state import RobotState
 from .kalman import Correction, FloatArray, Gate, conditioned, distances
 from .robots import Steppable
-from .tangent import StepTangent, shifted
+from .tangent import StepTangent, pulled_by, shifted
 
 _DIFFERENCE: Final = 0.05  # of the robots that run beside, in deviations of their parameter
 _OPEN: Final = 1e-3  # least distance of a parameter from a bound that it must not reach, over its first value
 _UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
 _SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
 _WANDER: Final = 1.0  # time after which the force on the body is another [s]
+_TRIED: Final = 0.2  # time over which errors are compared with those of the simulator without markers [s]
+_WORSE: Final = 1.5  # errors over those of the simulator without markers, above which this takes over
 _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
 _MEDIAN: Final = 2.366  # of the squared distance of a marker, chi-squared with three degrees of freedom
 _ADAPTED: Final = 0.2  # share of a frame in the variance of steps, as a power
@@ -80,7 +83,11 @@ class Belief:
         bias: (r,) shift of the equilibrium.
         places: (M, 3) markers from where they are bound [m].
         covariance: (n, n) of the errors of z, w, b, parameters and places.
+        transition: (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step.
+        turn: number of the column of it that the next step renews.
         since: (M,) for how long markers have been left out [s].
+        squares: (2,) mean squared distances of markers from where they were expected, and from the simulator without
+            markers, over the last frames [m^2].
         shaken: factor of the variance that a step adds, by which past frames would have been as far off as expected.
         left: (M, 3) what was left of the distance of markers when they were last believed [m]; NaN for never.
     """
@@ -90,8 +97,11 @@ class Belief:
     bias: FloatArray
     places: FloatArray
     covariance: FloatArray
+    transition: FloatArray
+    turn: int
     since: FloatArray
     left: FloatArray
+    squares: FloatArray
     shaken: float = 1.0
 
 
@@ -177,12 +187,14 @@ class FullEstimator:
         shaken = force * tangent.frequencies * np.sqrt(tangent.frequencies[0] * h / (2.0 * np.pi))
         places = np.full(3 * len(self.labels), noise.placement)
         self._unknown = np.concatenate([shape, shape * tangent.frequencies, force]) ** 2
-        self._initial = np.concatenate([self._unknown, self._prior**2, places**2])
+        self._simulated = np.concatenate([force, force * tangent.frequencies, force]) ** 2
+        self._placed = places**2
+        self._initial = np.concatenate([self._unknown, self._prior**2, self._placed])
         self._added = np.concatenate(
             [
                 np.zeros(len(shape)),
                 shaken**2,
-                force**2 * h / _WANDER,
+                force**2 * -np.expm1(-2.0 * h / _WANDER),
                 self._prior**2 * h / noise.forget,
                 np.zeros(len(places)),
             ]
@@ -213,19 +225,22 @@ class FullEstimator:
             np.zeros(r),
             np.zeros((len(self.labels), 3)),
             np.diag(self._initial),
+            self.tangent.transition,
+            0,
             np.zeros(markers),
             np.full((markers, 3), np.nan),
+            np.zeros(2),
         )
 
     @property
     def _count(self) -> int:
         return 2 + len(self._refined)
 
-    def _at(self, values: FloatArray, inputs: Mapping[str, Given]) -> tuple[Steppable, dict[str, Given]]:
-        """The robot with the parameters of all environments, and its commands."""
-        table = np.tile(values, (self._count, 1))
-        table[1:-1] += np.diag(self._apart)
-        table[-1] = self._first
+    def _at(self, values: FloatArray, inputs: Mapping[str, Given], more: int = 0) -> tuple[Steppable, dict[str, Given]]:
+        """The robot with the parameters of all environments, and some more like the first, and its commands."""
+        table = np.tile(values, (self._count + more, 1))
+        table[1 : self._count - 1] += np.diag(self._apart)
+        table[self._count - 1] = self._first
         columns = dict(zip(self._refined, table.T, strict=True))
         given = dict(inputs)
         if PAYLOAD.name in columns:
@@ -233,27 +248,47 @@ class FullEstimator:
         changed = {name: self.robot.simulator.tensor(column) for name, column in columns.items()}
         return self.robot.with_parameters(**changed) if changed else self.robot, given
 
-    def advance(self, belief: Belief, inputs: Mapping[str, Given]) -> Belief:
+    def advance(self, belief: Belief, inputs: Mapping[str, Given], renew: bool = True) -> Belief:
         """Simulates a step under commands.
+
+        Args:
+            belief: before it.
+            inputs: commands by name.
+            renew: whether to renew a column of the transition, by two environments beside.
 
         Raises:
             InputError: an invalid command.
             ConvergenceError: the step failed.
         """
-        robot, given = self._at(belief.parameters, inputs)
-        pull = torch.einsum("r,rni->ni", self.robot.simulator.tensor(belief.bias), self.tangent.pull)
-        forces = torch.cat([pull.expand(self._count - 1, -1, -1), torch.zeros_like(pull)[None]])
-        state = robot.step(belief.state, **{**given, FORCE: forces}).detach()
-        r = len(belief.bias)
+        tangent, r, more = self.tangent, len(belief.bias), 2 if renew else 0
+        robot, given = self._at(belief.parameters, inputs, more)
+        state, transition = belief.state, belief.transition
+        pull = torch.einsum("r,rni->ni", self.robot.simulator.tensor(belief.bias), tangent.pull)
+        forces = pull.repeat(self._count + more, 1, 1)
+        forces[self._count - 1] = 0.0
+        if renew:
+            changes = tangent.changes([belief.turn])
+            moved, faster, pulled = (F.pad(change, (0, 0, 0, 0, self._count, 0)) for change in changes)
+            state = shifted(robot, state.select([*range(self._count), 0, 0]), moved, faster)
+            forces += pulled
+        state = robot.step(state, **pulled_by(robot, given, forces)).detach()
+        if renew:
+            transition = transition.copy()
+            transition[:, [belief.turn]] = tangent.slopes(state.select([self._count, self._count + 1]), [belief.turn])
+            state = state.select(range(self._count))
         step = np.eye(len(belief.covariance))
-        step[: 2 * r, : 3 * r] = self.tangent.transition
+        step[: 2 * r, : 3 * r] = transition
+        fades = float(np.exp(-self.time_step / _WANDER))
+        step[2 * r : 3 * r] *= fades
         added = self._added * np.where(np.arange(len(step)) < 3 * r, belief.shaken, 1.0)
         covariance = step @ belief.covariance @ step.T + np.diag(added)
         known = slice(3 * r, 3 * r + len(self._prior))
         much = np.sqrt(np.maximum(np.diag(covariance)[known] / self._prior**2, 1.0))
         covariance[known] /= much[:, None]
         covariance[:, known] /= much
-        return replace(belief, state=state, covariance=covariance)
+        turn = (belief.turn + more // 2) % (3 * r)
+        bias = fades * belief.bias
+        return replace(belief, state=state, bias=bias, covariance=covariance, transition=transition, turn=turn)
 
     # Markers
 
@@ -309,14 +344,29 @@ class FullEstimator:
                 more[-belief.places.size :] = np.repeat(np.where(moved, off, 0.0) ** 2, 3)
                 belief = replace(belief, covariance=belief.covariance + np.diag(more))
                 since = np.where(moved, 0.0, since)
-        correction, belief = Correction(seen, refused, moved, restarted, off, apart), replace(belief, since=since)
-        belief = replace(belief, shaken=_shaken(belief.shaken, away))
+        squares, worse = self._compared(belief.squares, off, apart, passed)
+        correction = Correction(seen, refused, moved, restarted, off, apart, worse)
+        belief = replace(belief, since=since, squares=squares, shaken=_shaken(belief.shaken, away))
+        if worse:
+            return self.without_markers(belief), correction
         use = seen & ~refused
         if not use.any():
             return belief, correction
         change, covariance = self._conditioned(belief, slopes[use], residual[use])
         left = np.where(use[:, None], residual - slopes @ change, belief.left)
         return self._changed(replace(belief, covariance=covariance, left=left), change), correction
+
+    def _compared(
+        self, squares: FloatArray, off: FloatArray, apart: FloatArray, passed: float
+    ) -> tuple[FloatArray, bool]:
+        """Returns `Belief.squares` after a frame, and whether the simulator without markers is much better."""
+        seen = np.isfinite(off)
+        if not seen.any():
+            return squares, False
+        now = np.array([np.mean(x[seen] ** 2) for x in (off, apart)])
+        squares = now + np.exp(-passed / _TRIED) * (squares - now)
+        own, other = squares
+        return squares, bool(own > _WORSE**2 * (other + 3.0 * self.noise.markers**2))
 
     def _conditioned(self, belief: Belief, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """`kalman.conditioned` for markers, with more noise where the shape would change by too much at once."""
@@ -329,17 +379,33 @@ class FullEstimator:
         return np.zeros(len(belief.covariance)), belief.covariance
 
     def without_markers(self, belief: Belief) -> Belief:
-        """Returns a belief in the state of the simulator that sees no markers, without a force, and unknown."""
+        """Returns a belief in the state of the simulator that sees no markers, with its errors, and without a force."""
         state = belief.state.select([self._count - 1] * self._count)
-        return replace(self._lost(belief), state=state, bias=np.zeros_like(belief.bias))
+        covariance = self._with_block(belief.covariance, slice(3 * len(belief.bias)), self._simulated)
+        markers = slice(len(covariance) - belief.places.size, None)
+        return replace(
+            belief,
+            state=state,
+            bias=np.zeros_like(belief.bias),
+            places=np.zeros_like(belief.places),
+            covariance=self._with_block(covariance, markers, self._placed),
+            since=np.zeros_like(belief.since),
+            left=np.full_like(belief.left, np.nan),
+            squares=np.zeros(2),
+        )
 
     def _lost(self, belief: Belief) -> Belief:
         """A belief with a state that may be far off."""
-        unknown = 3 * len(belief.bias)
-        covariance = belief.covariance.copy()
-        covariance[:unknown] = covariance[:, :unknown] = 0.0
-        covariance[:unknown, :unknown] = np.diag(self._unknown)
+        covariance = self._with_block(belief.covariance, slice(3 * len(belief.bias)), self._unknown)
         return replace(belief, covariance=covariance)
+
+    @staticmethod
+    def _with_block(covariance: FloatArray, rows: slice, variances: FloatArray) -> FloatArray:
+        """A covariance with independent errors of some variances in some rows."""
+        covariance = covariance.copy()
+        covariance[rows] = covariance[:, rows] = 0.0
+        covariance[rows, rows] = np.diag(variances)
+        return covariance
 
     def _changed(self, belief: Belief, change: FloatArray) -> Belief:
         """Adds a change (n,) of the errors to a belief."""
@@ -357,7 +423,7 @@ class FullEstimator:
         moved, faster = (own * field for field in shapes)
         return replace(
             belief,
-            state=shifted(state, moved, faster, self.time_step),
+            state=shifted(self._at(after, {})[0], state, moved, faster),
             parameters=after,
             bias=belief.bias + b,
             places=belief.places + places.reshape(-1, 3),

@@ -61,7 +61,8 @@ class Correction:
         moved: (M,) markers that have moved on the body, to where they are looked for from now on.
         restarted: whether the body has moved to where markers stayed, so that its state was unknown.
         off: (M,) distances from where the corrected simulator expected them [m], NaN where not seen.
-        free: (M,) distances from the simulator that sees no markers [m]; None if none runs beside.
+        free: (M,) distances from the simulator that sees no markers [m].
+        worse: whether these have been much smaller for a while, so that it went on from there.
     """
 
     seen: BoolArray
@@ -69,7 +70,8 @@ class Correction:
     moved: BoolArray
     restarted: bool
     off: FloatArray
-    free: FloatArray | None = None
+    free: FloatArray
+    worse: bool
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from ...dynamics.simulator import Simulator
+from ...stepping.constants import Constants
 from ..description import Description
 from ..inputs import RobotInput
 from ..state import RobotState
@@ -22,6 +23,7 @@ class Steppable(Protocol):
     labels: tuple[str, ...]
     inputs: dict[str, RobotInput]
     parameters: dict[str, torch.Tensor]
+    constants: Constants
 
     @property
     def is_data_driven(self) -> bool:

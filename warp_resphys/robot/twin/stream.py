@@ -3,7 +3,7 @@
 import json
 import socket
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Self
@@ -19,7 +19,7 @@ from ...io.errors import InputError, ResphysError, listed
 from .robots import Steppable
 
 _LARGEST: Final = 65_535  # bytes of a packet
-_FIELDS: Final = ("time", "markers", "inputs")
+_FIELDS: Final = ("time", "markers", "inputs", "plan")
 _MOST: Final = 1e12  # of numbers in a packet
 _LONGEST: Final = 1000  # packets that wait for the registration
 _KINDS: Final = 30  # of faults that are counted apart
@@ -34,11 +34,13 @@ class Packet:
         time: [s].
         markers: positions (3,) [m] by name, NaN where a marker is not seen; empty without a frame.
         inputs: commands by name, in SI units.
+        plan: times [s] and commands to come; None leaves the last plan.
     """
 
     time: float
     markers: Mapping[str, Any] = field(default_factory=dict)
     inputs: Mapping[str, Any] = field(default_factory=dict)
+    plan: Sequence[tuple[float, Mapping[str, Any]]] | None = None
 
     @classmethod
     def of_text(cls, text: str | bytes) -> Self:
@@ -56,11 +58,12 @@ class Packet:
         for name in content:
             if name not in _FIELDS:
                 raise InputError(f"a packet has the field {name!r}: it may have {listed(_FIELDS)}.")
-        for name in _FIELDS[1:]:
+        for name in _FIELDS[1:3]:
             if not isinstance(content.get(name, {}), dict):
                 raise InputError(f"{name} of a packet is no object: give values by name.")
         markers = {label: _position(label, place) for label, place in content.get("markers", {}).items()}
-        return cls(_number("time", content["time"]), markers, _values(content.get("inputs", {})))
+        plan = None if content.get("plan") is None else _plan(content["plan"])
+        return cls(_number("time", content["time"]), markers, _values(content.get("inputs", {})), plan)
 
 
 def _number(name: str, value: Any) -> float:
@@ -75,6 +78,13 @@ def _position(label: str, place: Any) -> tuple[float, ...]:
     if not isinstance(place, list) or len(place) != 3:
         raise InputError(f"a packet has no position of {label!r}: give x, y and z in m, or null for each.")
     return tuple(np.nan if value is None or value != value else _number(label, value) for value in place)
+
+
+def _plan(content: Any) -> list[tuple[float, dict[str, Any]]]:
+    try:
+        return [(_number("time", entry["time"]), _values(entry["inputs"])) for entry in content]
+    except (TypeError, KeyError, AttributeError):
+        raise InputError("plan of a packet is no list of objects with 'time' and 'inputs'.") from None
 
 
 def _values(inputs: Mapping[str, Any]) -> dict[str, Any]:

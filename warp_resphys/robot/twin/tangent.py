@@ -5,7 +5,7 @@ damping, friction and the integrator. They are as wide as the errors that a twin
 change by more within less, and is clipped.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...energies.materials import VISCOUS
 from ...stepping.integrators import make_integrator
 from ...stepping.state import State
-from ..inputs import FORCE, Given
+from ..inputs import FORCE, Given, InputReader
 from ..state import RobotState
 from .robots import Steppable
 
@@ -38,8 +38,11 @@ class StepTangent:
         shapes: (r, N, 3) of the vibrations, orthonormal in the mass.
         pull: (r, N, 3) forces that shift the equilibrium by one unit of each coordinate [N].
         frequencies: (r,) [rad/s].
-        transition: (2 r, 3 r) of (z, w) after a step by (z, w, b) before it.
+        transition: (2 r, 3 r) of (z, w) after a step by (z, w, b) before it, at rest.
         size: root mean square displacement of the body per unit of a coordinate [m].
+        amounts: (3 r,) of z, w and b in the differences.
+        duals: (3 F, r) from the free vertices to the coordinates.
+        free: (F,) numbers of the free vertices.
     """
 
     shapes: torch.Tensor
@@ -47,6 +50,9 @@ class StepTangent:
     frequencies: FloatArray
     transition: FloatArray
     size: float
+    amounts: FloatArray
+    duals: FloatArray
+    free: torch.Tensor
 
     @classmethod
     def of(cls, robot: Steppable, state: RobotState, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
@@ -58,7 +64,7 @@ class StepTangent:
             inputs: constant commands under which it rests.
             modes: least number r; vibrations of equal frequency are kept together.
         """
-        simulator, h = robot.simulator, robot.time_step
+        simulator = robot.simulator
         elastic = robot.with_parameters(**{name: 0.0 for name in simulator.parameters if name.endswith(VISCOUS)})
         values, vectors, inertia, free = _vibrations(elastic, state, inputs, modes)
         frequencies, count = np.sqrt(np.abs(values)).clip(_SLOWEST), len(values)
@@ -76,30 +82,69 @@ class StepTangent:
         pull = fields(duals * frequencies**2)
         size = float(shapes.norm(dim=2).square().mean().sqrt())
         rest = simulator.rest_positions
-        amount = _STEP * float((rest.amax(0) - rest.amin(0)).max()) / shapes.norm(dim=2).amax(1)  # (r,)
-        base = robot.step(robot.step(state, **inputs), **inputs).detach()
-        rate = amount * simulator.tensor(frequencies)
-        none = torch.zeros_like(shapes)
-        moved = torch.cat([amount[:, None, None] * shapes, none, none])
-        faster = torch.cat([none, rate[:, None, None] * shapes, none])
-        pulled = torch.cat([none, none, amount[:, None, None] * pull])
-        moved, faster, pulled = (torch.cat([fields, -fields]) for fields in (moved, faster, pulled))
-        after = robot.step(shifted(base.repeat(6 * count), moved, faster, h), **{**inputs, FORCE: pulled}).body
+        amount = _STEP * float((rest.amax(0) - rest.amin(0)).max()) / shapes.norm(dim=2).amax(1).cpu().double().numpy()
+        amounts = np.concatenate([amount, amount * frequencies, amount])
         chosen = torch.as_tensor(free, device=rest.device)
-        changes = ((0.5 * (x[: 3 * count] - x[3 * count :])[:, chosen]).flatten(1) for x in (after.q, after.v))
-        response = np.concatenate([x.cpu().double().numpy() @ duals for x in changes], axis=1).T  # (2 r, 3 r)
-        scale = torch.cat([amount, rate, amount]).cpu().double().numpy()
-        return cls(shapes, pull, frequencies, response / scale, size)
+        tangent = cls(shapes, pull, frequencies, np.zeros((2 * count, 3 * count)), size, amounts, duals, chosen)
+        base = robot.step(robot.step(state, **inputs), **inputs).detach()
+        columns = range(3 * count)
+        moved, faster, pulled = tangent.changes(columns)
+        after = robot.step(shifted(robot, base.repeat(6 * count), moved, faster), **pulled_by(robot, inputs, pulled))
+        return replace(tangent, transition=tangent.slopes(after, columns))
+
+    def changes(self, columns: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns displacements [m], velocities [m/s] and forces [N] for C columns of a transition, (2 C, N, 3).
+
+        The first C are those of the columns' `amounts`, the others their opposites.
+        """
+        count, fields = len(self.frequencies), self.shapes.new_zeros(3, len(columns), *self.shapes.shape[1:])
+        for row, column in enumerate(columns):
+            kind, number = divmod(column, count)
+            fields[kind, row] = self.amounts[column] * (self.pull if kind == 2 else self.shapes)[number]
+        moved, faster, pulled = torch.cat([fields, -fields], dim=1)
+        return moved, faster, pulled
+
+    def slopes(self, after: RobotState, columns: Sequence[int]) -> FloatArray:
+        """Returns C columns (2 r, C) of a transition, from 2 C environments after `changes` and a step."""
+        count, environments = len(columns), range(len(after.q))
+        response = 0.5 * self.amplitudes(after.select(environments[count:]), after.select(environments[:count]))
+        return np.asarray(response.T / self.amounts[[*columns]])
+
+    def amplitudes(self, before: RobotState, after: RobotState) -> FloatArray:
+        """Returns (B, 2 r) changes of (z, w) from one state to another."""
+        changes = ((x - y)[:, self.free].flatten(1) for x, y in ((after.q, before.q), (after.v, before.v)))
+        return np.concatenate([x.cpu().double().numpy() @ self.duals for x in changes], axis=1)
 
 
-def shifted(state: RobotState, moved: torch.Tensor, faster: torch.Tensor, time_step: float) -> RobotState:
-    """Returns a state with other positions and velocities, (B, N, 3), and a past that fits them."""
-    body = state.body
+def pulled_by(robot: Steppable, inputs: Mapping[str, Given], forces: torch.Tensor) -> dict[str, Given]:
+    """Returns inputs with forces (B, N, 3) [N] that are added to theirs."""
+    if FORCE in inputs:
+        forces = forces + InputReader(robot.inputs, robot.simulator).field(inputs[FORCE], FORCE)
+    return {**inputs, FORCE: forces}
+
+
+def shifted(
+    robot: Steppable, state: RobotState, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True
+) -> RobotState:
+    """Returns a state with other positions and velocities, and a past that fits them.
+
+    Args:
+        robot: in this state.
+        state: of B environments.
+        moved: (B, N, 3) [m].
+        faster: (B, N, 3) [m/s].
+        at_once: whether the body has only just been moved, so that its material has not relaxed there; else as if it
+            had always been there.
+    """
+    body, memory = state.body, dict(state.body.memory)
     q, v = body.q + moved, body.v + faster
+    if at_once and memory:
+        after, before = (robot.simulator.remember(body, x, robot.constants).memory for x in (q, body.q))
+        memory = {name: value + (after[name] - before[name]) for name, value in memory.items()}
     previous = None
     if body.previous is not None:
-        previous = body.previous[0] + moved - time_step * faster, body.previous[1] + faster
-    return replace(state, body=State(q, v, previous, body.memory))
+        previous = body.previous[0] + moved - robot.time_step * faster, body.previous[1] + faster
+    return replace(state, body=State(q, v, previous, memory))
 
 
 def _vibrations(

@@ -2,7 +2,7 @@
 
 from bisect import insort
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Final
@@ -86,6 +86,7 @@ class Twin:
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
+        self._planned: list[tuple[float, dict[str, Given]]] = []
         self._steps: dict[int, _Interval] = {}
         self._refined: FloatArray | None = None
         self._packets = self._stale = 0
@@ -122,9 +123,7 @@ class Twin:
         Raises:
             InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
         """
-        if not isinstance(time, Real) or not abs(time) < _LATEST:
-            raise InputError(f"a packet has the time {time}: give seconds.")
-        commands: dict[str, Given] = {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
+        commands = self._read(time, inputs)
         self._packets += 1
         frame = None if markers is None else self._frame(markers)
         if self._origin is None or self._is_other_clock(time):
@@ -155,6 +154,22 @@ class Twin:
             self._done = min(self._done, number - 1)
             self._simulated = min(self._simulated, number)
         return True
+
+    def plan(self, commands: Iterable[tuple[float, Mapping[str, Given]]]) -> None:
+        """Announces commands, for predictions only: what acts is what packets say. It replaces the last plan.
+
+        Args:
+            commands: times on the clock of the packets [s], and commands by name that will hold from then on.
+
+        Raises:
+            InputError: no time, or an unknown input or values that it cannot have; the last plan stays.
+        """
+        self._planned = sorted(((at, self._read(at, values)) for at, values in commands), key=lambda entry: entry[0])
+
+    def _read(self, time: float, inputs: Mapping[str, Given]) -> dict[str, Given]:
+        if not isinstance(time, Real) or not abs(time) < _LATEST:
+            raise InputError(f"a packet has the time {time}: give seconds.")
+        return {name: self._reader.read(name, value, 1) for name, value in inputs.items()}
 
     def restart(self, why: str) -> None:
         """Starts again with the next packet, from rest and with the refined parameters; `counts` has the reason."""
@@ -304,7 +319,7 @@ class Twin:
         """Counts what happened in a step that no packet can change any more."""
         for _, correction in interval.corrections:
             self._tell(correction, self._counts)
-            if correction.free is not None and np.isfinite(correction.free).any():
+            if np.isfinite(correction.free).any():
                 self._free.append(1e3 * float(np.nanmean(correction.free)))
 
     def _tell(self, correction: Correction, counts: Faults) -> None:
@@ -313,6 +328,8 @@ class Twin:
                 counts.add(f"{self.labels[number] if self.labels else 'a vertex'} {word}")
         if correction.restarted:
             counts.add(JUMPS)
+        if correction.worse:
+            counts.add("it went on from the simulator without markers, which was closer")
 
     @property
     def has_begun(self) -> bool:
@@ -350,9 +367,9 @@ class Twin:
         return dict(counts)
 
     def ahead(self, seconds: float | None = None, **inputs: Given) -> Forecast:
-        """Simulates what comes, under the last commands or others.
+        """Simulates what comes, under the last commands and those of the `plan`, or under others.
 
-        Predictions under the last commands are compared with the markers that come (`disagreement`).
+        Predictions without other commands are compared with the markers that come (`disagreement`).
 
         Args:
             seconds: `horizon` if omitted.
@@ -366,18 +383,21 @@ class Twin:
             raise InputError(f"seconds is {seconds}: give the length of the prediction, more than zero.")
         belief = self._belief_at(self._update())
         assert self._origin is not None
-        commands = {**self._commanded(np.inf), **inputs}
+        held, now = self._commanded(np.inf), self._origin + self._newest * self._h
+        planned = [entry for entry in self._planned if entry[0] > now - _ROUNDING * self._h]
         steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - _ROUNDING)), 1)
         markers, state = [self.estimator.markers(belief)[0]], belief
         with torch.no_grad():
-            for _ in range(steps):
+            for number in range(steps):
+                while planned and planned[0][0] <= now + (number + _ROUNDING) * self._h:
+                    held = held | planned.pop(0)[1]
                 try:
-                    state = self.estimator.advance(state, commands)
+                    state = self.estimator.advance(state, {**held, **inputs}, renew=False)
                 except ConvergenceError:
                     self._counts.add("predictions that failed")
                     raise
                 markers.append(self.estimator.markers(state)[0])
-        times = self._origin + self._h * (self._newest + np.arange(steps + 1, dtype=np.float64))
+        times = now + self._h * np.arange(steps + 1, dtype=np.float64)
         deviations = self.estimator.markers(state)[1]
         prediction = Forecast(times, np.stack(markers), self._scores.scale * deviations, state.state.select([0]))
         seen = self._last_seen()

@@ -42,6 +42,33 @@ def strain_adjoint(
     stress_out[b, p] = f * (HALF * (w + wp.transpose(w)))
 
 
+@wp.func
+def add_strain_tangent(
+    f: wp.mat33d, stress: wp.mat33d, shape: wp.float64, volume: wp.float64, out: wp.array[wp.mat33d]
+):
+    """Adds the blocks of F S(E), with S = 2 mu E + lambda tr(E) I and its value `stress`."""
+    columns = wp.transpose(f)
+    left = shape * (f * columns)
+    for k in range(3):
+        for n in range(k + 1):
+            block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(columns[k], columns[n])
+            if k == n:
+                block += left
+            block[0, 0] += stress[k, n]
+            block[1, 1] += stress[k, n]
+            block[2, 2] += stress[k, n]
+            out[(k * (k + 1)) / 2 + n] += block
+
+
+@wp.func
+def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
+    """Adds the blocks of a factor times the product of a matrix with itself."""
+    columns = wp.transpose(a)
+    for k in range(3):
+        for n in range(k + 1):
+            out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
+
+
 @functools.cache
 def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
@@ -98,31 +125,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         stress_out[b, p] = stress
         energy_out[b, p] = energy
 
-    @wp.func(module=module)
-    def add_viscous_tangent(
-        f: wp.mat33d, stress: wp.mat33d, shape: wp.float64, volume: wp.float64, out: wp.array[wp.mat33d]
-    ):
-        """Adds the blocks of F S(E), with S = 2 mu E + lambda tr(E) I and its value `stress`."""
-        columns = wp.transpose(f)
-        left = shape * (f * columns)
-        for k in range(3):
-            for n in range(k + 1):
-                block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(columns[k], columns[n])
-                if k == n:
-                    block += left
-                block[0, 0] += stress[k, n]
-                block[1, 1] += stress[k, n]
-                block[2, 2] += stress[k, n]
-                out[(k * (k + 1)) / 2 + n] += block
-
-    @wp.func(module=module)
-    def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
-        """Adds the blocks of a factor times the product of a matrix with itself."""
-        columns = wp.transpose(a)
-        for k in range(3):
-            for n in range(k + 1):
-                out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
-
     @wp.kernel(module=module)
     def tangent(
         active: wp.array[int],
@@ -161,7 +163,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             if clamp[b] != 0:
                 # The stress part of the viscous Hessian may be indefinite and is dropped in a clamped Hessian.
                 stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-            add_viscous_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
+            add_strain_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
 
     @wp.kernel(module=module)
     def adjoint(

@@ -129,7 +129,7 @@ def check_reducible(robot: Robot) -> None:
     """Refuses a robot that cannot be reduced.
 
     Raises:
-        InputError: a data-driven robot, one without markers, with a moving base or a viscoelastic material, or whose
+        InputError: a data-driven robot, one without markers, with a moving base or a material with memory, or whose
             network is recurrent or nodal.
     """
     description = robot.description
@@ -139,8 +139,11 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"{description.name} has no markers: control follows markers of the robot.")
     if description.told_of_base is not None:
         raise InputError(f"the base of {description.name} moves: control is for robots with a fixed base.")
-    if any(material.prony for material in robot.simulator.materials.values()):
-        raise InputError("a viscoelastic material cannot be reduced: remove its Prony branches (material.prony).")
+    if any(material.prony or material.hysteresis for material in robot.simulator.materials.values()):
+        raise InputError(
+            "a material with memory cannot be reduced: remove its Prony branches and sliders (material.prony, "
+            "material.hysteresis)."
+        )
     network = None if description.learned is None else description.learned.network
     if network is not None and network.recurrent is not None:
         raise InputError("a recurrent network cannot be reduced: train one without a recurrent state.")

@@ -4,6 +4,7 @@ An energy has its own names (``youngs_modulus``). If a simulator has several ene
 two regions, their names in the simulator have a prefix (``tip_youngs_modulus``), which is added and removed only here.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -80,6 +81,7 @@ class EnergySet:
             for name in ("load", "begin_step", "at_pose")
         )
         self._remembering = [(i, pair) for i, pair in pairs if pair[1].memory]
+        self._rate_independent = [(i, pair) for i, pair in self._remembering if pair[1].rate_independent]
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
         """Returns the values that follow from the parameters, by name, and the mass of the body."""
@@ -120,9 +122,15 @@ class EnergySet:
             values |= placed.named(bound.begin_step(placed.step(state, stage, inputs, constants, terms[i])))
         return values
 
-    def at_rest(self, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns these values for a static equilibrium."""
-        return {k: v for placed, bound in self._pairs for k, v in placed.named(bound.at_rest(batch)).items()}
+    def at_rest(
+        self, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]
+    ) -> dict[str, torch.Tensor | None]:
+        """Returns these values for a static equilibrium after a state."""
+        values = {k: v for p, bound in self._pairs for k, v in p.named(bound.at_rest(state.batch)).items()}
+        for i, (placed, bound) in self._rate_independent:
+            step = placed.step(state, _endless_stage(state), inputs, constants, terms[i])
+            values |= placed.named(bound.begin_step(step))
+        return values
 
     @property
     def follow_pose(self) -> bool:
@@ -148,8 +156,29 @@ class EnergySet:
         q: torch.Tensor,
     ) -> dict[str, torch.Tensor]:
         """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each."""
+        return self._remembered(self._remembering, state, stage, inputs, constants, terms, x, q)
+
+    def end_pose(
+        self, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term], q: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Returns the memory variables of a static equilibrium (B, N, 3) after a state."""
+        return self._remembered(
+            self._rate_independent, state, _endless_stage(state), inputs, constants, terms, q, q
+        )
+
+    @staticmethod
+    def _remembered(
+        remembering: Sequence[tuple[int, tuple[PlacedEnergy, BoundEnergy]]],
+        state: State,
+        stage: ImplicitStage,
+        inputs: Inputs,
+        constants: Constants,
+        terms: Sequence[Term],
+        x: torch.Tensor,
+        q: torch.Tensor,
+    ) -> dict[str, torch.Tensor]:
         memory: dict[str, torch.Tensor] = {}
-        for i, (placed, bound) in self._remembering:
+        for i, (placed, bound) in remembering:
             memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, terms[i]), x, q))
         return memory
 
@@ -176,3 +205,8 @@ class EnergySet:
                     f"Unknown memory {name!r} of the state. The energies of this body remember {names}; leave it out."
                 )
             self.memory[name].check(values, batch, like)
+
+
+def _endless_stage(state: State) -> ImplicitStage:
+    """Returns the stage of a static equilibrium after a state: a step without end, in which inertia has no part."""
+    return ImplicitStage(math.inf, state.q, state.q, ())

@@ -71,27 +71,34 @@ class PotentialTerms:
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
     def at_rest(
-        self, rest: torch.Tensor, inputs: Inputs, constants: Constants, share: float, near: torch.Tensor | None = None
+        self,
+        state: State,
+        inputs: Inputs,
+        constants: Constants,
+        terms: Sequence[Term],
+        share: float,
+        near: torch.Tensor | None = None,
     ) -> StepTerms:
-        """Returns the terms of a static equilibrium of the shape ``rest`` (B, N, 3), under a fraction of all loads.
+        """Returns the terms of a static equilibrium after a state, under a fraction of all loads.
 
         Args:
-            rest: the undeformed shape [m].
+            state: the state before, whose positions matter only to its memory.
             inputs: constant inputs.
             constants: prepared constants.
+            terms: the energies' kernels for the batch.
             share: the fraction.
             near: (B, N, 3) positions of forces that depend on the pose; without, these are left out [m].
         """
-        batch = len(rest)
+        batch = state.batch
         values = self._energies.values(constants, inputs, batch)
         for name in self._energies.inputs:
             value = values[name]
             values[name] = None if value is None else share * value
-        values |= self._energies.at_rest(batch)
+        values |= self._energies.at_rest(state, inputs, constants, terms)
         if near is not None:
             values |= self._energies.at_pose(near, values)
         force = self._coordinates.reduce(self._loads(inputs, constants, batch, True).expand(batch, -1, -1))
-        return StepTerms(rest, rest.new_zeros(rest.shape[:2]), share * force, values)
+        return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
 
     def _loads(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor:
         """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""

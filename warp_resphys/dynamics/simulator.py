@@ -304,8 +304,12 @@ class Simulator:
         parameters: Parameters | Constants | None = None,
         start: torch.Tensor | None = None,
         batch: int | None = None,
+        after: State | None = None,
     ) -> State:
         """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
+
+        Friction without rate, as of `energies.hysteresis`, makes it depend on the poses before. The state that is
+        returned has the memory of such energies; that of others is of a body long at rest.
 
         Args:
             inputs: constant inputs.
@@ -313,6 +317,8 @@ class Simulator:
             start: (B, N, 3) initial guess [m]; the rest shape if omitted. If Newton's method does not converge from it
                 in 100 iterations, loads, inputs and motion of the fixed vertices are increased in steps.
             batch: number of environments, if no other argument implies it.
+            after: state whose memory of friction without rate the equilibrium continues; the undeformed body if
+                omitted.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
@@ -325,42 +331,45 @@ class Simulator:
         constants = self.prepare(parameters)
         if batch is None:
             given = [*inputs.fields.values(), *([] if start is None else [start])]
-            batch = max([len(t) for t in given] + [constants.batch])
-        state = self.rest_state(batch)
+            batch = max([len(t) for t in given] + [constants.batch] + ([] if after is None else [after.batch]))
+        state = self.rest_state(batch) if after is None else after
         self._checked(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
-        solve = partial(self._balance, inputs, constants, state.q)
+        solve = partial(self._balance, inputs, constants, state)
         limited = self.settings.max_iterations < MOST_ITERATIONS
-        guess = state.q if start is None else start.detach()
-        if not self._energies.follow_pose:
-            x = find_equilibrium(solve, state.q, guess, limited)
-            return State(x, torch.zeros_like(x))
-        try:
-            x = find_equilibrium(partial(solve, near=guess), state.q, guess, limited)
-        except ConvergenceError:  # The guess is far away.
-            x = find_equilibrium(solve, state.q, guess, limited)
-        x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
-        return State(x, torch.zeros_like(x))
+        rest = self.rest_positions.expand_as(state.q)
+        guess = state.q.detach() if start is None else start.detach()
+        if self._energies.follow_pose:
+            try:
+                x = find_equilibrium(partial(solve, near=guess), rest, guess, limited)
+            except ConvergenceError:  # The guess is far away.
+                x = find_equilibrium(solve, rest, guess, limited)
+            x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
+        else:
+            x = find_equilibrium(solve, rest, guess, limited)
+        terms = self.workspace(state.batch).potential.energies
+        return State(x, torch.zeros_like(x), memory=self._energies.end_pose(state, inputs, constants, terms, x))
 
     def _balance(
         self,
         inputs: Inputs,
         constants: Constants,
-        rest: torch.Tensor,
+        state: State,
         share: float,
         start: torch.Tensor,
         near: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) under a fraction of all loads, inputs and motion of the clamp [m].
+        """Returns the equilibrium (B, N, 3) after a state, under a fraction of all loads, inputs and motion of the clamp [m].
 
         Forces that depend on the pose without a potential are those ``near`` (B, N, 3); without, they are left out.
         """
-        workspace, clamp = self.workspace(len(rest)), rest[:, self.fixed]
+        workspace = self.workspace(state.batch)
+        clamp = self.rest_positions[self.fixed].expand(state.batch, -1, -1)
         most = min(self.settings.max_iterations, MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        terms = self._terms.at_rest(rest, inputs, constants, share, near)
+        terms = self._terms.at_rest(state, inputs, constants, workspace.potential.energies, share, near)
         x, report = equilibrium(workspace, "statics", settings, terms, start, at)
         check_converged(settings, report, x)
         return self._coordinates.expand(x), report

@@ -231,9 +231,12 @@ class BoundEnergy:
 
     Attributes:
         memory: memory variables.
+        rate_independent: whether a step depends on no time. Then a static equilibrium is a step too, with memory, and
+            `at_rest` is not used.
     """
 
     memory: tuple[Memory, ...] = ()
+    rate_independent: bool = False
 
     def __init__(self, energy: Energy, site: EnergySite) -> None:
         self.energy, self.site = energy, site

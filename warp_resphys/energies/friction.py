@@ -52,6 +52,7 @@ class BristleFriction(PointwiseEnergy):
     step_values: ClassVar[tuple[str, ...]] = ("deflection", "length")
     density: ClassVar = bristle_energy
     size: ClassVar[float] = 1e-4
+    rate_independent: ClassVar[bool] = True
 
     pairs: ArrayLike  # (L, 2) end vertices of each line
     friction_force: Parameter  # F_c [N]: a number, (L,), (B, 1) or (B, L) values

@@ -43,11 +43,13 @@ MASS_DAMPING: Final = "mass_damping"
 # constants of viscosity, whose names end so if they are those of a region
 VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 _PRONY_TIME = Quantity("prony_time", "s", 0.0)
+_YIELD_STRAIN = Quantity("hysteresis_strain", "", 0.0)
+_ITEMS: Final = {"prony": "branch", "hysteresis": "slider", "fibres": "family"}  # of groups
 
 
 @dataclass(frozen=True)
 class Material(ABC):
-    """An elastic material with Rayleigh damping and relaxation.
+    """An elastic material with Rayleigh damping, relaxation and hysteresis.
 
     Elastic constants and density are numbers, (M,) tensors with one value per element, (B, 1) tensors with one value
     per environment, or (B, M) tensors; damping constants are numbers or (B,) tensors. Every simulated quantity is
@@ -62,7 +64,8 @@ class Material(ABC):
     curvature: ClassVar[tuple[float, ...]]
     # constants of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
-        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), _PRONY_TIME)
+        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), _PRONY_TIME),
+        "hysteresis": (Quantity("hysteresis_ratio", "", 0.0, closed=True), _YIELD_STRAIN),
     }
 
     density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
@@ -73,6 +76,8 @@ class Material(ABC):
     # generalised Maxwell (Prony) branches: ratio of the shear modulus to the long-term modulus mu, and relaxation time
     # [s] (`energies.viscosity`)
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
+    # sliders of rate-independent friction: ratio of the shear modulus to mu, and yield strain (`energies.hysteresis`)
+    hysteresis: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Raises InputError for a constant outside its physical range."""
@@ -81,7 +86,7 @@ class Material(ABC):
             if not all(isinstance(item, Sequence) and len(item) == len(own) for item in items):
                 names = ", ".join(q.name.partition("_")[2] for q in own)
                 units = " and ".join(q.unit or "-" for q in own)
-                raise InputError(f"{group} is {items!r}: give a ({names}) for each {self._item(group)}, {units}.")
+                raise InputError(f"{group} is {items!r}: give a ({names}) for each {_ITEMS[group]}, {units}.")
         constants = self.constants
         for name, quantity in self.quantities.items():
             quantity.check(constants[name])
@@ -133,7 +138,7 @@ class Material(ABC):
             items = [[f"{q.name}_{k}" for q in quantities] for k in range(1, 1 + count)]
             if given != {*chain.from_iterable(items)}:
                 raise InputError(
-                    f"{group} has {', '.join(sorted(given))}: give each {cls._item(group)}, numbered from 1, its "
+                    f"{group} has {', '.join(sorted(given))}: give each {_ITEMS[group]}, numbered from 1, its "
                     f"{' and its '.join(f'{q.name}_' for q in quantities)}."
                 )
             groups[group] = [tuple(values.pop(name) for name in item) for item in items]
@@ -143,10 +148,6 @@ class Material(ABC):
                 known, model = ", ".join((*own, *numbered, "...")), cls.model or cls.__name__
                 raise InputError(f"{model} has no constant {name!r}: it has {known}")
         return {**values, **groups}
-
-    @staticmethod
-    def _item(group: str) -> str:
-        return "branch" if group == "prony" else "family"
 
     def group(self, name: str, constants: Mapping[str, torch.Tensor]) -> list[tuple[torch.Tensor, ...]]:
         """Returns the constants of each item of a group."""
@@ -315,7 +316,7 @@ class ConvexMaterial(Material):
     """Rubber of terms with non-negative coefficients: powers of invariants, Ogden's terms, and families of fibres.
 
     With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
-    that of Ogden (1972). Viscosities and branches have moduli of their own, independent of the elastic coefficients, so
+    that of Ogden (1972). Viscosities, branches and sliders have moduli of their own, independent of the elastic coefficients, so
     that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities and branches are quadratic
     in the strain of Green, and outside of that argument. Coefficients are zero by default, but for `bulk_1`.
 
@@ -329,11 +330,13 @@ class ConvexMaterial(Material):
         ogden: shear moduli [Pa] of Ogden's terms at small strains, by exponent, a whole number.
         fibres: families of fibres, see `FibreFamily`.
         prony: moduli [Pa] and relaxation times [s] of branches.
+        hysteresis: moduli [Pa] and yield strains of sliders.
     """
 
     model = "law"
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
         "prony": (Quantity("prony_modulus", "Pa", 0.0, closed=True), _PRONY_TIME),
+        "hysteresis": (Quantity("hysteresis_modulus", "Pa", 0.0, closed=True), _YIELD_STRAIN),
         "fibres": (
             Quantity("fibre_azimuth", "rad", per="element"),
             Quantity("fibre_elevation", "rad", per="element"),

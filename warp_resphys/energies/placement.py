@@ -6,6 +6,7 @@ from typing import Any, cast
 from ..fem.body import Body
 from ..io.errors import InputError
 from .base import Energy
+from .hysteresis import Hysteresis
 from .materials import Material
 from .placed import PlacedEnergy
 from .rigid import PointInertia, rigid_energies
@@ -27,7 +28,7 @@ def joined_names(materials: Material | Materials) -> dict[str, Material]:
 
 
 def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEnergy]:
-    """Returns the energies of all bodies: solids, rigid parts, and the bodies' own energies.
+    """Returns the energies of all bodies: solids and their hysteresis, rigid parts, and the bodies' own energies.
 
     Args:
         whole: a body, or a `fem.scene.Scene`.
@@ -41,6 +42,8 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
         prefix = f"{name}_" if name else ""
         solids = solids_of(body, _material_of(material, name))
         energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
+        sliding = [(Hysteresis(solid), f"{prefix}{region}") for solid, region in solids if solid.material.hysteresis]
+        energies += sliding
         for part in body.controls:
             energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
         items: list[tuple[Energy, Any, str]] = [(energy, energy.points(body.mesh), own) for energy, own in energies]

@@ -46,6 +46,7 @@ class PointwiseEnergy(Energy):
         size: typical size of f, for the step of finite differences.
         memory: memory variables of a point.
         step_values: names of the results of `begin_step`; those of the memory if empty.
+        rate_independent: as for `BoundEnergy`.
     """
 
     implicit_only: ClassVar[bool] = True
@@ -54,6 +55,7 @@ class PointwiseEnergy(Energy):
     size: ClassVar[float] = 1.0
     memory: ClassVar[tuple[Quantity, ...]] = ()
     step_values: ClassVar[tuple[str, ...]] = ()
+    rate_independent: ClassVar[bool] = False
 
     @abstractmethod
     @override
@@ -116,7 +118,7 @@ class BoundPointwise(BoundEnergy):
         super().__init__(energy, site)
         (points,) = site.points
         assert isinstance(points, PartPoints)
-        self._pointwise = energy
+        self._pointwise, self.rate_independent = energy, energy.rate_independent
         self._nodes = torch.as_tensor(points.nodes, device=site.rest_positions.device)
         self._operators = site.tensor(points.gradients)  # (C, Q, K, 1 or 3)
         self._part = torch.as_tensor(points.part, device=site.rest_positions.device)

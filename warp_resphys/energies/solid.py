@@ -1,8 +1,8 @@
 """Energy of a solid: elasticity, and viscosity (Kelvin-Voigt and generalised Maxwell)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -19,9 +19,10 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import Material
+from .strain import GreenStrain, StrainTerm
 from .viscosity import Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
@@ -141,6 +142,29 @@ def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
     return {"shape": points.shape_volume, "volume": points.volume_volume, "mean": mean}
 
 
+class PointModuli:
+    """Moduli of a solid's material, times the volumes of its points or as means over these.
+
+    Args:
+        solid: the solid.
+        site: the simulator.
+    """
+
+    def __init__(self, solid: Solid, site: EnergySite) -> None:
+        self._material, like = solid.material, site.rest_positions
+        shares = [_shares(s) for s in solid.discretisation.point_sets]
+        self._shares = {
+            rule: device_matrix(scipy.sparse.vstack([by_rule[rule] for by_rule in shares]), like.device, like.dtype)
+            for rule in set(solid.material.rules)
+        }
+
+    def __call__(self, parameters: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Returns the values (1 or B, P, T), which are mostly in J."""
+        moduli = torch.broadcast_tensors(*self._material.moduli(parameters))
+        rules = zip(self._material.rules, moduli, strict=True)
+        return torch.stack([spread(self._shares[rule], m) for rule, m in rules], dim=-1)
+
+
 class BoundSolid(BoundEnergy):
     """A solid in a simulator: stiffness, mass, and viscous strain."""
 
@@ -148,11 +172,7 @@ class BoundSolid(BoundEnergy):
         super().__init__(solid, site)
         self._solid = solid
         like, sets = site.rest_positions, solid.discretisation.point_sets
-        shares = [_shares(s) for s in sets]
-        self._shares = {
-            rule: device_matrix(scipy.sparse.vstack([by_rule[rule] for by_rule in shares]), like.device, like.dtype)
-            for rule in set(solid.material.rules)
-        }
+        self._moduli = PointModuli(solid, site)
         cells = slice(None) if solid.cells is None else solid.cells
         self._mass_volume, self._load_volume = (
             device_matrix(matrix[:, cells], like.device, like.dtype) for matrix in (site.mass_volume, site.load_volume)
@@ -163,8 +183,6 @@ class BoundSolid(BoundEnergy):
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
         material = self._solid.material
-        moduli = torch.broadcast_tensors(*material.moduli(parameters))
-        spreads = [spread(self._shares[rule], m) for rule, m in zip(material.rules, moduli, strict=True)]
         damping = torch.cat(torch.broadcast_tensors(*material.viscosity(parameters)), 1)
         ratio = time = None
         if material.prony:
@@ -174,7 +192,7 @@ class BoundSolid(BoundEnergy):
                 ratio = time = None
         damped = damping.requires_grad or bool((damping > 0).any())
         return {
-            "stiffness": torch.stack(spreads, dim=-1),
+            "stiffness": self._moduli(parameters),
             "damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,
@@ -213,7 +231,7 @@ class BoundSolid(BoundEnergy):
         return {VISCOUS_STRAIN: viscosity.relax(strain, step.state.q, carried, q, self.site.time_step)}
 
 
-class SolidTerm(Term):
+class SolidTerm(StrainTerm):
     """Kernels of a solid, whose points have the volumes ``carried`` (P, T) for each modulus of the material [m^3]."""
 
     def __init__(
@@ -286,76 +304,3 @@ class SolidTerm(Term):
             return {name: slope.sum(1) if name in sums else slope.clone() for name, slope in out.items()}
 
         return differentiate
-
-    def strain(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3)."""
-        return self._strain(positions)
-
-    @cached_property
-    def _strain(self) -> Callable[[torch.Tensor], torch.Tensor]:
-        """`strain`, recorded at its first use."""
-        own = self.launcher
-        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
-        view = warp_view(at, wp.vec3d)
-        commands = [
-            own.record(
-                kernels.strain,
-                (own.batch, s.n_points),
-                [s.nodes, s.gradients, s.points_per_cell, view],
-                [warp_view(out[:, s.own], wp.mat33d)],
-            )
-            for s in self.sets
-        ]
-        recorded = own.capture(*commands)
-
-        def strain(positions: torch.Tensor) -> torch.Tensor:
-            at.copy_(positions)
-            own.launch(recorded)
-            return out.clone()
-
-        return strain
-
-    def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
-        """Returns the vector-Jacobian product (B, N, 3) of `strain` with (B, P, 3, 3)."""
-        return self._strain_adjoint(positions, adjoint)
-
-    @cached_property
-    def _strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """`strain_adjoint`, recorded at its first use."""
-        own = self.launcher
-        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.sets[0].n_vertices, 3)
-        along, stress = own.zeros(self.n_points, 3, 3), own.zeros(self.n_points, 3, 3)
-        place, commands = warp_view(at, wp.vec3d), []
-        for s in self.sets:
-            direction, view = (warp_view(values[:, s.own], wp.mat33d) for values in (along, stress))
-            inputs = [s.nodes, s.gradients, s.points_per_cell, place, direction]
-            commands.append(own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view]))
-            commands.append(own.gather(s, view, out))
-        recorded = own.capture(*commands)
-
-        def product(positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
-            at.copy_(positions)
-            along.copy_(adjoint)
-            out.zero_()
-            own.launch(recorded)
-            return out.clone()
-
-        return product
-
-
-class GreenStrain(torch.autograd.Function):
-    """Green strain E = (F^T F - I) / 2 at every point, from (B, N, 3) to (B, P, 3, 3)."""
-
-    @override
-    @staticmethod
-    def forward(ctx: Any, term: SolidTerm, positions: torch.Tensor) -> torch.Tensor:
-        ctx.term = term
-        ctx.save_for_backward(positions)
-        return term.strain(positions.detach().double())
-
-    @override
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
-        (positions,) = ctx.saved_tensors
-        return None, ctx.term.strain_adjoint(positions.to(gradient.dtype), gradient)

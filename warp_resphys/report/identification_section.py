@@ -179,7 +179,7 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Return name, unit and factor of a parameter, including those of tendons, Prony branches, inputs and regions."""
+    """Return name, unit and factor of a parameter, including those of tendons, Prony branches, sliders, inputs and regions."""
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]
@@ -193,6 +193,9 @@ def parameter_wording(parameter: str) -> Wording:
     if branch := re.fullmatch(r"prony_(ratio|time)_(\d+)", parameter):
         kind, number = branch.groups()
         return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
+    if slider := re.fullmatch(r"hysteresis_(ratio|strain)_(\d+)", parameter):
+        kind, number = slider.groups()
+        return f"{'Yield strain' if kind == 'strain' else 'Hysteresis ratio'} {number}", "", 1.0
     region = next((parameter.removesuffix(f"_{name}") for name in _MATERIAL if parameter.endswith(f"_{name}")), "")
     if region:
         kind, unit, factor = _PARAMETERS[parameter.removeprefix(f"{region}_")]

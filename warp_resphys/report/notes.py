@@ -212,9 +212,10 @@ def differences(settings: RunSettings, target: TargetSettings) -> list[str]:
 
 
 def _damping(material: MaterialSettings) -> dict[str, float]:
-    """Constants of the viscosity of a material that are not zero."""
-    viscous = {name: value for name, value in material.parameters.items() if "damping" in name or "prony" in name}
-    return {name: value for name, value in viscous.items() if value}
+    """Constants of viscosity and hysteresis of a material that are not zero."""
+    kinds = ("damping", "prony", "hysteresis")
+    own = {name: value for name, value in material.parameters.items() if any(kind in name for kind in kinds)}
+    return {name: value for name, value in own.items() if value}
 
 
 def in_a_row(words: Sequence[str]) -> str:

@@ -34,6 +34,7 @@ def local_step(
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],  # (B, P) [J]
 ):
+    """Stress F S and energy of all sliders."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -63,6 +64,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
 ):
+    """Derivative of F S by F."""
     b, p = wp.tid()
     if active[b] == 0:
         return

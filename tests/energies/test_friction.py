@@ -67,6 +67,19 @@ def test_the_force_on_a_vertex_is_that_of_the_bristles(slide):
     np.testing.assert_allclose(acting - absent, [expected, 0.0, 0.0], atol=1e-9)
 
 
+def test_a_pose_stays_where_friction_holds_it():
+    """A static equilibrium is a step: none without loads, and one after another pose keeps a deflection."""
+    s = simulator([[LEFT[0], RIGHT[0]], [LEFT[3], RIGHT[3]]])
+    torch.testing.assert_close(s.static_equilibrium().q[0], s.rest_positions, rtol=0.0, atol=1e-12)
+    force = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64)
+    force[:, RIGHT, 0] = 1.0
+    pulled_out = s.static_equilibrium(Inputs(force))
+    left = s.static_equilibrium(after=pulled_out)
+    slides = [float((state.q[0, RIGHT] - s.rest_positions[RIGHT])[:, 0].mean()) for state in (pulled_out, left)]
+    assert 0.01 * slides[0] < slides[1] < slides[0]
+    assert left.memory["bristle_deflection"].shape == (1, 2)
+
+
 @pytest.mark.parametrize(
     ("integrator", "pairs"),
     [("implicit_euler", [[LEFT[0], RIGHT[0]]]), ("midpoint", [[LEFT[0], RIGHT[0]], [LEFT[1], RIGHT[2]]])],

@@ -162,9 +162,7 @@ class EnergySet:
         self, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term], q: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """Returns the memory variables of a static equilibrium (B, N, 3) after a state."""
-        return self._remembered(
-            self._rate_independent, state, _endless_stage(state), inputs, constants, terms, q, q
-        )
+        return self._remembered(self._rate_independent, state, _endless_stage(state), inputs, constants, terms, q, q)
 
     @staticmethod
     def _remembered(

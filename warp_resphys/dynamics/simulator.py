@@ -360,7 +360,7 @@ class Simulator:
         start: torch.Tensor,
         near: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) after a state, under a fraction of all loads, inputs and motion of the clamp [m].
+        """Returns the equilibrium (B, N, 3) [m] after a state, under a share of loads, inputs and the clamp's motion.
 
         Forces that depend on the pose without a potential are those ``near`` (B, N, 3); without, they are left out.
         """

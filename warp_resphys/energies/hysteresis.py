@@ -1,28 +1,27 @@
 r"""Hysteresis of a solid: rate-independent friction within the material, such as that of filled silicones.
 
-Every slider is a spring in series with a frictional element, in parallel to the elastic solid (Iwan 1967): with the
-Green strain E, the plastic strain E_p of the slider, its ratio g of the shear modulus mu, and its yield strain e,
+Sliders stand in parallel to the elastic solid (Iwan 1967). A slider is a spring in series with a frictional element:
+with the Green strain E, its plastic strain E_p, its ratio g to the shear modulus mu, and its yield strain e,
 
     S = 2 mu g (E - E_p),     |E - E_p| <= e,     dE_p/dt along E - E_p, and only where |E - E_p| = e,
 
-with Frobenius norms and the second Piola-Kirchhoff stress S. It is elastic-perfectly plastic, and its stress
-approaches 2 mu g e in steps of strain as small or as large, as fast or as slow as you like. An implicit step from the
+with Frobenius norms and the second Piola-Kirchhoff stress S: it is elastic-perfectly plastic. An implicit step from the
 plastic strain E_p0 minimises the energy stored plus the work of friction,
 
     min over E_p of  mu g |E - E_p|^2 + 2 mu g e |E_p - E_p0|  =  mu g phi(|A|^2),     A = E - E_p0,
     phi(s) = s where sqrt(s) <= e (the slider sticks), and 2 e sqrt(s) - e^2 beyond (it slides),
 
-which is the radial return (Simo and Hughes, Computational Inelasticity, 1998, chapter 3): E_p = E - min(1, e/|A|) A.
-This is exact for a strain that grows in proportion. The function of A is convex and has a continuous first derivative;
-so a step has a potential, friction takes energy in every implicit step, and its result depends on no time step. The
-second derivative jumps where a slider begins to slide: there, derivatives are those of one side. Dahl's exponential
-(`energies.friction`) has no such potential for tensors; several sliders approach it, or any other curve of loading.
+which is the radial return E_p = E - min(1, e / |A|) A (Simo and Hughes, Computational Inelasticity, 1998, chapter 3).
+It is exact where the strain changes in proportion, and depends on no time step. The function of A is convex with a
+continuous first derivative, so that a step has a potential, and friction takes energy in every implicit step. The
+second derivative jumps where a slider begins to slide: there, derivatives are those of one side. (Dahl's exponential,
+as in `energies.friction`, has no potential for tensors; several sliders approach it, or any other curve of loading.)
 
-At a point whose strain is proportional to one tensor, a cycle of amplitude a > e of |E| dissipates
-8 mu g e (a - e) per volume. |E| is sqrt(3/2) of the strain of a slightly stretched incompressible bar, and half of
-sqrt(2) of a small shear angle. Like a Prony branch, a slider acts on the whole strain and not on the volume term.
+A cycle of amplitude a > e along one direction of strain takes 8 mu g e (a - e) per volume. |E| is 1.22 times the small
+elongation of an incompressible bar, and 0.71 times a small shear angle. Like a Prony branch, a slider acts on the whole
+strain, and its modulus is no part of the volume term.
 
-Tests: ``tests/dynamics/test_hysteresis.py`` (closed forms, dissipation, gradients).
+``tests/dynamics/test_hysteresis.py`` has closed forms, dissipation and gradients.
 
 W. D. Iwan: On a class of models for the yielding behavior of continuous and composite systems. Journal of Applied
 Mechanics 34, 612-617, 1967.

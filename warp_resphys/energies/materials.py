@@ -316,9 +316,10 @@ class ConvexMaterial(Material):
     """Rubber of terms with non-negative coefficients: powers of invariants, Ogden's terms, and families of fibres.
 
     With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
-    that of Ogden (1972). Viscosities, branches and sliders have moduli of their own, independent of the elastic coefficients, so
-    that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities and branches are quadratic
-    in the strain of Green, and outside of that argument. Coefficients are zero by default, but for `bulk_1`.
+    that of Ogden (1972). Viscosities, branches and sliders have moduli of their own, independent of the elastic
+    coefficients, so that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities, branches
+    and sliders are functions of the strain of Green, and outside of that argument. Coefficients are zero by default,
+    but for `bulk_1`.
 
     Attributes:
         c10, c20, c30: coefficients [Pa] of a, a^2 and a^3, with a of `kernels.materials.convex`, near I1 - 3.

@@ -179,7 +179,7 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Return name, unit and factor of a parameter, including those of tendons, Prony branches, sliders, inputs and regions."""
+    """Return name, unit and factor of a parameter, also of tendons, Prony branches, sliders, inputs and regions."""
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]

@@ -36,6 +36,7 @@ class GradientSettings(Settings):
     steps: Natural
     batch: Natural
     seed: Count
+    change: Positive
     tolerance: Positive
     relative_tolerance: Positive
     mass_damping: Positive = setting(unit="1/s")
@@ -114,7 +115,7 @@ def pose(simulator: Simulator, name: str, batch: int) -> State:
 
 
 def check_gradients(
-    simulator: Simulator, pose_name: str = "bent", steps: int = 3, batch: int = 2, seed: int = 0
+    simulator: Simulator, pose_name: str = "bent", steps: int = 3, batch: int = 2, seed: int = 0, change: float = 1.0
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
@@ -127,20 +128,21 @@ def check_gradients(
         steps: number of steps of the roll-out.
         batch: number of environments.
         seed: of the random directions and functional.
+        change: factor of the largest changes; less than one where second derivatives jump, as those of sliders do.
 
     Returns:
         A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
         value, as one for each environment, and as one for each element or part.
     """
-    problem = _Problem(simulator, pose_name, steps, batch, seed)
+    problem = _Problem(simulator, pose_name, steps, batch, seed, change)
     return [problem.compare(*case) for case in problem.cases()]
 
 
 class _Problem:
     """The loss of a roll-out as a function of one parameter at a time."""
 
-    def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int) -> None:
-        self.simulator, self.steps, self.batch = simulator, steps, batch
+    def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float) -> None:
+        self.simulator, self.steps, self.batch, self.change = simulator, steps, batch, change
         self.random = torch.Generator().manual_seed(seed)
         self.state = pose(simulator, pose_name, batch)
         n = simulator.body.n_vertices
@@ -200,7 +202,7 @@ class _Problem:
 
     def compare(self, name: str, loss: Loss, value: torch.Tensor, size: float) -> GradientRow:
         direction = self.noise(*value.shape)
-        direction *= size / direction.abs().max()
+        direction *= self.change * size / direction.abs().max()
         variable = value.detach().clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(loss(variable), variable)
         with torch.no_grad():
@@ -228,7 +230,7 @@ def gradcheck(settings: GradientCheck, folder: Path) -> None:
         materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
         checked = replace(simulator, material=materials.get("", materials))
         for name in check.poses:
-            rows = check_gradients(checked, name, check.steps, check.batch, check.seed)
+            rows = check_gradients(checked, name, check.steps, check.batch, check.seed, check.change)
             show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {name}", check.tolerance))
             largest = max([largest, *(row.relative_error for row in rows)])
     show(f"Largest relative error: {largest:.1e}, {check.tolerance:.0e} allowed.")

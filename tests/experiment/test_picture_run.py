@@ -125,11 +125,11 @@ def test_pictures_of_a_folder(recorded):
     assert result.code == 0, result.err
     assert Image.open(recorded / "run" / "masks" / "beam.png").size == (640, 360)
     with read_hdf5(recorded / "run" / "pictures.h5", "pictures") as file:
-        masks, frames = file["beam/masks"][:], file["beam/frames"][:]
+        masks, frames = [file[f"beam/masks/{number}"][:] for number in (0, 2)], file["beam/frames"][:]
     assert frames.tolist() == [0, 2]
     assert (masks[0] == masks[1]).mean() > 0.999
     identified = json.loads((recorded / "run" / "identification.json").read_text())
-    assert identified["cameras"]["beam"][0][3] == pytest.approx(
+    assert identified["cameras"]["beam"][""][0][3] == pytest.approx(
         json.loads((recorded / "pictures/beam/camera.json").read_text())["frames"][1]["world_to_camera"][0][3]
     )
     (row,) = json.loads((recorded / "run" / "metrics.json").read_text())["poses"]
@@ -157,7 +157,7 @@ def test_a_tag_shows_the_camera(recorded):
     assert "does not show the tag 4 of 4x4_50" in refusal(*RECORDED, tag, "data.tag.number=4")
     result = outcome(*RECORDED, tag, "identify.starts=2", "identify.candidates=6")
     assert result.code == 0, result.err
-    camera = np.array(json.loads((recorded / "run" / "identification.json").read_text())["cameras"]["beam"])
+    camera = np.array(json.loads((recorded / "run" / "identification.json").read_text())["cameras"]["beam"][""])
     assert camera[:3, :3] == pytest.approx(right[:3, :3], abs=0.05)
     assert camera[:3, 3] == pytest.approx(right[:3, 3], abs=0.02)
     (row,) = json.loads((recorded / "run" / "metrics.json").read_text())["poses"]
@@ -204,7 +204,7 @@ def test_tracked_points_of_a_moving_camera(recorded):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ("data.poses.beam.frames=[0,9]", "has 9, but"),
+        ("data.poses.beam.frames=[0,9]", "name 9, but"),
         ("data.poses.beam.folder=nowhere", "nowhere/camera.json"),
         ("data.poses.beam.mesh=nowhere.vtk", "nowhere.vtk"),
         ("data.poses.beam.material=hard", "materials lacks 'hard'"),
@@ -215,11 +215,11 @@ def test_tracked_points_of_a_moving_camera(recorded):
         ("data.test=[beam]", "which is in data.train as well"),
         ("data.train=[other]", "train names 'other'"),
         ("identify=null", "identify is null, but data.kind is pictures"),
-        ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material and trial"),
+        ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material, lens and trial"),
         ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
         ("data.lens.file=calibration.yaml", "give one of them, a calibration or the matrix"),
         ("data.folder=null", "folder is not set"),
-        ("data.poses.beam.outline=false", "poses.beam has no outline and no points"),
+        ("data.poses.beam.outline=false", "data.poses.beam has no outline, no points, no scan and no depth image"),
         ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
         ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),
     ],
@@ -269,7 +269,7 @@ def test_the_verdict_says_where_an_identification_is_no_better():
     def result(sysid, simulation, tested):
         distances = {"undeformed": 9.0, "simulation": simulation, "sysid": sysid}
         none = dict.fromkeys(distances)
-        return PictureResult("a", "", tested, 1, distances, distances, distances, none)
+        return PictureResult("a", "", tested, 1, distances, distances, distances, none, none)
 
     better = picture_verdict([result(0.5, 2.0, True), result(9.0, 1.0, False)])
     assert "no better" not in better

@@ -31,6 +31,7 @@ from .observation import Observation
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 _COUNTS = (0, 4, 5, 8)  # of the coefficients of a lens
+_UNDISTORTING = 30  # steps of Newton's method
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,23 @@ class Lens:
             )
         intrinsic = self.matrix.to(points)
         return flat @ intrinsic[:2, :2].mT + intrinsic[:2, 2]
+
+    def rays(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Returns the points (..., 3) of depth one in the axes of the camera that are seen at pixels (..., 2).
+
+        Of a distorted image they are sought by Newton's method with the derivative of the undistorted one, which
+        converges where the distortion is well below the distance from the principal point.
+        """
+        inverse = torch.linalg.inv(self.matrix[:2, :2].to(pixels)).mT
+        flat = (pixels - self.matrix[:2, 2].to(pixels)) @ inverse
+        for _ in range(0 if self.distortion is None else _UNDISTORTING):
+            flat = flat - (self.pixels(_at_one(flat)) - pixels) @ inverse
+        return _at_one(flat)
+
+
+def _at_one(flat: torch.Tensor) -> torch.Tensor:
+    """Points (..., 3) of depth one, from their first two coordinates."""
+    return torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
 
 
 def _numbers(content: Any, names: tuple[str, ...], path: str | Path) -> "np.ndarray[Any, np.dtype[np.float64]] | None":

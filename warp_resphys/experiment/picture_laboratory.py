@@ -1,4 +1,4 @@
-"""A simulated laboratory of pictures: masks of a body of another material, before a camera that stands elsewhere."""
+"""A simulated laboratory of pictures: masks and depths of a body of another material, before a camera elsewhere."""
 
 import numpy as np
 import scipy.ndimage
@@ -15,17 +15,18 @@ from ..pictures.outlines import ClosedSurface
 from ..settings.pictures import SimulatedCamera
 from ..settings.stages import PictureStage
 from .build import build_body, build_simulator
-from .seen_poses import read_lens, scene_file
+from .seen_poses import read_lenses, scene_file
 
 FloatArray = NDArray[np.float64]
 
-IMAGE, MASK = "00.png", "00_mask.png"
+IMAGE, MASK, DEPTH = "00.png", "00_mask.png", "00_depth.png"
 _BODY, _BEHIND = (46, 96, 140), (24, 24, 26)  # red, green and blue of the pictures
+_THIN = 1e-9  # px^2, of a triangle that is seen from the side
 _CORRELATED = 2.0  # px, along an outline, of its noise
 
 
 def play_camera(context: StageContext) -> None:
-    """Writes camera.json, a picture and a mask of every pose."""
+    """Writes camera.json, a picture, a mask and perhaps a depth image of every pose."""
     settings: PictureStage = context.settings
     data, played = settings.data, settings.data.simulated
     assert played is not None
@@ -39,15 +40,23 @@ def play_camera(context: StageContext) -> None:
             q = simulator.static_equilibrium().q[0].double().cpu()
         looking = looks(played, gravity)
         centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))
-        camera = PlacedCamera(read_lens(data), torch.as_tensor(looking), centre)
-        pixels = camera.pixels(q, PlacedCamera.corrections(played.corrections)).numpy()
+        camera = PlacedCamera(read_lenses(data)[""], torch.as_tensor(looking), centre)
+        corrections = PlacedCamera.corrections(played.corrections)
+        pixels = camera.pixels(q, corrections).numpy()
         random = np.random.default_rng([settings.seed, number])
         mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
         path = scene_file(data, pose, context.run_dir)
-        for file, drawn in ((IMAGE, np.where(mask[..., None], _BODY, _BEHIND).astype(np.uint8)), (MASK, mask)):
+        drawings = {IMAGE: np.where(mask[..., None], _BODY, _BEHIND).astype(np.uint8), MASK: mask}
+        frame = {"image": IMAGE, "mask": MASK, "world_to_camera": looking.tolist()}
+        if played.depth is not None:
+            deep = camera.seen_from(q, corrections)[:, 2].numpy()
+            depth = depth_image(pixels[surface.triangles], deep[surface.triangles], played.size)
+            noisy = np.where(depth > 0.0, depth + played.depth * random.normal(size=depth.shape), 0.0)
+            drawings[DEPTH] = np.rint(noisy / data.cloud.depth_unit).astype(np.uint16)
+            frame["depth"] = DEPTH
+        for file, drawn in drawings.items():
             with atomic_path(path.parent / file) as partial:
                 Image.fromarray(drawn).save(partial, format="png")
-        frame = {"image": IMAGE, "mask": MASK, "world_to_camera": looking.tolist()}
         write_json(path, {"name": name, "frames": [frame]})
 
 
@@ -59,6 +68,30 @@ def looks(played: SimulatedCamera, gravity: tuple[float, float, float]) -> Float
     down = down / np.linalg.norm(down)
     axes = np.stack([np.cross(down, forward), down, forward])
     return np.block([[axes, -(axes @ place)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def depth_image(corners: FloatArray, depths: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Returns the depth (H, W) of the foremost triangle at every pixel, zero where there is none [m].
+
+    Args:
+        corners: (F, 3, 2) pixels of triangles.
+        depths: (F, 3) of their corners, of which the inverses are linear in the picture [m].
+        size: width and height of the picture.
+    """
+    closeness = np.zeros((size[1], size[0]))  # 1/m
+    for triangle, inverse in zip(corners, 1.0 / depths, strict=True):
+        low = np.maximum(np.ceil(triangle.min(0)), 0).astype(int)
+        high = np.minimum(np.floor(triangle.max(0)), np.array(size) - 1).astype(int)
+        columns, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        edges = np.stack([triangle[1] - triangle[0], triangle[2] - triangle[0]], 1)
+        if not columns.size or abs(np.linalg.det(edges)) < _THIN:
+            continue
+        share = np.linalg.solve(edges, np.stack([columns.ravel(), rows.ravel()]) - triangle[0][:, None])
+        inside = ((share >= 0.0).all(0) & (share.sum(0) <= 1.0)).reshape(rows.shape)
+        at = (inverse[0] + (inverse[1:] - inverse[0]) @ share).reshape(rows.shape)
+        part = closeness[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        part[inside] = np.maximum(part, at)[inside]
+    return np.divide(1.0, closeness, out=np.zeros_like(closeness), where=closeness > 0.0)
 
 
 def noisy_mask(

@@ -32,14 +32,14 @@ from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, SeenPose, Shape
 from ..report.identification_section import parameter_rows
 from ..report.page import NONE, number_text
 from ..report.pictures_page import PictureResult, picture_verdict, write_pictures_report
-from ..settings.pictures import PictureData
+from ..settings.pictures import PictureData, PoseSettings
 from ..settings.run import RunSettings
 from ..settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
 from .build import simulation_device
 from .files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from .identify import Checkpoint, bounds_of, search_parameters
-from .picture_laboratory import IMAGE, MASK, play_camera
-from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lens
+from .picture_laboratory import DEPTH, IMAGE, MASK, play_camera
+from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lenses, scene_of
 
 log = logging.getLogger(__name__)
 
@@ -65,10 +65,11 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     data = run.pictures
     assert data is not None
     stages, upstream = list[Stage](), tuple[str, ...]()
+    with_depth = data.simulated is not None and data.simulated.depth is not None
     common = {"files": {**files, **picture_files(data)}, "data": data}
     settings = PictureStage.of(run, **common)
     if data.folder is None:
-        files_of_pose = (SCENE, IMAGE, MASK)
+        files_of_pose = (SCENE, IMAGE, MASK, *[DEPTH] * with_depth)
         written = tuple(f"recordings/{own.folder}/{file}" for own in data.poses.values() for file in files_of_pose)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
@@ -96,7 +97,10 @@ def check_pictures(run: RunSettings) -> None:
     data, wanted = run.pictures, run.identify
     assert data is not None
     assert wanted is not None
-    read_lens(data)
+    read_lenses(data)
+    for name, pose in data.poses.items():
+        if not (pose.outline or pose.points or pose.cloud or (pose.depth and _has_depth(data, pose))):
+            raise InputError(f"data.poses.{name} has no outline, no points, no scan and no depth image: give one.")
     if not wanted.parameters:
         raise InputError("identify.parameters is empty: give a range for at least one parameter.")
     known = [*run.simulation.constants, *_PLACED]
@@ -104,9 +108,18 @@ def check_pictures(run: RunSettings) -> None:
         if name not in known:
             raise InputError(f"identify.parameters names '{name}': choose from {', '.join(known)}.")
         if limits.per == "session":
-            raise InputError(f"identify.parameters.{name}.per is session: pictures have all, material and trial.")
+            raise InputError(f"identify.parameters.{name}.per is session: pictures have all, material, lens and trial.")
+        if limits.per == "lens" and name not in CORRECTIONS:
+            raise InputError(f"identify.parameters.{name}.per is lens, and is not of a camera: take all or material.")
         if limits.per == "trial" and name not in _PLACED:
             raise InputError(f"identify.parameters.{name}.per is trial, which says nothing of others: take material.")
+
+
+def _has_depth(data: PictureData, pose: PoseSettings) -> bool:
+    """Whether a pose has depth images."""
+    if data.folder is None:
+        return data.simulated is not None and data.simulated.depth is not None
+    return any(frame.depth is not None for frame in scene_of(data, pose, Path()).frames)
 
 
 class _Plan:
@@ -115,14 +128,17 @@ class _Plan:
     Args:
         settings: of the stage.
         run_dir: the run folder.
-        cameras: (4, 4) of poses whose standing camera was chosen in the identification, by name.
+        cameras: (4, 4) of poses whose standing cameras were chosen in the identification, by name and lens.
     """
 
     def __init__(
         self, settings: IdentifyPicturesStage, run_dir: Path, cameras: Mapping[str, Any] | None = None
     ) -> None:
         self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
-        self._cameras = {name: torch.tensor(camera, dtype=torch.float64) for name, camera in (cameras or {}).items()}
+        self._cameras = {
+            name: {lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in own.items()}
+            for name, own in (cameras or {}).items()
+        }
 
     def bounds(self, poses: Sequence[SeenPose], chosen: Callable[[str, str], bool]) -> dict[str, Bounds]:
         """Ranges of parameters that act on some poses, with a name for each owner.
@@ -133,10 +149,15 @@ class _Plan:
         """
         result = {}
         for name, limits in self.settings.identify.parameters.items():
-            owners = {"all": [""], "material": [pose.material for pose in poses], "trial": [p.name for p in poses]}
+            owners = {
+                "all": [""],
+                "material": [pose.material for pose in poses],
+                "trial": [pose.name for pose in poses],
+                "lens": [lens for pose in poses for lens in pose.lenses],
+            }
             for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
-                mine = [pose for pose in poses if owner in ("", pose.material, pose.name)]
-                if any(name in (pose.parameter_names if pose.deforms else CORRECTIONS) for pose in mine):
+                mine = [pose for pose in poses if owner in (*pose.owners, *pose.lenses)]
+                if any(name in pose.parameter_names and (pose.deforms or name in CORRECTIONS) for pose in mine):
                     result[own_name(name, owner) if owner else name] = bounds_of(limits)
         return result
 
@@ -146,7 +167,7 @@ class _Plan:
         neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True)) | {CLAMP_SHIFT: 0.0}
         for name in names:
             parameter, owner = split_name(name)
-            pose = next(pose for pose in poses if owner in ("", pose.material, pose.name))
+            pose = next(pose for pose in poses if owner in (*pose.owners, *pose.lenses))
             prior = wanted.parameters[parameter].prior
             if parameter in wanted.first_guess:
                 result[name] = wanted.first_guess[parameter]
@@ -184,13 +205,18 @@ class _Plan:
             return pose
         if known and name in self._cameras:
             return pose.before(self._cameras[name])
-        guess = self.guess(self.bounds([pose], lambda name, per: True), [pose])
-        values = values_of(pose, {**guess, **self.given([pose]), **known})
-        q, seen, failure = pose.shape(values, near), list[tuple[float, SeenPose]](), None
-        for camera in self.poses.cameras_of(name):
-            tried = pose.before(camera)
+        guess = {**self.guess(self.bounds([pose], lambda name, per: True), [pose]), **self.given([pose]), **known}
+        q = pose.shape(values_of(pose, guess), near)
+        return pose.before({lens: self._best_camera(pose, lens, q, guess) for lens in pose.lenses})
+
+    def _best_camera(self, pose: SeenPose, lens: str, q: torch.Tensor, values: Values) -> torch.Tensor:
+        """The camera (4, 4) of the frames by a lens from which a body (N, 3) is seen best."""
+        seen, failure, own = list[tuple[float, torch.Tensor]](), None, values_of(pose, values, lens)
+        for camera in self.poses.cameras_of(pose.name, lens):
+            tried = pose.before({lens: camera})
             try:
-                seen.append((sum(tried.difference(photo, q, values).distance for photo in tried.photos), tried))
+                photos = [photo for photo in tried.photos if photo.camera.lens is not None and photo.lens == lens]
+                seen.append((sum(tried.difference(photo, q, own).distance for photo in photos), camera))
             except InputError as error:
                 failure = error
         if failure is not None and not seen:
@@ -198,7 +224,7 @@ class _Plan:
         return min(seen, key=lambda own: own[0])[1]
 
     def fitted(self, name: str, model: str, identified: Values, near: Shape | None) -> tuple[SeenPose, Values, Shape]:
-        """A pose with a model, the values of its parameters, and its shape.
+        """A pose with a model, the values of parameters, and its shape.
 
         Place before the camera, tilt of gravity and clamps are fitted to it, unless they were identified with it. The
         identified model has the identified lens; the others, which have none, fit it as well, and choose among the
@@ -213,8 +239,9 @@ class _Plan:
             wanted, guess = self.settings.identify, self.guess(bounds, [pose])
             search = ParameterSearch(PictureMisfit([pose], bounds, given, [near]))
             fitted = search.run([guess], wanted.max_evaluations, tolerance=wanted.tolerance).parameters
-        own = values_of(pose, {**given, **fitted})
-        return pose, own, (own, pose.shape(own, near))
+        values = {**given, **fitted}
+        own = values_of(pose, values)
+        return pose, values, (own, pose.shape(own, near))
 
 
 def identify_pictures(context: StageContext) -> None:
@@ -234,7 +261,11 @@ def identify_pictures(context: StageContext) -> None:
         search = ParameterSearch(misfit)
         found = search_parameters(wanted, settings.seed, search, guess, kept, progress, wanted.starts)
     result = {**found, "first_guess": guess}
-    cameras = {pose.name: pose.photos[0].camera.pose.tolist() for pose in poses if settings.data.stands}
+    cameras = {
+        pose.name: {photo.lens: photo.camera.pose.tolist() for photo in pose.photos if photo.camera.lens is not None}
+        for pose in poses
+        if settings.data.stands
+    }
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)
@@ -270,14 +301,25 @@ def compare_pictures(context: StageContext) -> None:
             for model in reversed(MODELS):
                 pose, values, near = plan.fitted(name, model, shared, near)
                 for number, photo in enumerate(pose.photos):
+                    own = values_of(pose, values, photo.lens)
                     row = {"pose": name, "picture": number, "model": model, "tested": name in settings.data.test}
-                    rows.append({**row, **asdict(pose.difference(photo, near[1], values)), "values": values})
+                    rows.append({**row, **asdict(pose.difference(photo, near[1], own)), "values": own})
+                    corrections = PlacedCamera.corrections(own)
                     if photo.outline is not None:
-                        seen = pose.outlines(photo, near[1], PlacedCamera.corrections(values))
+                        seen = pose.outlines(photo, near[1], corrections)
                         create(file, f"{name}/{number}/{model}", seen.silhouette.pixels, "px")
                         create(file, f"{name}/{number}/{model}_weight", seen.of_simulated, "px")
                         if model == MODELS[0]:
                             create(file, f"{name}/{number}/measured", photo.outline.points, "px")
+                    if photo.cloud is not None:
+                        closest, weights = pose.cloud_distances(photo, near[1], corrections)
+                        distances = np.abs(closest.distances)
+                        content = {"places": closest.places, "distances": distances, "surface": near[1].cpu().numpy()}
+                        for key, array in content.items():
+                            create(file, f"{name}/{number}/{model}_{key}", array, "m")
+                        create(file, f"{name}/{number}/{model}_weights", weights)
+                        if model == MODELS[0]:
+                            create(file, f"{name}/{number}/triangles", pose.surface.triangles)
                 progress.advance(1, pose=name)
     write_json(context.run_dir / DIFFERENCES, {"rows": rows})
 
@@ -295,7 +337,7 @@ def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[Pic
                     model: _mean(row[key] for row in rows if (row["pose"], row["model"]) == (name, model))
                     for model in MODELS
                 }
-                for key in ("outline_mm", "outline_px", "overlap", "points_mm")
+                for key in ("outline_mm", "outline_px", "overlap", "cloud_mm", "points_mm")
             },
         )
         for name in (*data.train, *data.test)
@@ -353,7 +395,8 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
     by_outline = any(result.outline_mm["sysid"] is not None for result in results)
-    title = f"Distance of {'outlines' if by_outline else 'tracked points'} [mm]"
+    kinds = list(dict.fromkeys(result.compared for result in results))
+    title = f"Distance of {' or '.join(kinds)} [mm]"
     heads = ["undeformed", "uncorrected", "identified", *["overlap"] * by_outline]
     table = Table("pose", *heads, title=title)
     for result in results:

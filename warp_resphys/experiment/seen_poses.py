@@ -2,10 +2,11 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,14 +16,25 @@ from ..data.camera import Lens
 from ..data.markers import bind_markers
 from ..fem.body import Body
 from ..io.atomic import atomic_path, digest
-from ..io.errors import DataFileError, InputError
+from ..io.errors import DataFileError, InputError, listed
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.stages import StageContext
 from ..mesh.mesh import Mesh, quadratic, select_vertices
-from ..mesh.readers import read_mesh
+from ..mesh.readers import METRES, read_mesh
 from ..pictures.camera import PlacedCamera
+from ..pictures.clouds import Cloud
 from ..pictures.outlines import ClosedSurface, Outline
-from ..pictures.reading import Colours, Frame, read_mask, read_picture, read_scene, read_tracked
+from ..pictures.reading import (
+    Colours,
+    Frame,
+    SceneFile,
+    read_depth,
+    read_mask,
+    read_picture,
+    read_scene,
+    read_tracked,
+)
+from ..pictures.scans import read_scan
 from ..pictures.seen import Photo, SeenPose
 from ..pictures.tags import Tag
 from ..settings.body import MaterialSettings
@@ -35,6 +47,7 @@ log = logging.getLogger(__name__)
 PICTURES: Final = "pictures.h5"
 SCENE: Final = "camera.json"
 _KIND: Final = "pictures"
+_OF_FRAMES: Final = ("masks", "depths")
 _ALIKE: Final = 1e-9  # of two cameras
 _MOVED: Final = 0.05  # m: a tag that can be seen in two ways keeps its place
 
@@ -53,14 +66,13 @@ def picture_files(data: PictureData) -> dict[str, str]:
     """
     if data.folder is None:
         return {}
-    paths = [] if data.lens.file is None else [Path(data.folder).expanduser() / data.lens.file]
+    paths = [Path(data.folder).expanduser() / lens.file for lens in data.lenses.values() if lens.file is not None]
     for pose in data.poses.values():
-        scene = read_scene(scene_file(data, pose, Path()))
-        own = [pose.mesh, pose.points]
-        paths += [scene.path, *(scene.path.parent / name for name in own if name is not None)]
-        paths += [
-            path for frame in _chosen(scene.frames, pose) for path in (frame.image, frame.mask) if path is not None
-        ]
+        scene = scene_of(data, pose, Path())
+        own = [pose.mesh, pose.points, pose.cloud]
+        paths += [scene.path] if scene.path.exists() else []
+        paths += [scene.path.parent / name for name in own if name is not None]
+        paths += [path for frame in scene.frames for path in frame.files]
     result = {}
     for path in paths:
         try:
@@ -70,8 +82,28 @@ def picture_files(data: PictureData) -> dict[str, str]:
     return result
 
 
-def _chosen(frames: Sequence[Frame], pose: PoseSettings) -> list[Frame]:
-    return [frame for number, frame in enumerate(frames) if pose.frames is None or number in pose.frames]
+def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
+    """Returns the content of a pose's camera.json, with the chosen frames.
+
+    Raises:
+        DataFileError: it is missing or damaged.
+        InputError: a chosen frame, or a lens, is not there.
+    """
+    scene = read_scene(scene_file(data, pose, run_dir), pose.cloud is not None)
+    if wrong := [number for number in pose.frames or () if number >= len(scene.frames)]:
+        raise InputError(
+            f"the frames of {pose.folder} in data.poses name {wrong[0]}, but {scene.path} has {len(scene.frames)}, "
+            "from 0: leave it out."
+        )
+    frames = tuple(frame for frame in scene.frames if pose.frames is None or frame.number in pose.frames)
+    for frame in frames:
+        if frame.lens not in data.lenses:
+            names = listed([own for own in data.lenses if own])
+            raise InputError(
+                f"{scene.path}: frame {frame.number} has the lens '{frame.lens}', and data.lens has the names {names}: "
+                "name the lens of a frame, as 'lens', where data.lens has several, and only there."
+            )
+    return replace(scene, frames=frames)
 
 
 def import_pictures(context: StageContext) -> None:
@@ -84,16 +116,18 @@ def import_pictures(context: StageContext) -> None:
     data = settings.data
     with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
         for name, pose in data.poses.items():
-            scene = read_scene(scene_file(data, pose, context.run_dir))
-            wrong = [number for number in pose.frames or () if number >= len(scene.frames)]
-            if wrong:
-                raise InputError(f"data.poses.{name}.frames has {wrong[0]}, but {scene.path} has {len(scene.frames)}.")
-            frames = _different(name, _chosen(scene.frames, pose))
+            scene = scene_of(data, pose, context.run_dir)
+            frames = _different(name, scene.frames)
             colours = pose.mask or data.mask
             chosen = None if colours is None else Colours(**dict(colours))
-            masks = [_mask(frame, chosen) for frame in frames] if pose.outline else []
-            if len({mask.shape for mask in masks}) > 1:
-                raise DataFileError(f"{scene.path}: its pictures have different sizes: give each size its own pose.")
+            masks = dict[int, NDArray[np.bool_]]()
+            for frame in frames:
+                with_depth = pose.depth and frame.depth is not None
+                if pose.outline or (with_depth and (frame.mask is not None or chosen is not None)):
+                    masks[frame.number] = _mask(frame, chosen)
+                    create(file, f"{name}/masks/{frame.number}", masks[frame.number])
+                if with_depth:
+                    create(file, f"{name}/depths/{frame.number}", _depth(frame, masks.get(frame.number), data), "m")
             numbers = [frame.number for frame in frames]
             if pose.points is not None:
                 path = scene.path.parent / pose.points
@@ -101,14 +135,34 @@ def import_pictures(context: StageContext) -> None:
                 if not np.isfinite(tracked).any():
                     raise DataFileError(f"{path}: no point was seen in the frames of data.poses.{name}: leave it out.")
                 create(file, f"{name}/tracked", tracked, "px")
-            create(file, f"{name}/masks", np.array(masks, dtype=bool))
+            if pose.cloud is not None:
+                points, normals = read_scan(scene.path.parent / pose.cloud, METRES[data.cloud.units], settings.seed)
+                create(file, f"{name}/scan", points, "m")
+                if normals is not None:
+                    create(file, f"{name}/scan_normals", normals)
+                log.info("import: %s has a scan of %d points", name, len(points))
             create(file, f"{name}/world_to_camera", _cameras(scene.path, frames, data), "1, m")
             create(file, f"{name}/frames", numbers)
-            shares = [100.0 * mask.mean() for mask in masks]
+            shares = [100.0 * mask.mean() for mask in masks.values()]
             covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
-            log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
+            if frames:
+                log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
             if masks:
-                _show_mask(context.run_dir / "masks" / f"{name}.png", read_picture(frames[0].image), masks[0])
+                shown = next(frame for frame in frames if frame.number in masks)
+                image = read_picture(shown.image)
+                _show_mask(context.run_dir / "masks" / f"{name}.png", image, masks[shown.number])
+
+
+def _depth(frame: Frame, mask: NDArray[np.bool_] | None, data: PictureData) -> NDArray[np.float32]:
+    """A depth image (H, W), zero where the mask does not show the body [m]."""
+    assert frame.depth is not None
+    depth = read_depth(frame.depth, data.cloud.depth_unit)
+    if mask is not None and mask.shape != depth.shape:
+        raise DataFileError(
+            f"{frame.depth} has {depth.shape[1]} x {depth.shape[0]} pixels, and its mask {mask.shape[1]} x "
+            f"{mask.shape[0]}: register the depths to the picture."
+        )
+    return np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(np.float32)
 
 
 def _show_mask(path: Path, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
@@ -132,25 +186,30 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[
     if data.tag is None:
         if missing := [frame.image.name for frame in frames if frame.pose is None]:
             raise DataFileError(f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag.")
-        given = np.stack([np.stack([frame.pose, frame.pose]) for frame in frames if frame.pose is not None])
-        return _of_one_camera(path, given, data)
-    tag, lens = Tag(**dict(data.tag)), read_lens(data)
-    found = [tag.poses(read_picture(frame.image), lens) for frame in frames]
+        given = [np.stack([frame.pose, frame.pose]) for frame in frames if frame.pose is not None]
+        return _of_standing(path, frames, np.array(given).reshape(-1, 2, 4, 4), data)
+    tag, lenses = Tag(**dict(data.tag)), read_lenses(data)
+    found = [tag.poses(read_picture(frame.image), lenses[frame.lens]) for frame in frames]
     if hidden := [frame.image for frame, own in zip(frames, found, strict=True) if not own]:
         raise DataFileError(
             f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame out, "
             "or give its world_to_camera."
         )
-    return _of_one_camera(path, np.stack([np.stack([own[0], own[-1]]) for own in found]), data)
+    both = np.array([np.stack([own[0], own[-1]]) for own in found]).reshape(-1, 2, 4, 4)
+    return _of_standing(path, frames, both, data)
 
 
-def _of_one_camera(path: Path, cameras: NDArray[np.float64], data: PictureData) -> NDArray[np.float64]:
+def _of_standing(
+    path: Path, frames: Sequence[Frame], cameras: NDArray[np.float64], data: PictureData
+) -> NDArray[np.float64]:
     """The cameras (F, 2, 4, 4), refused if a standing one sees the origin of the mesh at different places."""
-    apart = np.linalg.norm(cameras[:, 0, :3, 3] - cameras[0, 0, :3, 3], axis=1).max()
+    first: dict[str, NDArray[np.float64]] = {}
+    places = [(first.setdefault(f.lens, own[0, :3, 3]), own[0, :3, 3]) for f, own in zip(frames, cameras, strict=True)]
+    apart = max((float(np.linalg.norm(there - here)) for here, there in places), default=0.0)
     if data.stands and apart > _MOVED:
         raise DataFileError(
             f"{path}: between its frames the camera moves by {100.0 * apart:.0f} cm against the origin of the mesh: "
-            "set data.stands=false if it does, or if there are several; world_to_camera is in m."
+            "set data.stands=false if it does, or name several in data.lens; world_to_camera is in m."
         )
     return cameras
 
@@ -159,7 +218,7 @@ def _different(name: str, frames: Sequence[Frame]) -> list[Frame]:
     """Frames without copies of earlier pictures, which would count as often as there are copies."""
     first: dict[str, Frame] = {}
     for frame in frames:
-        first.setdefault(digest(frame.mask or frame.image), frame)
+        first.setdefault(digest(frame.files[0]), frame)
     if len(first) < len(frames):
         log.warning(
             "import: %d of the %d pictures of %s are copies of others, and are left out",
@@ -172,10 +231,23 @@ def _different(name: str, frames: Sequence[Frame]) -> list[Frame]:
 class Loaded:
     """A pose as it was read."""
 
-    masks: NDArray[np.bool_]  # (F, H, W), or empty
+    masks: dict[int, NDArray[np.bool_]]  # (H, W) by number of the frame
+    depths: dict[int, NDArray[np.float64]]  # (H, W) by number of the frame [m]
     cameras: NDArray[np.float64]  # (F, 2, 4, 4) world_to_camera: two that a tag allows, or the given one twice
     tracked: NDArray[np.float64] | None  # (F, M, 2) [px]
     frames: tuple[int, ...]
+    scan: NDArray[np.float64] | None = None  # (P, 3) [m]
+    normals: NDArray[np.float64] | None = None  # (P, 3) of these points
+
+
+def _loaded(file: h5py.Group) -> Loaded:
+    """A pose of pictures.h5."""
+    masks, depths = ({int(own): read_array(file, f"{key}/{own}") for own in file.get(key, ())} for key in _OF_FRAMES)
+    tracked, scan, normals = (
+        read_array(file, key) if key in file else None for key in ("tracked", "scan", "scan_normals")
+    )
+    frames = tuple(read_array(file, "frames").tolist())
+    return Loaded(masks, depths, read_array(file, "world_to_camera"), tracked, frames, scan, normals)
 
 
 class SeenPoses:
@@ -192,17 +264,9 @@ class SeenPoses:
 
     def __init__(self, settings: PictureStage, run_dir: Path) -> None:
         self.settings, self.data, self.run_dir = settings, settings.data, run_dir
-        self.lens, self._poses = read_lens(self.data), dict[str, SeenPose]()
+        self.lenses, self._poses = read_lenses(self.data), dict[str, SeenPose]()
         with read_hdf5(run_dir / PICTURES, _KIND) as file:
-            self.loaded = {
-                name: Loaded(
-                    read_array(file, f"{name}/masks"),
-                    read_array(file, f"{name}/world_to_camera"),
-                    read_array(file, f"{name}/tracked") if f"{name}/tracked" in file else None,
-                    tuple(read_array(file, f"{name}/frames").tolist()),
-                )
-                for name in self.data.poses
-            }
+            self.loaded = {name: _loaded(file[name]) for name in self.data.poses}
 
     def picture(self, name: str, number: int) -> NDArray[np.uint8]:
         """Returns a picture (H, W, 3) of a pose, by its number among those that are used.
@@ -210,13 +274,17 @@ class SeenPoses:
         Raises:
             DataFileError: it is missing.
         """
-        scene = read_scene(scene_file(self.data, self.data.poses[name], self.run_dir))
-        return read_picture(scene.frames[self.loaded[name].frames[number]].image)
+        return read_picture(self._frames(name)[number].image)
 
-    def cameras_of(self, name: str) -> list[torch.Tensor]:
-        """Returns the different cameras (4, 4) of a pose's frames, from which a standing camera is chosen."""
-        different: list[torch.Tensor] = []
-        for camera in torch.as_tensor(self.loaded[name].cameras.reshape(-1, 4, 4)):
+    def _frames(self, name: str) -> list[Frame]:
+        """The frames of a pose that are used."""
+        used = self.loaded[name].frames
+        return [f for f in scene_of(self.data, self.data.poses[name], self.run_dir).frames if f.number in used]
+
+    def cameras_of(self, name: str, lens: str) -> list[torch.Tensor]:
+        """Returns the different cameras (4, 4) of a pose's frames by a lens, from which a standing one is chosen."""
+        different, mine = list[torch.Tensor](), [frame.lens == lens for frame in self._frames(name)]
+        for camera in torch.as_tensor(self.loaded[name].cameras[mine].reshape(-1, 4, 4)):
             if all((camera - other).abs().max() > _ALIKE for other in different):
                 different.append(camera)
         return different
@@ -245,20 +313,36 @@ class SeenPoses:
         if own.points is not None:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
-        outlines: list[Outline | None] = [Outline.of_mask(mask) for mask in loaded.masks] or [None] * len(loaded.frames)
-        scene, photos = read_scene(scene_file(self.data, own, self.run_dir)), []
-        for number, (frame, outline) in enumerate(zip(loaded.frames, outlines, strict=True)):
-            image = f"{own.folder}/{scene.frames[frame].image.name}"
+        scene, photos = scene_of(self.data, own, self.run_dir), list[Photo]()
+        for number, frame in enumerate(self._frames(name)):
+            camera = PlacedCamera(self.lenses[frame.lens], torch.as_tensor(loaded.cameras[number, 0]), centre)
+            outline = Outline.of_mask(loaded.masks[frame.number]) if own.outline else None
             tracked = None if loaded.tracked is None else loaded.tracked[number]
-            camera = PlacedCamera(self.lens, torch.as_tensor(loaded.cameras[number, 0]), centre)
-            photos.append(Photo(image, camera, outline, tracked))
+            cloud, depth = None, loaded.depths.get(frame.number)
+            if depth is not None:
+                cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, mesh)
+            photos.append(Photo(f"{own.folder}/{frame.image.name}", camera, outline, tracked, cloud, frame.lens))
+        if loaded.scan is not None:
+            camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
+            outside = None if loaded.normals is None else loaded.scan + loaded.normals
+            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(loaded.scan, outside), camera, mesh)
+            photos.append(Photo(f"{own.folder}/{own.cloud}", camera, cloud=cloud))
         surface = ClosedSurface.of_mesh(mesh)
         return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points)
+
+    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh) -> Cloud:
+        """The points that may be of a body, as many as configured."""
+        wanted = self.data.cloud
+        cloud = replace(cloud, noise=wanted.noise, reach=wanted.reach)
+        try:
+            return cloud.around(camera, mesh.vertices, wanted.points, np.random.default_rng(self.settings.seed))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
     def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
         """Mesh of a pose, and the vertices in its clamps."""
         own = self.data.poses[name]
-        scene = read_scene(scene_file(self.data, own, self.run_dir))
+        scene = scene_of(self.data, own, self.run_dir)
         if own.mesh is None:
             mesh = build_mesh(self.settings.mesh)
         else:
@@ -285,12 +369,14 @@ def _with_midpoints(mesh: Mesh, corners: NDArray[np.int64]) -> NDArray[np.int64]
     return np.flatnonzero(within)
 
 
-def read_lens(data: PictureData) -> Lens:
-    """Returns the lens of the camera.
+def read_lenses(data: PictureData) -> dict[str, Lens]:
+    """Returns the lenses of the cameras by name, which is empty for a single one.
 
     Raises:
-        DataFileError: its calibration cannot be read.
+        DataFileError: a calibration cannot be read.
     """
-    if data.lens.file is not None:
-        return Lens.read(Path(data.folder or ".").expanduser() / data.lens.file)
-    return Lens(torch.tensor(data.lens.matrix, dtype=torch.float64))
+    folder = Path(data.folder or ".").expanduser()
+    return {
+        name: Lens(torch.tensor(own.matrix, dtype=torch.float64)) if own.file is None else Lens.read(folder / own.file)
+        for name, own in data.lenses.items()
+    }

@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..io.errors import InputError
 from .mesh import FloatArray, IntArray, Mesh, boundary_triangles
 
 _TIE = 1e-9  # difference up to which triangles are equally close, over the diagonal of the mesh
+_CANDIDATES = 16  # triangles that are tried first for a point
+_PAIRS = 200_000  # of points and triangles that are compared at once
 
 
 @dataclass(frozen=True)
@@ -29,25 +32,65 @@ def closest_points(mesh: Mesh, points: FloatArray) -> ClosestPoints:
     Raises:
         InputError: A point of (P, 3) [m] is not finite.
     """
-    import trimesh
-
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise InputError("A point whose closest point on a surface is needed is not finite.")
-    triangles = boundary_triangles(mesh)
-    corners = mesh.vertices[triangles]  # (F, 3, 3) [m]
+    return closest_of(boundary_triangles(mesh), mesh.vertices, points)
+
+
+def closest_of(
+    triangles: IntArray, vertices: FloatArray, points: FloatArray, towards: FloatArray | None = None
+) -> ClosestPoints:
+    """Returns the closest points on a surface in space, as `closest_points` does for the rest shape.
+
+    Triangles are tried by the distance of their centres, until no other can be closer.
+
+    Args:
+        triangles: (F, 3) vertices, counter-clockwise seen from outside.
+        vertices: (N, 3) [m].
+        points: (P, 3) [m].
+        towards: (P, 3) directions; only triangles whose outer normal has a positive component along that of a point
+            are compared with it. All of them, if left out.
+    """
+    corners = vertices[triangles]  # (F, 3, 3) [m]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    tie = _TIE * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    chosen = np.empty(len(points), dtype=np.int64)
-    nearest = np.empty_like(points)
-    for row, point in enumerate(points):
-        candidates = trimesh.triangles.closest_point(corners, np.broadcast_to(point, (len(corners), 3)))
-        distance = np.linalg.norm(candidates - point, axis=1)
-        close = np.flatnonzero(distance <= distance.min() + tie)
-        heights = np.abs(np.sum((point - candidates[close]) * normals[close], axis=1))
-        chosen[row] = close[np.argmax(heights)]
-        nearest[row] = candidates[chosen[row]]
+    tie = _TIE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    centres = corners.mean(1)
+    radius, tree = float(np.linalg.norm(corners - centres[:, None], axis=2).max()), cKDTree(centres)
+    chosen, nearest = np.empty(len(points), dtype=np.int64), np.empty_like(points)
+    left, count = np.arange(len(points)), min(_CANDIDATES, len(triangles))
+    while len(left):
+        again = []
+        for rows in np.array_split(left, len(left) * count // _PAIRS + 1):
+            apart, candidates = (own.reshape(len(rows), count) for own in tree.query(points[rows], count))
+            index, places, distance = _closest_candidate(
+                corners[candidates], normals[candidates], points[rows], None if towards is None else towards[rows], tie
+            )
+            chosen[rows], nearest[rows] = np.take_along_axis(candidates, index[:, None], 1)[:, 0], places
+            again.append(rows[distance > apart[:, -1] - radius - tie])
+        left = np.concatenate(again) if count < len(triangles) else left[:0]
+        count = min(4 * count, len(triangles))
     offset = points - nearest
     side = np.where(np.sum(offset * normals[chosen], axis=1) < 0.0, -1.0, 1.0)
     return ClosestPoints(triangles[chosen], nearest, normals[chosen], side * np.linalg.norm(offset, axis=1))
+
+
+def _closest_candidate(
+    corners: FloatArray, normals: FloatArray, points: FloatArray, towards: FloatArray | None, tie: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Index (R,) of the closest of K triangles (R, K, 3, 3) with normals (R, K, 3), the point on it, and its distance.
+
+    The distance is infinite where none of them faces the direction (R, 3) of its point.
+    """
+    import trimesh
+
+    copies = np.repeat(points[:, None], corners.shape[1], axis=1)  # (R, K, 3)
+    places = trimesh.triangles.closest_point(corners.reshape(-1, 3, 3), copies.reshape(-1, 3)).reshape(copies.shape)
+    distance = np.linalg.norm(places - copies, axis=2)
+    if towards is not None:
+        distance = np.where(np.einsum("rki,ri->rk", normals, towards) > 0.0, distance, np.inf)
+    least = distance.min(1)
+    heights = np.abs(np.einsum("rki,rki->rk", copies - places, normals))
+    index = np.argmax(np.where(distance <= least[:, None] + tie, heights, -1.0), axis=1)
+    return index, places[np.arange(len(points)), index], least

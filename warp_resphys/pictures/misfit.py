@@ -1,13 +1,16 @@
 """The misfit of simulated bodies to pictures of them, as a function of physical parameters and of the camera's.
 
 The loss is the mean square distance of the measured and the simulated outlines, both ways, and of tracked points, in
-pixels; every picture has the same weight, and within it outlines and points. A distance r counts as
-s sqrt(2 (sqrt(1 + (r / s)^2) - 1)), which is r where it is well below s pixels, and less beyond, as a cable or a hand
-before the body moves its outline by any number of pixels (Charbonnier et al. 1997).
+pixels, and of the points of clouds from the surface, in multiples of their noise; every picture or scan has the same
+weight, and within it outlines, points and cloud. A distance r counts as s sqrt(2 (sqrt(1 + (r / s)^2) - 1)), which is r
+where it is well below s = 4, and less beyond, as a cable or a hand before the body moves its outline by any number of
+pixels (Charbonnier et al. 1997).
 
-A name with an owner (`learning.parameters.own_name`) is the value of one pose, or of the poses of one material; a name
-without, that of all. Shapes follow the physical parameters by differences of equilibria, and pixels follow shapes and
-cameras exactly. `tests/pictures/test_picture_misfit.py` compares the derivatives with differences.
+A name with an owner (`learning.parameters.own_name`) is the value of one pose, of the poses of one material, or of the
+pictures by one lens; a name without, that of all. Shapes follow the physical parameters by differences of equilibria,
+and pixels and clouds follow shapes and cameras exactly.
+
+`tests/pictures/test_picture_misfit.py` and `test_clouds.py` compare the derivatives with differences.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +31,7 @@ from .camera import CORRECTIONS, PlacedCamera
 from .seen import Photo, SeenPose, Shape
 
 _DIFFERENCE: Final = 1e-4  # of a physical parameter, as a fraction of its range
-_ROBUST: Final = 4.0  # px, s
+_ROBUST: Final = 4.0  # px, or multiples of the noise of a cloud, s
 
 
 class PictureMisfit(BoundedMisfit):
@@ -41,7 +44,7 @@ class PictureMisfit(BoundedMisfit):
         near: shapes by pose from which equilibria are sought first; None where none is known.
 
     Raises:
-        InputError: an unknown parameter or owner, nothing to identify, or a picture without outline and points.
+        InputError: an unknown parameter or owner, nothing to identify, or a picture without anything to compare.
     """
 
     def __init__(
@@ -54,8 +57,8 @@ class PictureMisfit(BoundedMisfit):
         super().__init__(bounds)
         self.poses, self._known = [*poses], {} if known is None else dict(known)
         for photo in (photo for pose in self.poses for photo in pose.photos):
-            if photo.outline is None and photo.tracked is None:
-                raise InputError(f"{photo.name} has neither an outline nor tracked points: leave it out.")
+            if not photo.kinds:
+                raise InputError(f"{photo.name} has neither an outline, tracked points nor a cloud: leave it out.")
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
         for name in bounds:
@@ -63,7 +66,7 @@ class PictureMisfit(BoundedMisfit):
                 parameter, owner = split_name(name)
                 known_names = [*dict.fromkeys(n for pose in self.poses for n in pose.parameter_names)]
                 raise InputError(
-                    f"{owner} is neither a pose nor a material: name one."
+                    f"{owner} is neither a pose, a material nor a lens: name one."
                     if owner and parameter in known_names
                     else f"there is no parameter {parameter!r} to identify: choose from {', '.join(known_names)}."
                 )
@@ -75,11 +78,21 @@ class PictureMisfit(BoundedMisfit):
     def forget(self) -> None:
         self._shapes = [*self._first]
 
+    @override
+    def update_prior_weight(self, unit: FloatArray) -> float:
+        """As elsewhere, but from the known noise of clouds before the first search: a far guess has no small errors."""
+        first, change = not self.prior_weight, super().update_prior_weight(unit)
+        points = sum(len(photo.cloud.measured) for pose in self.poses for photo in pose.photos if photo.cloud)
+        if first and points:
+            self.prior_weight = min(self.prior_weight, 1.0 / points)
+        return change
+
     @staticmethod
     def _acts(name: str, pose: SeenPose) -> bool:
         """Whether a parameter acts on a pose."""
         parameter, owner = split_name(name)
-        return owner in ("", pose.name, pose.material) and parameter in pose.parameter_names
+        owners = (*pose.owners, *(pose.lenses if parameter in CORRECTIONS else ()))
+        return owner in owners and parameter in pose.parameter_names
 
     def shape(self, number: int, own: Mapping[str, float]) -> torch.Tensor:
         """Returns the vertices (N, 3) of a pose with values of its parameters [m], from the last ones.
@@ -99,12 +112,13 @@ class PictureMisfit(BoundedMisfit):
         values, trials = self.from_unit(unit), list[Linearised]()
         share = 1.0 / sum(len(pose.photos) for pose in self.poses)
         for number, pose in enumerate(self.poses):
-            own = values_of(pose, {**self._known, **values})
+            known = {**self._known, **values}
+            own = values_of(pose, known)
             try:
                 q = self.shape(number, own)
                 tangents = self._tangents(number, unit, own, q) if derivatives else {}
                 for photo in pose.photos:
-                    trials += self._of_photo(pose, photo, own, q, tangents, share)
+                    trials += self._of_photo(pose, photo, values_of(pose, known, photo.lens), q, tangents, share)
             except ConvergenceError:
                 return None
             except InputError:
@@ -145,18 +159,19 @@ class PictureMisfit(BoundedMisfit):
         tangents: Mapping[int, torch.Tensor],
         share: float,
     ) -> list[Linearised]:
-        """Weighted residuals of a picture, and their derivatives: outlines both ways, and tracked points.
+        """Weighted residuals of a picture, and their derivatives: outlines both ways, tracked points, and a cloud.
 
         The outlines of all pictures by a standing camera, both ways, have nearly the same errors (correlated by 0.87 to
         0.997 between real pictures), so that they count as one set.
         """
         corrections, parts = PlacedCamera.corrections(own), list[Linearised]()
         moved = torch.stack([*tangents.values()]) if tangents else q.new_zeros(0, *q.shape)
-        share, copies = share / (1 + (photo.outline is not None and photo.tracked is not None)), pose.copies
+        share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
         if photo.outline is not None:
             seen = pose.outlines(photo, q, corrections)
             rim = seen.silhouette
-            slopes = self._slopes(pose, photo, rim.points(q), corrections, rim.points(moved), [*tangents])
+            by = camera.derivative(rim.points(q), corrections, rim.points(moved)).numpy()
+            slopes = self._slopes(pose, photo, by, [*tangents])
             distance, along = photo.outline.signed(rim.pixels)
             order = np.argsort(cKDTree(photo.outline.points).query(rim.pixels)[1], kind="stable")
             jacobian = np.einsum("kpi,pi->pk", slopes, along)[order, None]
@@ -168,30 +183,35 @@ class PictureMisfit(BoundedMisfit):
         if photo.tracked is not None and pose.points is not None:
             places = pose.points(q[None])[0]
             moves = (moved.flatten(1) @ pose.points.transposed_jacobian(q[None])[0]).unflatten(1, (-1, 3))
-            slopes = self._slopes(pose, photo, places, corrections, moves, [*tangents])
-            away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
+            slopes = self._slopes(pose, photo, camera.derivative(places, corrections, moves).numpy(), [*tangents])
+            away = camera.pixels(places, corrections).numpy() - photo.tracked
             visible = np.asarray(np.isfinite(away).all(1))
             jacobian, away = slopes.transpose(1, 2, 0), np.where(visible[:, None], away, 0.0)
             if visible.any():
                 parts.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
+        if photo.cloud is not None:
+            cloud, (closest, weights) = photo.cloud, pose.cloud_distances(photo, q, corrections)
+            placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
+            by = np.concatenate([closest.moved(moved), np.einsum("cpi,pi->cp", placed, closest.directions)])
+            slopes = self._slopes(pose, photo, by, [*tangents]) * (np.abs(closest.distances) < cloud.reach)
+            distance = closest.distances.clip(-cloud.reach, cloud.reach)[:, None] / cloud.noise
+            parts.append(_weighted(share, weights, distance, slopes.T[:, None] / cloud.noise, copies))
         return parts
 
-    def _slopes(
-        self,
-        pose: SeenPose,
-        photo: Photo,
-        points: torch.Tensor,
-        corrections: torch.Tensor,
-        moves: torch.Tensor,
-        columns: Sequence[int],
-    ) -> FloatArray:
-        """(K, P, 2) derivatives of the pixels of points (P, 3) by all K parameters, with those of the points [px]."""
-        by = photo.camera.derivative(points, corrections, moves).numpy()
+    def _slopes(self, pose: SeenPose, photo: Photo, by: FloatArray, columns: Sequence[int]) -> FloatArray:
+        """Derivatives (P, ...) by all P parameters, from those (K + 9, ...) by K physical ones and the corrections.
+
+        Args:
+            pose: of the picture.
+            photo: the picture.
+            by: see above.
+            columns: K numbers of the physical parameters.
+        """
         slopes = np.zeros((len(self.bounds), *by.shape[1:]))
         slopes[columns] = by[: len(columns)]
         for column, (name, range_) in enumerate(self.bounds.items()):
-            parameter = split_name(name)[0]
-            if parameter in CORRECTIONS and self._acts(name, pose):
+            parameter, owner = split_name(name)
+            if parameter in CORRECTIONS and owner in (*pose.owners, photo.lens):
                 slopes[column] = by[len(columns) + CORRECTIONS.index(parameter)] * range_.slope(0.5)
         return slopes
 
@@ -202,7 +222,7 @@ def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: 
     Args:
         share: of the loss.
         weight: (T,) of each point.
-        distance: (T, C) coordinates of the distance of each point [px].
+        distance: (T, C) coordinates of the distance of each point [px], or multiples of its noise.
         jacobian: (T, C, P) of the distances.
         copies: number of sets of residuals with the same errors; this one counts as a part of one.
     """
@@ -218,9 +238,13 @@ def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: 
     return rows, (scale[..., None] * slopes).reshape(rows.size, -1), count
 
 
-def values_of(pose: SeenPose, values: Mapping[str, float]) -> dict[str, float]:
-    """Returns the values of a pose's parameters, by their names without an owner; the pose's own take precedence."""
+def values_of(pose: SeenPose, values: Mapping[str, float], lens: str = "") -> dict[str, float]:
+    """Returns the values of a pose's parameters, by their names without an owner.
+
+    Values of a lens come before those of all, values of its material before these, and its own before all others.
+    """
     own: dict[str, float] = {}
-    for owner in dict.fromkeys(("", pose.material, pose.name)):
+    everyone, *owners = pose.owners
+    for owner in dict.fromkeys((everyone, lens, *owners)):
         own |= {split_name(name)[0]: value for name, value in values.items() if split_name(name)[1] == owner}
     return own

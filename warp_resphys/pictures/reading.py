@@ -1,15 +1,16 @@
-"""Pictures of a scene in a folder: the places of their cameras, masks of the body, and points tracked in them.
+"""Pictures of a scene in a folder: the places of their cameras, masks of the body, depths, and tracked points.
 
 A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4 x 4, row-major,
-metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is;
-and perhaps `fixed`, a list of clamps with the numbers of their `vertices`. docs/pictures.md has an example. Tracked
-points are tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays
-`tracks` (T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
+metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is,
+a `depth` image and the name of its `lens`; perhaps `fixed`, a list of clamps with the numbers of their `vertices`; and
+perhaps `world_to_cloud`, the same matrix for the axes of a scan. docs/pictures.md has an example. Tracked points are
+tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays `tracks`
+(T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
 """
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,13 @@ class Frame:
     image: Path
     pose: FloatArray | None  # (4, 4) world_to_camera; None where a tag shows it
     mask: Path | None = None
+    depth: Path | None = None
+    lens: str = ""  # name of the lens; empty for a single one
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Its files; the first is the most telling."""
+        return tuple(path for path in (self.depth, self.mask, self.image) if path is not None)
 
 
 @dataclass(frozen=True)
@@ -77,22 +85,29 @@ class SceneFile:
     path: Path
     frames: tuple[Frame, ...]
     clamps: tuple[NDArray[np.int64], ...]  # vertices in each
+    scan_pose: FloatArray  # (4, 4) world_to_cloud
 
 
-def read_scene(path: Path) -> SceneFile:
+def read_scene(path: Path, scanned: bool = False) -> SceneFile:
     """Reads a `camera.json`.
+
+    Args:
+        path: of the file.
+        scanned: whether there is a scan, so that there may be no frames, or no such file at all.
 
     Raises:
         DataFileError: it is missing or damaged, or an entry is missing or of a wrong shape.
     """
+    if scanned and not path.exists():
+        return SceneFile(path, (), (), np.eye(4))
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DataFileError(f"{path} is no JSON ({error}): write the cameras of its pictures anew.") from error
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames:
+    frames = content.get("frames", [] if scanned else None) if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not (frames or scanned):
         raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md).")
     groups = content.get("fixed", [])
     try:
@@ -101,14 +116,24 @@ def read_scene(path: Path) -> SceneFile:
         raise DataFileError(f"{path}: 'fixed' is a list of clamps, each with its 'vertices': {error}.") from error
     if not all(len(clamp) for clamp in clamps):
         raise DataFileError(f"{path}: a clamp of 'fixed' has no 'vertices': leave it out.")
-    return SceneFile(path, tuple(_frame(path, number, entry) for number, entry in enumerate(frames)), clamps)
+    scan_pose = _pose(f"{path}", "world_to_cloud", content)
+    shown = tuple(_frame(path, number, entry) for number, entry in enumerate(frames))
+    return SceneFile(path, shown, clamps, np.eye(4) if scan_pose is None else scan_pose)
 
 
 def _frame(path: Path, number: int, entry: Any) -> Frame:
-    if not isinstance(entry, dict) or not isinstance(entry.get("image"), str):
+    image = entry.get("image", entry.get("depth")) if isinstance(entry, dict) else None
+    if not isinstance(image, str):
         raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
+    mask, depth = (None if entry.get(key) is None else path.parent / str(entry[key]) for key in ("mask", "depth"))
+    pose = _pose(f"{path}: frame {number}", "world_to_camera", entry)
+    return Frame(number, path.parent / image, pose, mask, depth, str(entry.get("lens", "")))
+
+
+def _pose(where: str, key: str, entry: Mapping[str, Any]) -> FloatArray | None:
+    """A rigid motion (4, 4) of an entry; None without."""
     try:
-        given = entry.get("world_to_camera")
+        given = entry.get(key)
         pose = None if given is None else np.array(given, dtype=np.float64).reshape(4, 4)
         rigid = pose is None or (
             np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=_RIGID)
@@ -116,14 +141,13 @@ def _frame(path: Path, number: int, entry: Any) -> Frame:
             and np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=_RIGID)
         )
     except (TypeError, ValueError) as error:
-        raise DataFileError(f"{path}: frame {number}: 'world_to_camera' has 4 rows of 4 numbers ({error}).") from error
+        raise DataFileError(f"{where}: '{key}' has 4 rows of 4 numbers ({error}).") from error
     if not rigid:
         raise DataFileError(
-            f"{path}: frame {number}: 'world_to_camera' is no rotation with a shift, above 0, 0, 0, 1: write it row by "
-            "row, for right-handed axes."
+            f"{where}: '{key}' is no rotation with a shift, above 0, 0, 0, 1: write it row by row, for right-handed "
+            "axes."
         )
-    mask = entry.get("mask")
-    return Frame(number, path.parent / entry["image"], pose, None if mask is None else path.parent / str(mask))
+    return pose
 
 
 def read_picture(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
@@ -158,6 +182,31 @@ def read_mask(frame: Frame, colours: Colours | None) -> Mask:
         return colours.mask(read_picture(frame.image))
     except InputError as error:
         raise InputError(f"{frame.image}: {error}") from None
+
+
+def read_depth(path: Path, unit: float) -> FloatArray:
+    """Reads a depth image (H, W), along the axis of the lens [m]; zero or not finite where there is none.
+
+    Args:
+        path: of a picture of 16-bit integers, or of a .npy file, in metres where its numbers are no integers.
+        unit: length that an integer stands for [m].
+
+    Raises:
+        DataFileError: it is missing, or has no single number at each pixel.
+    """
+    if path.suffix == ".npy":
+        values = read_arrays(path)[""]
+    else:
+        try:
+            with Image.open(path) as image:
+                values = np.asarray(image)
+        except (OSError, UnidentifiedImageError) as error:
+            raise DataFileError(f"cannot read the depth image {path} ({error}).") from error
+        if values.dtype == np.uint8:
+            raise DataFileError(f"{path} has 8 bits: write depths as a PNG of 16-bit integers, or as .npy in m.")
+    if values.ndim != 2 or values.dtype.kind not in "iuf":
+        raise DataFileError(f"{path} has the shape {values.shape}: a depth image has one number at each pixel.")
+    return np.asarray(values, dtype=np.float64) * (1.0 if values.dtype.kind == "f" else unit)
 
 
 def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequence[int]) -> FloatArray:

@@ -15,7 +15,8 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
-from .camera import CORRECTIONS, PlacedCamera
+from .camera import CORRECTIONS, PLACES, PlacedCamera
+from .clouds import Cloud, CloudDistances, distances_of
 from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
@@ -24,24 +25,34 @@ Shape = tuple[Mapping[str, float], torch.Tensor]  # values of parameters, and ve
 
 _TURNED: Final = 0.4  # rad, largest part of a clamp's turn from one equilibrium to the next
 _MARGIN: Final = 6.0  # px, around what a clamp hides
+_COUNTED: Final = 0.5  # weight of a point of a cloud, from which it counts in a median
 _MILLI: Final = 1e3
 
 
 @dataclass(frozen=True)
 class Photo:
-    """Outline or tracked points of a body in a picture.
+    """Outline, tracked points or depths of a body in a picture, or a scan of it.
 
     Attributes:
-        name: of the picture.
-        camera: before which the body stands.
+        name: of the picture, or of the scan.
+        camera: before which the body stands; without a lens, the axes of a scan.
         outline: of the body; None where it was not drawn.
         tracked: (M, 2) pixels of the body's tracked points, NaN where one was not seen; None without tracked points.
+        cloud: points of a scan or a depth image; None without.
+        lens: name of the lens, whose values of parameters are those of this picture; empty for a single one.
     """
 
     name: str
     camera: PlacedCamera
     outline: Outline | None = None
     tracked: FloatArray | None = None
+    cloud: Cloud | None = None
+    lens: str = ""
+
+    @property
+    def kinds(self) -> int:
+        """Number of kinds of measurements: outline, tracked points, cloud."""
+        return sum(own is not None for own in (self.outline, self.tracked, self.cloud))
 
 
 @dataclass(frozen=True)
@@ -67,18 +78,20 @@ class Difference:
         outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
         outline_px: the same in pixels.
         overlap: common area over that of both together, outside of the clamps.
+        cloud_mm: median distance of the points of a cloud from the surface; None without.
         points_mm: mean distance of the tracked points that were seen, at their depths; None without.
     """
 
-    outline_mm: float | None
-    outline_px: float | None
-    overlap: float | None
-    points_mm: float | None
+    outline_mm: float | None = None
+    outline_px: float | None = None
+    overlap: float | None = None
+    cloud_mm: float | None = None
+    points_mm: float | None = None
 
     @property
     def distance(self) -> float:
-        """Distance of the outlines, or of the points where there are no outlines [mm]."""
-        known = [value for value in (self.outline_mm, self.points_mm) if value is not None]
+        """Distance of the outlines; where there are none, of the cloud, and without that, of tracked points [mm]."""
+        known = [value for value in (self.outline_mm, self.cloud_mm, self.points_mm) if value is not None]
         return known[0] if known else math.nan
 
 
@@ -116,22 +129,36 @@ class SeenPose:
         if self.points is None and any(photo.tracked is not None for photo in self.photos):
             raise InputError(f"{self.name}: points were tracked, but their places on the body are not known.")
 
-    def before(self, camera: torch.Tensor) -> Self:
-        """Returns the pose with all its pictures taken from one place, world_to_camera (4, 4)."""
-        placed = (replace(photo, camera=replace(photo.camera, pose=camera)) for photo in self.photos)
+    def before(self, cameras: Mapping[str, torch.Tensor]) -> Self:
+        """Returns the pose with all pictures by a lens taken from one place, world_to_camera (4, 4) by its name."""
+        placed = (
+            replace(photo, camera=replace(photo.camera, pose=cameras[photo.lens]))
+            if photo.camera.lens is not None and photo.lens in cameras
+            else photo
+            for photo in self.photos
+        )
         return replace(self, photos=tuple(placed))
 
+    def copies(self, photo: Photo) -> int:
+        """Number of pictures by the standing camera of one, which have nearly the same errors; one where it moves."""
+        mine = [own for own in self.photos if (own.lens, own.camera.lens) == (photo.lens, photo.camera.lens)]
+        return len(mine) if all(torch.equal(own.camera.pose, photo.camera.pose) for own in mine) else 1
+
     @property
-    def copies(self) -> int:
-        """Number of its pictures by one standing camera, which have nearly the same errors; one where it moves."""
-        first = self.photos[0].camera.pose
-        return len(self.photos) if all(torch.equal(photo.camera.pose, first) for photo in self.photos) else 1
+    def owners(self) -> tuple[str, ...]:
+        """Owners of values of its parameters, of which a later one takes precedence; without the lenses."""
+        return ("", self.material, self.name)
+
+    @property
+    def lenses(self) -> tuple[str, ...]:
+        """Names of the lenses of its pictures."""
+        return tuple(dict.fromkeys(photo.lens for photo in self.photos if photo.camera.lens is not None))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters that shape and pictures depend on."""
         clamps = (CLAMP_TURN, CLAMP_SHIFT) if len(self.clamps) > 1 else ()
-        return (*identifiable_parameters(self.simulator), *clamps, *CORRECTIONS)
+        return (*identifiable_parameters(self.simulator), *clamps, *(CORRECTIONS if self.lenses else PLACES))
 
     def shape(self, values: Mapping[str, float], near: Shape | None = None) -> torch.Tensor:
         """Returns the vertices (N, 3) of the body at rest [m].
@@ -215,6 +242,19 @@ class SeenPose:
             )
         return SeenOutline(rim, simulated, measured)
 
+    def cloud_distances(
+        self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor
+    ) -> tuple[CloudDistances, FloatArray]:
+        """Returns the distances of a cloud from the body (N, 3) [m], and weights (P,) of its points.
+
+        A point whose closest one is on a clamp, which hides the body, has no weight; it grows to one across the
+        triangles beside the clamp.
+        """
+        assert photo.cloud is not None
+        closest = distances_of(photo.cloud, photo.camera, corrections, self.surface.triangles, q)
+        clamped = np.isin(closest.triangles, np.concatenate(self.clamps))
+        return closest, 1.0 - (clamped * closest.shares).sum(1).clip(0.0, 1.0)
+
     def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
         """Returns how far a simulated picture is from a measured one.
 
@@ -224,25 +264,29 @@ class SeenPose:
             values: of the camera's corrections by name; none where they are left out.
         """
         q, corrections = q.double().cpu(), PlacedCamera.corrections(values)
-        depth = photo.camera.seen_from(q, corrections)[:, 2]
-        # mm for a pixel at a depth of 1 m
-        scale = _MILLI / float(corrections[6] * photo.camera.lens.matrix[:2, :2].diagonal().mean())
-        millimetres = pixels = overlap = points = None
+        result = Difference()
         if photo.outline is not None:
+            depth = photo.camera.seen_from(q, corrections)[:, 2]
             seen = self.outlines(photo, q, corrections)
             there = np.abs(photo.outline.signed(seen.silhouette.pixels)[0])
             back = np.abs(seen.silhouette.closest(photo.outline.points)[1])
             both = [np.average(there, weights=seen.of_simulated), np.average(back, weights=seen.of_measured)]
             pixels = float(np.mean(both))
-            millimetres = pixels * float(depth.mean()) * scale
+            millimetres = pixels * float(depth.mean()) * photo.camera.millimetres(corrections)
             drawn = photo.camera.pixels(q, corrections).numpy()
             hidden = shapely.union_all([shapely.convex_hull(shapely.multipoints(drawn[own])) for own in self.clamps])
             body, mask = (shapely.difference(own, hidden) for own in (self.surface.region(drawn), photo.outline.region))
             overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
+            result = replace(result, outline_mm=millimetres, outline_px=pixels, overlap=overlap)
+        if photo.cloud is not None:
+            closest, weights = self.cloud_distances(photo, q, corrections)
+            counted = np.abs(closest.distances)[weights > _COUNTED]
+            result = replace(result, cloud_mm=_MILLI * float(np.median(counted)) if len(counted) else None)
         if photo.tracked is not None and self.points is not None:
             places = self.points(q[None])[0]
             away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
             deep = photo.camera.seen_from(places, corrections)[:, 2].numpy()
-            distance = np.linalg.norm(away, axis=1) * deep * scale
-            points = float(np.nanmean(distance)) if np.isfinite(distance).any() else None
-        return Difference(millimetres, pixels, overlap, points)
+            distance = np.linalg.norm(away, axis=1) * deep * photo.camera.millimetres(corrections)
+            if np.isfinite(distance).any():
+                result = replace(result, points_mm=float(np.nanmean(distance)))
+        return result

@@ -7,7 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import h5py
 import numpy as np
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -18,6 +20,7 @@ from .identification_section import parameter_rows
 from .page import (
     NO_BREAK_SPACE,
     NONE,
+    Block,
     Canvas,
     Cell,
     Drawn,
@@ -36,6 +39,11 @@ log = logging.getLogger(__name__)
 
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
 _DRAWN: Final = {"simulation": TONES["simulation"].light, "sysid": "#35d0ff"}
+_FIRST: Final = next(iter(_MODELS))
+_CLOUD_PANEL: Final = 2.6  # inch
+_CLOUD_MARGIN: Final = 0.04  # around a body, over its longer side
+_BODY: Final = "#d3dde7"
+_SHOWN: Final = 0.95  # of the points of clouds, whose distances are within the colours
 _MARGIN: Final = 25  # px, around the body in a figure
 _COVERED: Final = 0.5  # overlap, below which a fit has failed
 _PANEL: Final = 3.6  # inch
@@ -54,6 +62,7 @@ class PictureResult:
         outline_mm: mean distance of the outlines, both ways, at the depth of the body.
         outline_px: the same in pixels.
         overlap: common area over the area of both.
+        cloud_mm: median distance of the points of scans and depth images.
         points_mm: mean distance of the tracked points.
     """
 
@@ -64,11 +73,18 @@ class PictureResult:
     outline_mm: Mapping[str, float | None]
     outline_px: Mapping[str, float | None]
     overlap: Mapping[str, float | None]
+    cloud_mm: Mapping[str, float | None]
     points_mm: Mapping[str, float | None]
 
+    @property
+    def compared(self) -> str:
+        """What models are compared by: outlines; a cloud where there are none; without that, tracked points."""
+        kinds = {"outlines": self.outline_mm, "clouds": self.cloud_mm}
+        return next((kind for kind, values in kinds.items() if values["sysid"] is not None), "tracked points")
+
     def distance(self, model: str) -> float:
-        """Distance by which models are compared [mm]: of the outlines, or of the points where there are none."""
-        value = self.outline_mm[model] if self.outline_mm[model] is not None else self.points_mm[model]
+        """Distance by which models are compared [mm]."""
+        value = {"outlines": self.outline_mm, "clouds": self.cloud_mm}.get(self.compared, self.points_mm)[model]
         return float("nan") if value is None else value
 
 
@@ -140,8 +156,16 @@ def write_pictures_report(
         "outlines.",
     )
     with figures_beside(path) as folder:
-        panels = [(result, picture(result.pose, 0)) for result in results]
-        drawn = Canvas(folder).attempt("outlines.png", partial(draw_outlines, panels, outlines))
+        canvas, drawn = Canvas(folder), list[Block]()
+        panels = [(own, picture(own.pose, 0)) for own in results if own.outline_mm["sysid"] is not None]
+        clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
+        # Pictures without outlines are shown as well, where there is nothing else to see.
+        panels = panels or [(own, picture(own.pose, 0)) for own in results if not clouds]
+        if panels:
+            drawn += canvas.attempt("outlines.png", partial(draw_outlines, panels, outlines))
+        if clouds:
+            up = [-np.array(run.pictures.poses[own.pose].gravity or run.gravity) for own in clouds]
+            drawn += canvas.attempt("clouds.png", partial(draw_clouds, list(zip(clouds, up, strict=True)), outlines))
     write_page(
         path,
         [
@@ -160,27 +184,28 @@ def write_pictures_report(
 
 _HOW: Final = (
     "A distance is the mean over both outlines of that to the closest point of the other, at the mean depth of the "
-    "body; parts that a clamp hides do not count. The overlap is the common area over that of both together. What "
+    "body; parts that a clamp hides do not count. The overlap is the common area over that of both together. The "
+    "distance of a cloud is the median over its points of that to the surface, of a depth image to its visible side. "
+    "What "
     "belongs to a pose alone, such as its place before the camera, is fitted to it for each of the models."
 )
 
 
 def _distances(results: Sequence[PictureResult]) -> PageTable:
     """Table of the distances, with a row for each pose."""
-    by_points = any(result.points_mm["sysid"] is not None for result in results)
-    columns = [
-        *(f"{name} [mm]" for name in _MODELS.values()),
-        "Overlap",
-        *(["Tracked points [mm]"] if by_points else []),
-    ]
+    others = {"Overlap": "overlap", "Cloud [mm]": "cloud_mm", "Tracked points [mm]": "points_mm"}
+    others = {
+        name: key
+        for name, key in others.items()
+        if any(getattr(own, key)["sysid"] not in (None, own.distance("sysid")) for own in results)
+    }
     rows = []
     for result in results:
-        cells = [Cell(_text(result.outline_mm[model])) for model in _MODELS]
-        cells += [Cell(_text(result.overlap["sysid"]))]
-        cells += [Cell(_text(result.points_mm["sysid"]))] if by_points else []
+        cells = [Cell(number_text(result.distance(model))) for model in _MODELS]
+        cells += [Cell(_text(getattr(result, key)["sysid"])) for key in others.values()]
         small = f"{result.material}{', ' * bool(result.material)}{'kept back' if result.tested else 'training'}"
         rows.append(Row(result.pose, cells, answer=result.tested, small=small))
-    return PageTable("Pose", columns, rows)
+    return PageTable("Pose", [*(f"{name} [mm]" for name in _MODELS.values()), *others], rows)
 
 
 def _text(value: float | None) -> str:
@@ -220,7 +245,7 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
                 axis.plot(
                     *points.T, linestyle="", marker=".", markersize=0.9, color=colour, label=_MODELS[model].lower()
                 )
-            low, high = _frame(measured)
+            low, high = _frame_of(measured, _MARGIN)
             axis.set_xlim(low[0], high[0])
             axis.set_ylim(high[1], low[1])
     handles, labels = axes[0].get_legend_handles_labels()
@@ -240,9 +265,84 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
     return drawn_file(path, f"Outlines on pictures. Mean distances: {alt}.", caption)
 
 
-def _frame(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest coordinates (2,) of a frame of 4 to 3 around points [px]."""
-    low, high = points.min(0) - _MARGIN, points.max(0) + _MARGIN
+@in_style()
+def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path) -> Drawn:
+    """Draws the first cloud of every pose on the body of each model into a PNG file, in colours of the distance.
+
+    Args:
+        panels: results, with the direction (3,) upwards.
+        outlines: file with the clouds.
+        path: of the PNG file.
+
+    Raises:
+        DataFileError: the file is damaged.
+    """
+    rows = list[tuple[PictureResult, list[_Panel]]]()
+    with read_hdf5(outlines, "outlines") as file:
+        for result, up in panels:
+            number = next(own for own in file[result.pose] if f"{_FIRST}_places" in file[f"{result.pose}/{own}"])
+            rows.append((result, _cloud_panels(file[f"{result.pose}/{number}"], up)))
+    most = max(float(np.quantile(own.distances, _SHOWN)) for _, own_panels in rows for own in own_panels[1:])
+    figure = Figure(figsize=(len(_MODELS) * _CLOUD_PANEL, len(rows) * _CLOUD_PANEL * 0.8), layout="constrained")
+    axes = figure.subplots(len(rows), len(_MODELS), squeeze=False)
+    dots = None
+    for (result, own_panels), row in zip(rows, axes, strict=True):
+        ends = np.concatenate([own.places for own in own_panels] + [own.body.reshape(-1, 2) for own in own_panels])
+        low, high = _frame_of(ends, _CLOUD_MARGIN * float(np.ptp(ends, axis=0).max()))
+        for model, axis, own in zip(_MODELS, row, own_panels, strict=True):
+            axis.add_collection(PolyCollection([*own.body], facecolors=_BODY, edgecolors=_BODY, linewidths=0.3))
+            dots = axis.scatter(
+                *own.places.T, c=own.distances, s=2.5, cmap="viridis", vmin=0.0, vmax=most, linewidths=0
+            )
+            axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+            axis.grid(visible=False)
+            for spine in axis.spines.values():
+                spine.set_visible(False)
+            axis.set_title(
+                f"{result.pose}{' (kept back)' * result.tested}\n{_MODELS[model].lower()}: "
+                f"{_text(result.cloud_mm[model])} mm"
+            )
+    if dots is not None:
+        bar = figure.colorbar(dots, ax=axes, location="bottom", shrink=0.5, aspect=40, extend="max")
+        bar.set_label("distance of a point from the surface [mm]")
+    figure.savefig(path, dpi=170)
+    caption = (
+        "Measured points on the simulated body (grey) as seen from the side, above with the median of their distances: "
+        "the undeformed body, the simulator with the parameters of the data sheet, and the identified one."
+    )
+    alt = "; ".join(f"{own.pose}: {', '.join(_text(own.cloud_mm[model]) for model in _MODELS)} mm" for own, _ in panels)
+    return drawn_file(path, f"Clouds of points on bodies. Median distances of the three models: {alt}.", caption)
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A cloud and the body of a model, seen from the side."""
+
+    places: FloatArray  # (P, 2) of the points [m]
+    distances: FloatArray  # (P,) [mm]
+    body: FloatArray  # (F, 3, 2) triangles of its surface [m]
+
+
+def _cloud_panels(group: h5py.Group, up: FloatArray) -> list[_Panel]:
+    """The panels of a cloud, in the order of the models: along the horizontal direction in which it is thinnest."""
+    triangles, panels = read_array(group, "triangles"), []
+    shape = read_array(group, f"{_FIRST}_surface")
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    level = np.eye(3) - np.outer(up, up)
+    spread = np.linalg.eigh(level @ np.cov(shape.T) @ level)[1]
+    right = spread[:, -1]
+    for model in _MODELS:
+        places, distances, weights, surface = (
+            read_array(group, f"{model}_{key}") for key in ("places", "distances", "weights", "surface")
+        )
+        axes, seen = np.stack([right, up], 1), weights > 0.0
+        panels.append(_Panel(places[seen] @ axes, 1e3 * distances[seen], surface[triangles] @ axes))
+    return panels
+
+
+def _frame_of(points: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest coordinates (2,) of a frame of 4 to 3 around points (P, 2)."""
+    low, high = points.min(0) - margin, points.max(0) + margin
     half = 0.5 * np.maximum(high - low, (high - low)[::-1] * np.array([4.0 / 3.0, 0.75]))
     middle = 0.5 * (low + high)
     return middle - half, middle + half

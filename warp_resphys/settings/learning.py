@@ -38,10 +38,10 @@ class RangeSettings(SpanSettings):
     """The search range of a parameter."""
 
     prior: PriorSettings | None = setting(None, "prior knowledge")
-    per: Literal["all", "session", "trial", "material"] = setting(
+    per: Literal["all", "session", "trial", "material", "lens"] = setting(
         "all",
         "trials that share a value; session, trial: a value of each, near the mean of the prior, that of all others; "
-        "material: of pictures, a value of each material",
+        "material, lens: of pictures, a value of each material or lens",
     )
 
     @model_validator(mode="after")

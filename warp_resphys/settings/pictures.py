@@ -1,8 +1,10 @@
 """Settings of bodies at rest that are seen by cameras."""
 
+from collections.abc import Mapping
+from itertools import combinations
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
 from .mesh import LengthUnit
@@ -33,6 +35,28 @@ class LensSettings(Settings):
         return self
 
 
+def _kind_of_lens(value: object) -> str:
+    """Whether settings of lenses are those of one, or of several by their names."""
+    one = isinstance(value, LensSettings) or not isinstance(value, Mapping) or {*value} & {*LensSettings.model_fields}
+    return "one" if one else "several"
+
+
+_Lenses = Annotated[
+    Annotated[LensSettings, Tag("one")] | Annotated[dict[str, LensSettings], Tag("several")],
+    Discriminator(_kind_of_lens),
+]
+
+
+class CloudSettings(Settings):
+    """Scans of the surface of bodies, and depth images."""
+
+    units: LengthUnit = setting("m", "of scans")
+    depth_unit: Positive = setting(1e-3, "length that an integer of a depth image stands for", "m")
+    noise: Positive = setting(1e-3, "standard deviation of a distance from the surface", "m")
+    reach: Positive = setting(0.05, "distance from the body, beyond which a point is of something else", "m")
+    points: Natural = setting(1000, "of each scan or depth image, chosen at random")
+
+
 class TagSettings(Settings):
     """A square tag on the clamp, from which the camera's place is computed in place of world_to_camera."""
 
@@ -56,6 +80,10 @@ class PoseSettings(Settings):
     mask: ColourSettings | None = setting(None, "colours of the body, where its frames have no masks; null: data.mask")
     outline: bool = setting(True, "whether the body's outline is compared")
     points: Word | None = setting(None, "file of tracked points, in its folder, with a row for each frame")
+    cloud: Word | None = setting(
+        None, "file of a scan of its surface, in its folder: .ply, .xyz, .pcd, .npy, .obj, .off or .stl"
+    )
+    depth: bool = setting(True, "whether depth images of its frames are compared")
     gravity: Vector | None = setting(None, "in the axes of the scene; null: as configured", "m/s^2")
     clamp_turn: float = setting(0.0, "about which the second clamp is turned against the first", "degrees")
 
@@ -66,6 +94,7 @@ class SimulatedCamera(Settings):
     material: dict[str, float] = setting({}, "constants of the true material that differ from the simulation")
     corrections: dict[str, float] = setting({}, "true corrections of the camera, by parameter")
     noise: NotNegative = setting(1.0, "standard deviation of an outline, across it", "px")
+    depth: NotNegative | None = setting(None, "standard deviation of each pixel of depth images; null: no such", "m")
     size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
     place: Vector = setting(description="of the camera", unit="m")
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
@@ -76,7 +105,9 @@ class PictureData(Settings):
 
     kind: Literal["pictures"]
     folder: Word | None = setting(None, "of the pictures")
-    lens: LensSettings = setting(description="of the camera")
+    lens: _Lenses | None = setting(
+        None, "of the camera; of several cameras, a name for each: {left: {file: left.yaml}, right: {...}}"
+    )
     tag: TagSettings | None = setting(None, "on the clamp; null: frames have world_to_camera")
     stands: bool = setting(
         True, "whether the camera stands still during a pose, so that the poses of its frames differ by errors alone"
@@ -86,6 +117,7 @@ class PictureData(Settings):
     mask: ColourSettings | None = setting(None, "colours of the bodies, where frames have no masks")
     points: dict[str, Vector] = setting({}, "places of tracked points on the undeformed body, by name", "m")
     likelihood: _Fraction = setting(0.6, "of a tracked point, below which it counts as not seen")
+    cloud: CloudSettings = setting(CloudSettings(), "of scans and depth images")
     materials: dict[str, dict[str, float]] = setting(
         {}, "constants of materials by name, where they differ from the group simulation"
     )
@@ -107,13 +139,13 @@ class PictureData(Settings):
             raise ValueError(
                 f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
             )
-        if blind := [name for name, pose in self.poses.items() if not pose.outline and pose.points is None]:
-            raise ValueError(f"poses.{blind[0]} has no outline and no points: give one of them.")
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
-        if both := [name for name in self.materials if name in self.poses]:
-            raise ValueError(f"materials and data.poses both have '{both[0]}': rename one.")
+        owners = {"data.poses": [*self.poses], "data.materials": [*self.materials], "data.lens": [*self.lenses]}
+        for (first, mine), (second, others) in combinations(owners.items(), 2):
+            if both := [name for name in mine if name in others]:
+                raise ValueError(f"{first} and {second} both have '{both[0]}': rename one.")
         if unseen := {self.poses[name].material for name in self.test} - {self.poses[n].material for n in self.train}:
             raise ValueError(
                 f"test has a pose of {min(map(str, unseen))}, of which no pose is in data.train: take it out."
@@ -124,14 +156,23 @@ class PictureData(Settings):
             raise ValueError("simulated is for pictures without a folder, and data.folder is set: set it to null.")
         if self.simulated is not None:
             for name, pose in self.poses.items():
-                if pose.mesh or pose.material or pose.points or pose.clamp_turn:
+                if pose.mesh or pose.material or pose.points or pose.cloud or pose.clamp_turn:
                     raise ValueError(
-                        f"poses.{name} has a mesh, a material, points or a turned clamp, which the simulated camera "
-                        "does not play: leave them out."
+                        f"poses.{name} has a mesh, a material, points, a scan or a turned clamp, which the simulated "
+                        "camera does not play: leave them out."
                     )
+            if [*self.lenses] != [""]:
+                raise ValueError("lens must be a single one for the simulated camera.")
             if len({pose.folder for pose in self.poses.values()}) < len(self.poses):
                 raise ValueError("poses share a folder: give each its own.")
         return self
+
+    @property
+    def lenses(self) -> dict[str, LensSettings]:
+        """Lenses by name, which is empty for a single one."""
+        if isinstance(self.lens, dict):
+            return self.lens
+        return {} if self.lens is None else {"": self.lens}
 
     @property
     def base_motion(self) -> None:

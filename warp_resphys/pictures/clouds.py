@@ -1,0 +1,139 @@
+"""Points of a body's surface without identity: scans, and depth images; their distances from a simulated body.
+
+A measured point is compared with the closest point of the deformed surface. Its distance is differentiated along the
+line between the two, on which a shift of the closest point within the surface has no effect to first order (Besl and
+McKay 1992; with plane triangles this is the point-to-plane distance of Chen and Medioni 1992, except at edges). Only
+triangles on the side from which a point was seen are compared with it: towards the camera of a depth image, or towards
+the outer normal of a scanned surface. Parts of the body that no point shows do not count.
+
+Outliers hardly matter, by the robust loss of `misfit`, and points beyond a reach not at all; before that, what is
+farther from the clamp than the body is long is left out.
+
+`tests/pictures/test_clouds.py` compares distances with closed forms, and derivatives with differences.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from ..io.errors import InputError
+from ..mesh.surface import closest_of
+from .camera import PlacedCamera
+from .outlines import FloatArray, IntArray, Mask
+
+_LEAST: Final = 20  # points on a body
+_NEIGHBOURS: Final = 8  # of a point
+_ISOLATED: Final = 3.0  # distance of the last of these, over the median of all points, beyond which it is an outlier
+_LONGER: Final = 1.2  # of the length of a body: what it may be stretched to
+_SIZES: Final = (0.05, 200.0)  # of a cloud with its background, over that of the body
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Measured points, in the axes of a scan or as pixels with depths (`PlacedCamera.located`)."""
+
+    measured: FloatArray  # (P, 3) points [m], or pixels and depths [px, px, m]
+    outside: FloatArray | None = None  # (P, 3) another place towards which the surface faces; None where not known
+    noise: float = 1e-3  # standard deviation of a distance [m]
+    reach: float = 0.05  # distance from which points have no effect [m]
+
+    @classmethod
+    def of_depth(cls, depth: FloatArray, mask: Mask | None = None, noise: float = 1e-3, reach: float = 0.05) -> Self:
+        """Returns the points of a depth image.
+
+        Args:
+            depth: (H, W) along the axis of the lens, zero or not finite where there is none [m].
+            mask: (H, W) whether a pixel shows the body; all of them, if left out.
+            noise: see above.
+            reach: see above.
+        """
+        seen = np.isfinite(depth) & (depth > 0.0) & (True if mask is None else mask)
+        rows, columns = np.nonzero(seen)
+        measured = np.stack([columns, rows, depth[seen]], 1).astype(np.float64)
+        return cls(measured, measured * (1.0, 1.0, 0.0), noise, reach)  # at depth zero is the camera
+
+    def _chosen(self, index: IntArray | Mask) -> Self:
+        outside = None if self.outside is None else self.outside[index]
+        return replace(self, measured=self.measured[index], outside=outside)
+
+    def around(self, camera: PlacedCamera, vertices: FloatArray, count: int, random: np.random.Generator) -> Self:
+        """Returns at most a number of points that may be of a body, in their order along the longest axis.
+
+        Args:
+            camera: by which they are located, about the centre of the body's clamp.
+            vertices: (N, 3) of the undeformed body [m].
+            count: number of points.
+            random: chooses them.
+
+        Raises:
+            InputError: hardly a point may be of the body, or the cloud has another unit of length.
+        """
+        centre = camera.centre.numpy()
+        places = camera.located(torch.as_tensor(self.measured), PlacedCamera.corrections({})).numpy()
+        length = float(np.linalg.norm(vertices - centre, axis=1).max())
+        away = np.linalg.norm(places - centre, axis=1)
+        close = np.flatnonzero(away < _LONGER * length + self.reach)
+        size, body = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (places, vertices))
+        if len(close) < _LEAST or not _SIZES[0] < size / body < _SIZES[1]:
+            raise InputError(
+                f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "
+                f"{size:.3g} m across and {np.median(away):.3g} m from the clamp, and the body is {body:.3g} m across: "
+                "check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the pose "
+                "(world_to_cloud, world_to_camera)."
+            )
+        spacing = cKDTree(places[close]).query(places[close], _NEIGHBOURS + 1)[0][:, -1]
+        close = close[spacing <= _ISOLATED * np.median(spacing)]
+        if len(close) > count:
+            close = random.choice(close, count, replace=False)
+        longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
+        return self._chosen(close[np.argsort(places[close] @ longest)])
+
+
+@dataclass(frozen=True)
+class CloudDistances:
+    """The closest points of a body's surface to P points of a cloud."""
+
+    places: FloatArray  # (P, 3) of the points in the axes of the scene [m]
+    triangles: IntArray  # (P, 3) vertices of the closest triangle
+    shares: FloatArray  # (P, 3) of these vertices in the closest point
+    distances: FloatArray  # (P,) negative inside the body [m]
+    directions: FloatArray  # (P, 3) gradient of the distance
+
+    def moved(self, tangents: torch.Tensor) -> FloatArray:
+        """Returns derivatives (K, P) of the distances by K motions (K, N, 3) of the vertices [m]."""
+        at = torch.einsum("kpci,pc->kpi", tangents[:, torch.as_tensor(self.triangles)], torch.as_tensor(self.shares))
+        return -np.einsum("kpi,pi->kp", at.numpy(), self.directions)
+
+
+def distances_of(
+    cloud: Cloud, camera: PlacedCamera, corrections: torch.Tensor, triangles: IntArray, q: torch.Tensor
+) -> CloudDistances:
+    """Returns the distances of a cloud from a surface.
+
+    Args:
+        cloud: the points.
+        camera: by which they are located.
+        corrections: (9,) of it.
+        triangles: (F, 3) of the surface.
+        q: (N, 3) vertices [m].
+    """
+    vertices, towards = q.double().cpu().numpy(), None
+    places = camera.located(torch.as_tensor(cloud.measured), corrections).numpy()
+    if cloud.outside is not None:
+        towards = camera.located(torch.as_tensor(cloud.outside), corrections).numpy() - places
+    closest = closest_of(triangles, vertices, places, towards)
+    offset = places - closest.points
+    length = np.maximum(np.abs(closest.distances), 1e-12)[:, None]
+    directions = np.where(length > 1e-9, np.sign(closest.distances)[:, None] * offset / length, closest.normals)
+    shares = _barycentric(vertices[closest.triangles], closest.points)
+    return CloudDistances(places, closest.triangles, shares, closest.distances, directions)
+
+
+def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Shares (P, 3) of the corners (P, 3, 3) of triangles in points (P, 3) on them."""
+    import trimesh
+
+    return np.asarray(trimesh.triangles.points_to_barycentric(corners, points))

@@ -141,6 +141,16 @@ def test_a_camera_with_a_straight_lens_is_the_pinhole():
     torch.testing.assert_close(bent.transposed_jacobian(at)[0].T @ way.flatten(), numeric, rtol=1e-7, atol=1e-5)
 
 
+def test_rays_are_the_inverse_of_pixels():
+    intrinsic = torch.tensor([[FOCAL, 2.0, CENTRE[0]], [0.0, 880.0, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    pixels = torch.tensor([[0.0, 0.0], [639.0, 479.0], [300.0, 250.0]], dtype=torch.float64)
+    for distortion in (None, torch.tensor([-0.3, 0.1, 2e-3, 1e-3], dtype=torch.float64)):
+        lens = Lens(intrinsic, distortion)
+        rays = lens.rays(pixels)
+        assert rays[:, 2].tolist() == [1.0, 1.0, 1.0]
+        torch.testing.assert_close(lens.pixels(rays), pixels, rtol=0.0, atol=1e-8)
+
+
 def test_a_calibration_of_ros_is_read(tmp_path):
     matrix, distortion = "{rows: 3, cols: 3, data: [1, 0, 2, 0, 3, 4, 0, 0, 1]}", "{data: [0.1, 0, 0, 0]}"
     (tmp_path / "info.yaml").write_text(f"camera_matrix: {matrix}\ndistortion_coefficients: {distortion}\n")

@@ -4,10 +4,12 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.pictures.reading import Colours, read_mask, read_picture, read_scene, read_tracked
+from warp_resphys.pictures.reading import Colours, read_depth, read_mask, read_picture, read_scene, read_tracked
+from warp_resphys.pictures.scans import read_scan
 
 FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}
 
@@ -49,6 +51,91 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
         read_mask(scene.frames[0], Colours((100.0, 140.0), 0.5, 0.3))
     with pytest.raises(DataFileError, match=r"has no mask: name one in camera.json"):
         read_mask(scene.frames[0], None)
+
+
+def test_depth_images(tmp_path):
+    """Integers have a unit, other numbers are metres."""
+    deep = np.array([[0, 500], [65535, 1]], dtype=np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    np.save(tmp_path / "deep.npy", np.array([[0.25, np.nan]], dtype=np.float32))
+    assert read_depth(tmp_path / "deep.png", 1e-3) == pytest.approx(1e-3 * deep)
+    assert read_depth(tmp_path / "deep.png", 1e-4) == pytest.approx(1e-4 * deep)
+    assert read_depth(tmp_path / "deep.npy", 1e-3)[0, 0] == 0.25
+    picture(tmp_path / "00.png")
+    with pytest.raises(DataFileError, match="has 8 bits: write depths as a PNG of 16-bit integers"):
+        read_depth(tmp_path / "00.png", 1e-3)
+    np.save(tmp_path / "flat.npy", np.zeros(3))
+    with pytest.raises(DataFileError, match="has one number at each pixel"):
+        read_depth(tmp_path / "flat.npy", 1e-3)
+    with pytest.raises(DataFileError, match="cannot read the depth image"):
+        read_depth(tmp_path / "none.png", 1e-3)
+
+
+def test_scenes_with_depths_lenses_and_a_scan(tmp_path):
+    moved = np.eye(4)
+    moved[:3, 3] = (0.1, 0.0, 0.0)
+    frames = [{**FRAME, "depth": "00_depth.png", "lens": "left"}, {"depth": "01.npy", "lens": "right"}]
+    scene = read_scene(write(tmp_path / "camera.json", {"frames": frames, "world_to_cloud": moved.tolist()}))
+    assert [frame.lens for frame in scene.frames] == ["left", "right"]
+    assert scene.frames[0].depth == tmp_path / "00_depth.png"
+    assert scene.frames[1].image == scene.frames[1].depth == tmp_path / "01.npy"
+    assert scene.scan_pose[:3, 3].tolist() == [0.1, 0.0, 0.0]
+    assert read_scene(tmp_path / "none.json", scanned=True).frames == ()
+    write(tmp_path / "camera.json", {"world_to_cloud": [[1, 2], [3, 4]]})
+    with pytest.raises(DataFileError, match="'world_to_cloud' has 4 rows of 4 numbers"):
+        read_scene(tmp_path / "camera.json", scanned=True)
+
+
+def points_of(path):
+    """Points of a tetrahedron with a colour, in a format for each extension."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    header = "# .PCD\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\n"
+    rows = np.column_stack([np.full(4, 7.0), points])
+    if path.name == "ascii.pcd":
+        path.write_text(header + "DATA ascii\n" + "\n".join(" ".join(f"{x:g}" for x in row) for row in rows))
+    elif path.name == "binary.pcd":
+        kinds = [("rgb", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+        path.write_bytes((header + "DATA binary\n").encode() + np.array([*map(tuple, rows)], dtype=kinds).tobytes())
+    elif path.suffix == ".npy":
+        np.save(path, points)
+    else:
+        trimesh.PointCloud(points).export(path)
+    return points
+
+
+@pytest.mark.parametrize("name", ["ascii.pcd", "binary.pcd", "scan.npy", "scan.ply", "scan.xyz"])
+def test_scans_of_points(tmp_path, name):
+    expected = points_of(tmp_path / name)
+    points, normals = read_scan(tmp_path / name, 1e-3)
+    assert points == pytest.approx(1e-3 * expected, abs=1e-9)
+    assert normals is None
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+def test_a_scanned_surface_has_points_on_its_triangles_and_outer_normals(tmp_path, suffix):
+    trimesh.creation.icosphere(3, 40.0).export(tmp_path / f"scan{suffix}")
+    points, normals = read_scan(tmp_path / f"scan{suffix}", 1e-3)
+    assert np.linalg.norm(points, axis=1) == pytest.approx(0.04, rel=0.01)
+    assert (points * normals).sum(1) == pytest.approx(0.04, rel=0.01)
+
+
+def test_files_that_are_no_scans_are_said(tmp_path):
+    (tmp_path / "scan.txt").write_text("0 0 0")
+    (tmp_path / "scan.ply").write_text("nothing")
+    (tmp_path / "packed.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
+    np.save(tmp_path / "flat.npy", np.zeros((4, 2)))
+    np.save(tmp_path / "empty.npy", np.full((4, 3), np.nan))
+    for name, words in {
+        "scan.txt": "its extension is none of .npy, .pcd, .ply",
+        "scan.ply": "cannot read a scan from",
+        "packed.pcd": "must be ascii or binary",
+        "flat.npy": r"not \(points, 3\)",
+        "empty.npy": "has no points",
+        "none.ply": "there is no such file",
+        "none.npy": "none.npy",
+    }.items():
+        with pytest.raises(DataFileError, match=words):
+            read_scan(tmp_path / name, 1.0)
 
 
 def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):

@@ -59,6 +59,20 @@ def test_corrections_mean_what_their_names_say():
     assert lens.tolist() == pytest.approx([320.0 + 990.0 * 0.15 / 0.51, 245.0])
 
 
+def test_located_points_are_those_that_are_seen():
+    """From pixels and depths through a distorted lens, and from the axes of a scan, with derivatives."""
+    corrections = CAMERA.corrections(MOVED)
+    depth = CAMERA.seen_from(POINTS, corrections)[:, 2:]
+    measured = torch.cat([CAMERA.pixels(POINTS, corrections), depth], 1)
+    scanner = PlacedCamera(None, POSE, CENTRE)
+    for camera, own in ((CAMERA, measured), (scanner, scanner.seen_from(POINTS, corrections))):
+        assert torch.allclose(camera.located(own, corrections), POINTS, atol=1e-9)
+        slopes = camera.located_by(own, corrections)
+        for number, by in enumerate(1e-6 * torch.eye(len(CORRECTIONS), dtype=torch.float64)):
+            ends = [camera.located(own, corrections + sign * by) for sign in (1.0, -1.0)]
+            assert torch.allclose(slopes[number], (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-8)
+
+
 def test_points_behind_the_camera_are_not_seen():
     points = POINTS.clone()
     points[0] = -10.0 * POSE[:3, :3].T[:, 2]

@@ -312,12 +312,11 @@ def compare_pictures(context: StageContext) -> None:
                         if model == MODELS[0]:
                             create(file, f"{name}/{number}/measured", photo.outline.points, "px")
                     if photo.cloud is not None:
-                        closest, weights = pose.cloud_distances(photo, near[1], corrections)
+                        closest = pose.cloud_distances(photo, near[1], corrections)
                         distances = np.abs(closest.distances)
                         content = {"places": closest.places, "distances": distances, "surface": near[1].cpu().numpy()}
                         for key, array in content.items():
                             create(file, f"{name}/{number}/{model}_{key}", array, "m")
-                        create(file, f"{name}/{number}/{model}_weights", weights)
                         if model == MODELS[0]:
                             create(file, f"{name}/{number}/triangles", pose.surface.triangles)
                 progress.advance(1, pose=name)

@@ -6,14 +6,14 @@ McKay 1992; with plane triangles this is the point-to-plane distance of Chen and
 triangles on the side from which a point was seen are compared with it: towards the camera of a depth image, or towards
 the outer normal of a scanned surface. Parts of the body that no point shows do not count.
 
-Outliers hardly matter, by the robust loss of `misfit`, and points beyond a reach not at all; before that, what is
-farther from the clamp than the body is long is left out.
+Outliers hardly matter, by the robust loss of `misfit`, and points beyond a reach not at all; before that, most are left
+out by `Cloud.around`.
 
 `tests/pictures/test_clouds.py` compares distances with closed forms, and derivatives with differences.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -29,6 +29,14 @@ _NEIGHBOURS: Final = 8  # of a point
 _ISOLATED: Final = 3.0  # distance of the last of these, over the median of all points, beyond which it is an outlier
 _LONGER: Final = 1.2  # of the length of a body: what it may be stretched to
 _SIZES: Final = (0.05, 200.0)  # of a cloud with its background, over that of the body
+
+
+class RestingBody(NamedTuple):
+    """The undeformed body to which points of a cloud may belong."""
+
+    vertices: FloatArray  # (N, 3) [m]
+    triangles: IntArray  # (F, 3) of its surface
+    clamped: IntArray  # (D,) vertices in clamps
 
 
 @dataclass(frozen=True)
@@ -59,35 +67,40 @@ class Cloud:
         outside = None if self.outside is None else self.outside[index]
         return replace(self, measured=self.measured[index], outside=outside)
 
-    def around(self, camera: PlacedCamera, vertices: FloatArray, count: int, random: np.random.Generator) -> Self:
+    def around(self, camera: PlacedCamera, body: RestingBody, count: int, random: np.random.Generator) -> Self:
         """Returns at most a number of points that may be of a body, in their order along the longest axis.
+
+        Left out are points farther from the clamp than the body is long, isolated ones, and those that are closest to a
+        clamp of the undeformed body. A choice that followed the body would let it evade points.
 
         Args:
             camera: by which they are located, about the centre of the body's clamp.
-            vertices: (N, 3) of the undeformed body [m].
+            body: undeformed.
             count: number of points.
             random: chooses them.
 
         Raises:
             InputError: hardly a point may be of the body, or the cloud has another unit of length.
         """
-        centre = camera.centre.numpy()
+        centre, vertices = camera.centre.numpy(), body.vertices
         places = camera.located(torch.as_tensor(self.measured), PlacedCamera.corrections({})).numpy()
         length = float(np.linalg.norm(vertices - centre, axis=1).max())
         away = np.linalg.norm(places - centre, axis=1)
         close = np.flatnonzero(away < _LONGER * length + self.reach)
-        size, body = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (places, vertices))
-        if len(close) < _LEAST or not _SIZES[0] < size / body < _SIZES[1]:
+        size, extent = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (places, vertices))
+        if len(close) < _LEAST or not _SIZES[0] < size / extent < _SIZES[1]:
             raise InputError(
                 f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "
-                f"{size:.3g} m across and {np.median(away):.3g} m from the clamp, and the body is {body:.3g} m across: "
-                "check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the pose "
+                f"{size:.3g} m across and {np.median(away):.3g} m from the clamp, and the body is {extent:.3g} m "
+                "across: check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the pose "
                 "(world_to_cloud, world_to_camera)."
             )
         spacing = cKDTree(places[close]).query(places[close], _NEIGHBOURS + 1)[0][:, -1]
         close = close[spacing <= _ISOLATED * np.median(spacing)]
         if len(close) > count:
             close = random.choice(close, count, replace=False)
+        closest = closest_of(body.triangles, vertices, places[close]).triangles
+        close = close[~np.isin(closest, body.clamped).all(1)]
         longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
         return self._chosen(close[np.argsort(places[close] @ longest)])
 

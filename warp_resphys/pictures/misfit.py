@@ -190,12 +190,12 @@ class PictureMisfit(BoundedMisfit):
             if visible.any():
                 parts.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
         if photo.cloud is not None:
-            cloud, (closest, weights) = photo.cloud, pose.cloud_distances(photo, q, corrections)
+            cloud, closest = photo.cloud, pose.cloud_distances(photo, q, corrections)
             placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
             by = np.concatenate([closest.moved(moved), np.einsum("cpi,pi->cp", placed, closest.directions)])
             slopes = self._slopes(pose, photo, by, [*tangents]) * (np.abs(closest.distances) < cloud.reach)
             distance = closest.distances.clip(-cloud.reach, cloud.reach)[:, None] / cloud.noise
-            parts.append(_weighted(share, weights, distance, slopes.T[:, None] / cloud.noise, copies))
+            parts.append(_weighted(share, np.ones(len(distance)), distance, slopes.T[:, None] / cloud.noise, copies))
         return parts
 
     def _slopes(self, pose: SeenPose, photo: Photo, by: FloatArray, columns: Sequence[int]) -> FloatArray:

@@ -25,7 +25,6 @@ Shape = tuple[Mapping[str, float], torch.Tensor]  # values of parameters, and ve
 
 _TURNED: Final = 0.4  # rad, largest part of a clamp's turn from one equilibrium to the next
 _MARGIN: Final = 6.0  # px, around what a clamp hides
-_COUNTED: Final = 0.5  # weight of a point of a cloud, from which it counts in a median
 _MILLI: Final = 1e3
 
 
@@ -78,7 +77,7 @@ class Difference:
         outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
         outline_px: the same in pixels.
         overlap: common area over that of both together, outside of the clamps.
-        cloud_mm: median distance of the points of a cloud from the surface; None without.
+        cloud_mm: mean distance of the points of a cloud from the surface, of farther ones its reach; None without.
         points_mm: mean distance of the tracked points that were seen, at their depths; None without.
     """
 
@@ -242,18 +241,10 @@ class SeenPose:
             )
         return SeenOutline(rim, simulated, measured)
 
-    def cloud_distances(
-        self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor
-    ) -> tuple[CloudDistances, FloatArray]:
-        """Returns the distances of a cloud from the body (N, 3) [m], and weights (P,) of its points.
-
-        A point whose closest one is on a clamp, which hides the body, has no weight; it grows to one across the
-        triangles beside the clamp.
-        """
+    def cloud_distances(self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor) -> CloudDistances:
+        """Returns the distances of a picture's cloud from the body (N, 3) [m]."""
         assert photo.cloud is not None
-        closest = distances_of(photo.cloud, photo.camera, corrections, self.surface.triangles, q)
-        clamped = np.isin(closest.triangles, np.concatenate(self.clamps))
-        return closest, 1.0 - (clamped * closest.shares).sum(1).clip(0.0, 1.0)
+        return distances_of(photo.cloud, photo.camera, corrections, self.surface.triangles, q)
 
     def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
         """Returns how far a simulated picture is from a measured one.
@@ -279,9 +270,8 @@ class SeenPose:
             overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
             result = replace(result, outline_mm=millimetres, outline_px=pixels, overlap=overlap)
         if photo.cloud is not None:
-            closest, weights = self.cloud_distances(photo, q, corrections)
-            counted = np.abs(closest.distances)[weights > _COUNTED]
-            result = replace(result, cloud_mm=_MILLI * float(np.median(counted)) if len(counted) else None)
+            distances = np.abs(self.cloud_distances(photo, q, corrections).distances)
+            result = replace(result, cloud_mm=_MILLI * float(np.minimum(distances, photo.cloud.reach).mean()))
         if photo.tracked is not None and self.points is not None:
             places = self.points(q[None])[0]
             away = photo.camera.pixels(places, corrections).numpy() - photo.tracked

@@ -62,7 +62,7 @@ class PictureResult:
         outline_mm: mean distance of the outlines, both ways, at the depth of the body.
         outline_px: the same in pixels.
         overlap: common area over the area of both.
-        cloud_mm: median distance of the points of scans and depth images.
+        cloud_mm: mean distance of the points of scans and depth images from the surface.
         points_mm: mean distance of the tracked points.
     """
 
@@ -185,9 +185,9 @@ def write_pictures_report(
 _HOW: Final = (
     "A distance is the mean over both outlines of that to the closest point of the other, at the mean depth of the "
     "body; parts that a clamp hides do not count. The overlap is the common area over that of both together. The "
-    "distance of a cloud is the median over its points of that to the surface, of a depth image to its visible side. "
-    "What "
-    "belongs to a pose alone, such as its place before the camera, is fitted to it for each of the models."
+    "distance of a cloud is the mean over its points of that to the surface, of a depth image to its visible side; a "
+    "point beyond the reach counts as one at it. What belongs to a pose alone, such as its place before the camera, is "
+    "fitted to it for each of the models."
 )
 
 
@@ -307,11 +307,11 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
         bar.set_label("distance of a point from the surface [mm]")
     figure.savefig(path, dpi=170)
     caption = (
-        "Measured points on the simulated body (grey) as seen from the side, above with the median of their distances: "
+        "Measured points on the simulated body (grey) as seen from the side, above with the mean of their distances: "
         "the undeformed body, the simulator with the parameters of the data sheet, and the identified one."
     )
     alt = "; ".join(f"{own.pose}: {', '.join(_text(own.cloud_mm[model]) for model in _MODELS)} mm" for own, _ in panels)
-    return drawn_file(path, f"Clouds of points on bodies. Median distances of the three models: {alt}.", caption)
+    return drawn_file(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
 
 
 @dataclass(frozen=True)
@@ -332,11 +332,9 @@ def _cloud_panels(group: h5py.Group, up: FloatArray) -> list[_Panel]:
     spread = np.linalg.eigh(level @ np.cov(shape.T) @ level)[1]
     right = spread[:, -1]
     for model in _MODELS:
-        places, distances, weights, surface = (
-            read_array(group, f"{model}_{key}") for key in ("places", "distances", "weights", "surface")
-        )
-        axes, seen = np.stack([right, up], 1), weights > 0.0
-        panels.append(_Panel(places[seen] @ axes, 1e3 * distances[seen], surface[triangles] @ axes))
+        places, distances, surface = (read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface"))
+        axes = np.stack([right, up], 1)
+        panels.append(_Panel(places @ axes, 1e3 * distances, surface[triangles] @ axes))
     return panels
 
 

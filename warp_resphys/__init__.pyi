@@ -64,9 +64,11 @@ from .mesh.readers import write_mesh as write_mesh
 from .mesh.rod import rod as rod
 from .mesh.tetrahedra import fill_surface as fill_surface
 from .pictures.camera import PlacedCamera as PlacedCamera
+from .pictures.clouds import Cloud as Cloud
 from .pictures.misfit import PictureMisfit as PictureMisfit
 from .pictures.outlines import ClosedSurface as ClosedSurface
 from .pictures.outlines import Outline as Outline
+from .pictures.scans import read_scan as read_scan
 from .pictures.seen import Photo as Photo
 from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load

@@ -15,7 +15,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures.camera import PLACES, PlacedCamera
-from warp_resphys.pictures.clouds import Cloud, RestingBody, distances_of
+from warp_resphys.pictures.clouds import Cloud, distances_of
 from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface
 from warp_resphys.pictures.seen import Photo, SeenPose
@@ -24,7 +24,6 @@ MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
 CLAMP = wr.select_vertices(MESH, x=0.0)
 SURFACE = ClosedSurface.of_mesh(MESH)
 REST = torch.as_tensor(MESH.vertices)
-RESTING = RestingBody(MESH.vertices, SURFACE.triangles, CLAMP)
 CENTRE = MESH.vertices[CLAMP].mean(0)
 SCANNER = PlacedCamera(None, torch.eye(4), CENTRE)
 LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
@@ -64,7 +63,7 @@ def depths(q, camera=CAMERA, noise=0.0, corrections=PLAIN):
 
 
 def with_cloud(pose, cloud, camera=SCANNER, count=1000):
-    photo = Photo("scan", camera, cloud=cloud.around(camera, RESTING, count, np.random.default_rng(0)))
+    photo = Photo("scan", camera, cloud=cloud.around(camera, MESH, CLAMP, count))
     return replace(pose, photos=(photo,))
 
 
@@ -162,7 +161,7 @@ def test_points_on_the_clamp_are_left_out():
         scan(REST, 0.0, 300),
         np.random.default_rng(0).uniform((-0.01, 0.0, 0.0), (-0.004, 0.02, 0.02), (60, 3)),
     )
-    kept = Cloud(np.concatenate([body, clamp])).around(SCANNER, RESTING, 1000, np.random.default_rng(0)).measured
+    kept = Cloud(np.concatenate([body, clamp])).around(SCANNER, MESH, CLAMP, 1000).measured
     assert kept[:, 0].min() > -1e-9
     assert len(kept) > 250
 
@@ -210,14 +209,14 @@ def test_background_and_isolated_points_are_left_out():
     body, wall = scan(REST, 0.0, 900), random.uniform((-1.0, 0.4, -1.0), (1.0, 0.41, 1.0), (5000, 3))
     stray = random.uniform(-0.1, 0.1, (30, 3)) + (0.05, 0.0, 0.0)
     stray = stray[np.abs(stray - (0.05, 0.01, 0.01)).max(1) > 0.055]
-    kept = Cloud(np.concatenate([body, wall, stray])).around(SCANNER, RESTING, 10_000, random).measured
+    kept = Cloud(np.concatenate([body, wall, stray])).around(SCANNER, MESH, CLAMP, 10_000).measured
     assert 800 <= len(kept) <= 905
     assert kept[:, 1].max() < 0.1
-    assert 90 <= len(Cloud(body).around(SCANNER, RESTING, 100, random).measured) <= 100
+    assert 90 <= len(Cloud(body).around(SCANNER, MESH, CLAMP, 100).measured) <= 100
     assert np.diff(kept[:, 0]).min() > -1e-3  # along the beam, or the other way round
     for wrong in (1e3 * body, 1e-3 * body):
         with pytest.raises(InputError, match=r"check the unit \(data.cloud.units of a scan"):
-            Cloud(wrong).around(SCANNER, RESTING, 100, random)
+            Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)
 
 
 def test_two_lenses_have_values_of_their_own(beam):
@@ -231,7 +230,7 @@ def test_two_lenses_have_values_of_their_own(beam):
         camera = PlacedCamera(LENS, looking, CENTRE)
         corrections = PlacedCamera.corrections({"focal_factor": factor})
         cloud = Cloud.of_depth(depths(q, camera, corrections=corrections))
-        cloud = cloud.around(camera, RESTING, 600, np.random.default_rng(0))
+        cloud = cloud.around(camera, MESH, CLAMP, 600)
         photos.append(Photo(lens, camera, cloud=cloud, lens=lens))
     own = replace(pose, photos=tuple(photos))
     assert own.lenses == ("left", "right")

@@ -22,7 +22,7 @@ from ..io.stages import StageContext
 from ..mesh.mesh import Mesh, quadratic, select_vertices
 from ..mesh.readers import METRES, read_mesh
 from ..pictures.camera import PlacedCamera
-from ..pictures.clouds import Cloud, RestingBody
+from ..pictures.clouds import Cloud
 from ..pictures.outlines import ClosedSurface, Outline
 from ..pictures.reading import (
     Colours,
@@ -314,28 +314,27 @@ class SeenPoses:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
         scene, photos, surface = scene_of(self.data, own, self.run_dir), list[Photo](), ClosedSurface.of_mesh(mesh)
-        body = RestingBody(mesh.vertices, surface.triangles, fixed)
         for number, frame in enumerate(self._frames(name)):
             camera = PlacedCamera(self.lenses[frame.lens], torch.as_tensor(loaded.cameras[number, 0]), centre)
             outline = Outline.of_mask(loaded.masks[frame.number]) if own.outline else None
             tracked = None if loaded.tracked is None else loaded.tracked[number]
             cloud, depth = None, loaded.depths.get(frame.number)
             if depth is not None:
-                cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, body)
+                cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, mesh, fixed)
             photos.append(Photo(f"{own.folder}/{frame.image.name}", camera, outline, tracked, cloud, frame.lens))
         if loaded.scan is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
             outside = None if loaded.normals is None else loaded.scan + loaded.normals
-            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(loaded.scan, outside), camera, body)
+            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(loaded.scan, outside), camera, mesh, fixed)
             photos.append(Photo(f"{own.folder}/{own.cloud}", camera, cloud=cloud))
         return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points)
 
-    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, body: RestingBody) -> Cloud:
+    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: NDArray[np.int64]) -> Cloud:
         """The points that may be of a body, as many as configured."""
         wanted = self.data.cloud
         cloud = replace(cloud, noise=wanted.noise, reach=wanted.reach)
         try:
-            return cloud.around(camera, body, wanted.points, np.random.default_rng(self.settings.seed))
+            return cloud.around(camera, mesh, clamped, wanted.points, self.settings.seed)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 

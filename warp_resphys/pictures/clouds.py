@@ -13,14 +13,15 @@ out by `Cloud.around`.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from ..io.errors import InputError
-from ..mesh.surface import closest_of
+from ..mesh.mesh import Mesh
+from ..mesh.surface import closest_of, closest_points
 from .camera import PlacedCamera
 from .outlines import FloatArray, IntArray, Mask
 
@@ -29,14 +30,6 @@ _NEIGHBOURS: Final = 8  # of a point
 _ISOLATED: Final = 3.0  # distance of the last of these, over the median of all points, beyond which it is an outlier
 _LONGER: Final = 1.2  # of the length of a body: what it may be stretched to
 _SIZES: Final = (0.05, 200.0)  # of a cloud with its background, over that of the body
-
-
-class RestingBody(NamedTuple):
-    """The undeformed body to which points of a cloud may belong."""
-
-    vertices: FloatArray  # (N, 3) [m]
-    triangles: IntArray  # (F, 3) of its surface
-    clamped: IntArray  # (D,) vertices in clamps
 
 
 @dataclass(frozen=True)
@@ -67,7 +60,7 @@ class Cloud:
         outside = None if self.outside is None else self.outside[index]
         return replace(self, measured=self.measured[index], outside=outside)
 
-    def around(self, camera: PlacedCamera, body: RestingBody, count: int, random: np.random.Generator) -> Self:
+    def around(self, camera: PlacedCamera, mesh: Mesh, clamped: IntArray, count: int = 1000, seed: int = 0) -> Self:
         """Returns at most a number of points that may be of a body, in their order along the longest axis.
 
         Left out are points farther from the clamp than the body is long, isolated ones, and those that are closest to a
@@ -75,14 +68,15 @@ class Cloud:
 
         Args:
             camera: by which they are located, about the centre of the body's clamp.
-            body: undeformed.
+            mesh: undeformed body.
+            clamped: (D,) vertices in clamps.
             count: number of points.
-            random: chooses them.
+            seed: of the choice.
 
         Raises:
             InputError: hardly a point may be of the body, or the cloud has another unit of length.
         """
-        centre, vertices = camera.centre.numpy(), body.vertices
+        centre, vertices = camera.centre.numpy(), mesh.vertices
         places = camera.located(torch.as_tensor(self.measured), PlacedCamera.corrections({})).numpy()
         length = float(np.linalg.norm(vertices - centre, axis=1).max())
         away = np.linalg.norm(places - centre, axis=1)
@@ -92,15 +86,14 @@ class Cloud:
             raise InputError(
                 f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "
                 f"{size:.3g} m across and {np.median(away):.3g} m from the clamp, and the body is {extent:.3g} m "
-                "across: check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the pose "
-                "(world_to_cloud, world_to_camera)."
+                "across: check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the "
+                "pose (world_to_cloud, world_to_camera)."
             )
         spacing = cKDTree(places[close]).query(places[close], _NEIGHBOURS + 1)[0][:, -1]
         close = close[spacing <= _ISOLATED * np.median(spacing)]
         if len(close) > count:
-            close = random.choice(close, count, replace=False)
-        closest = closest_of(body.triangles, vertices, places[close]).triangles
-        close = close[~np.isin(closest, body.clamped).all(1)]
+            close = np.random.default_rng(seed).choice(close, count, replace=False)
+        close = close[~np.isin(closest_points(mesh, places[close]).triangles, clamped).all(1)]
         longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
         return self._chosen(close[np.argsort(places[close] @ longest)])
 

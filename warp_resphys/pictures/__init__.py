@@ -1,1 +1,1 @@
-"""Bodies seen by cameras: outlines and tracked points in pictures, and the physical parameters that explain them."""
+"""Bodies seen by cameras: outlines, tracked points, depths and scans, and the physical parameters that explain them."""

@@ -167,6 +167,7 @@ def test_two_cameras_have_a_lens_each(beam, folder):
         ),
         (["~data.lens.left"], "frame 0 has the lens 'left', and data.lens has the names 'right'"),
         (["~data.lens", "+data.lens={file:a.yaml}"], "a.yaml"),
+        (["~data.lens", "+data.lens=null"], "data.lens is not set, and"),
         (["+data.lens.beam={file:a.yaml}"], "data.poses and data.lens both have 'beam': rename one"),
         (["data.lens.left.file=a.yaml"], "give one of them, a calibration or the matrix"),
         (["identify.parameters.youngs_modulus.per=lens"], "per is lens, and is not of a camera"),

@@ -96,6 +96,8 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
             "from 0: leave it out."
         )
     frames = tuple(frame for frame in scene.frames if pose.frames is None or frame.number in pose.frames)
+    if frames and not data.lenses:
+        raise InputError(f"data.lens is not set, and {scene.path} has frames: give the lens of the camera.")
     for frame in frames:
         if frame.lens not in data.lenses:
             names = listed([own for own in data.lenses if own])
@@ -107,7 +109,7 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
 
 
 def import_pictures(context: StageContext) -> None:
-    """Writes pictures.h5: of every pose the masks of the body, the poses of the camera and the tracked points.
+    """Writes pictures.h5: of every pose the masks, depths, cameras, tracked points and the scan.
 
     Raises:
         DataFileError: a picture cannot be read, or does not show the body.

@@ -25,7 +25,9 @@ from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere
+ENDS = {"first": 1e-3, "second": 5e-4}  # m, outwards, by which they end elsewhere
 POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "second": (0.0, 1.5), "other": (0.0, 1.0), "both": (1.0, 1.0)}
+STRONG = {"weak": (1.5, 0.0), "strong": (4.0, 0.0), "second": (0.0, 3.0), "other": (0.0, 4.0), "both": (3.0, 3.0)}
 TINY = [
     "experiment=tentacle",
     *("mesh.layers=4", "mesh.nodes=20", "tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6"),
@@ -41,7 +43,7 @@ TINY = [
     *(
         "~identify.parameters.tendon_offset_2_first",
         "~identify.parameters.tendon_offset_2_second",
-    ),  # hardly distinguishable from E
+    ),  # weak poses do not show them
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
@@ -55,11 +57,11 @@ def trials(poses):
 TRIALS = trials(POSES)
 
 
-def moved(tendons):
-    """Tendons whose guides are where the recorded body has them."""
+def moved(tendons, offsets=OFFSETS, direction=0):
+    """Tendons whose guides are where the recorded body has them: displaced along their first or second direction."""
     routes = {}
     for name, route in tendons.routes.items():
-        guides = np.array(route.guides) + OFFSETS[name] * np.array(route.offsets[0])
+        guides = np.array(route.guides) + offsets[name] * np.array(route.offsets[direction])
         routes[name] = {"guides": guides.tolist(), "pieces": route.pieces}
     return tendons.changed(routes=routes)
 
@@ -127,18 +129,30 @@ def test_poses_are_imported_from_bags(poses, tmp_path, monkeypatch):
 
 def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    strong = {"weak": (1.5, 0.0), "strong": (4.0, 0.0), "second": (0.0, 3.0), "other": (0.0, 4.0), "both": (3.0, 3.0)}
     recorded = settings(*TINY, *TRIALS)
-    write(Path("recordings"), poses_of(recorded, recorded.tendons.changed(friction=0.3), strong))
+    write(Path("recordings"), poses_of(recorded, recorded.tendons.changed(friction=0.3), STRONG))
     offsets = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
     friction = ["tendons.friction=0.05", "+identify.parameters.tendon_friction={lower:0.0,upper:1.0}"]
-    run_without_report(tmp_path, *TINY, *trials(strong), *offsets, *friction)
+    run_without_report(tmp_path, *TINY, *trials(STRONG), *offsets, *friction)
     identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     assert identified["tendon_friction"] == pytest.approx(0.3, abs=0.02)
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
     errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     assert errors["sysid"]["mean"] < 0.3
     check_robots("run")
+
+
+def test_poses_identify_where_tendons_end(tmp_path, monkeypatch):
+    """Outwards at the end alone, which strong poses tell from Young's modulus; their priors shrink them a little."""
+    monkeypatch.chdir(tmp_path)
+    given = [key for key in TINY if "tendon_offset_2" not in key]
+    recorded = settings(*given, *trials(STRONG))
+    write(Path("recordings"), poses_of(recorded, moved(recorded.tendons, ENDS, 1), STRONG))
+    known = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
+    run_without_report(tmp_path, *given, *trials(STRONG), *known)
+    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
+    assert {name: identified[f"tendon_offset_2_{name}"] for name in ENDS} == pytest.approx(ENDS, abs=3e-4)
+    assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.05)
 
 
 def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):

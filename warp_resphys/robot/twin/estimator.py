@@ -35,6 +35,8 @@ _OPEN: Final = 1e-3  # least distance of a parameter from a bound that it must n
 _UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
 _SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
 _WANDER: Final = 1.0  # time after which the force on the body is another [s]
+_CHANGED: Final = 0.05  # change of a column of the transition after which the next step renews one, too
+_LONGEST_PAUSE: Final = 8  # steps
 _TRIED: Final = 0.2  # time over which errors are compared with those of the simulator without markers [s]
 _WORSE: Final = 1.5  # errors over those of the simulator without markers, above which this takes over
 _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
@@ -84,7 +86,9 @@ class Belief:
         places: (M, 3) markers from where they are bound [m].
         covariance: (n, n) of the errors of z, w, b, parameters and places.
         transition: (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step.
-        turn: number of the column of it that the next step renews.
+        turn: number of the column of it that is renewed next.
+        pause: steps between two renewals: few while they change the transition.
+        wait: steps until the next one.
         since: (M,) for how long markers have been left out [s].
         squares: (2,) mean squared distances of markers from where they were expected, and from the simulator without
             markers, over the last frames [m^2].
@@ -99,6 +103,8 @@ class Belief:
     covariance: FloatArray
     transition: FloatArray
     turn: int
+    pause: int
+    wait: int
     since: FloatArray
     left: FloatArray
     squares: FloatArray
@@ -227,6 +233,8 @@ class FullEstimator:
             np.diag(self._initial),
             self.tangent.transition,
             0,
+            1,
+            0,
             np.zeros(markers),
             np.full((markers, 3), np.nan),
             np.zeros(2),
@@ -254,15 +262,16 @@ class FullEstimator:
         Args:
             belief: before it.
             inputs: commands by name.
-            renew: whether to renew a column of the transition, by two environments beside.
+            renew: whether a column of the transition may be renewed, by two environments beside.
 
         Raises:
             InputError: an invalid command.
             ConvergenceError: the step failed.
         """
-        tangent, r, more = self.tangent, len(belief.bias), 2 if renew else 0
+        tangent, r, renew = self.tangent, len(belief.bias), renew and not belief.wait
+        more = 2 if renew else 0
         robot, given = self._at(belief.parameters, inputs, more)
-        state, transition = belief.state, belief.transition
+        state = belief.state
         pull = torch.einsum("r,rni->ni", self.robot.simulator.tensor(belief.bias), tangent.pull)
         forces = pull.repeat(self._count + more, 1, 1)
         forces[self._count - 1] = 0.0
@@ -272,12 +281,12 @@ class FullEstimator:
             state = shifted(robot, state.select([*range(self._count), 0, 0]), moved, faster)
             forces += pulled
         state = robot.step(state, **pulled_by(robot, given, forces)).detach()
+        belief = replace(belief, wait=max(belief.wait - 1, 0))
         if renew:
-            transition = transition.copy()
-            transition[:, [belief.turn]] = tangent.slopes(state.select([self._count, self._count + 1]), [belief.turn])
+            belief = self._renewed(belief, state)
             state = state.select(range(self._count))
         step = np.eye(len(belief.covariance))
-        step[: 2 * r, : 3 * r] = transition
+        step[: 2 * r, : 3 * r] = belief.transition
         fades = float(np.exp(-self.time_step / _WANDER))
         step[2 * r : 3 * r] *= fades
         added = self._added * np.where(np.arange(len(step)) < 3 * r, belief.shaken, 1.0)
@@ -286,9 +295,17 @@ class FullEstimator:
         much = np.sqrt(np.maximum(np.diag(covariance)[known] / self._prior**2, 1.0))
         covariance[known] /= much[:, None]
         covariance[:, known] /= much
-        turn = (belief.turn + more // 2) % (3 * r)
-        bias = fades * belief.bias
-        return replace(belief, state=state, bias=bias, covariance=covariance, transition=transition, turn=turn)
+        return replace(belief, state=state, bias=fades * belief.bias, covariance=covariance)
+
+    def _renewed(self, belief: Belief, after: RobotState) -> Belief:
+        """Renews a column of the transition from a step of which the last two environments began with its changes."""
+        column = self.tangent.slopes(after.select([self._count, self._count + 1]), [belief.turn])[:, 0]
+        before, transition, r = belief.transition[:, belief.turn], belief.transition.copy(), len(belief.bias)
+        transition[:, belief.turn] = column
+        changed = np.abs(column - before)[:r].max() > _CHANGED * np.abs(before)[:r].max()
+        pause = 1 if changed else min(2 * belief.pause, _LONGEST_PAUSE)
+        turn = (belief.turn + 1) % (3 * r)
+        return replace(belief, transition=transition, turn=turn, pause=pause, wait=pause - 1)
 
     # Markers
 

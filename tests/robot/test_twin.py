@@ -295,7 +295,9 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     listener = Listener("udp://127.0.0.1:0")
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sent = {"time": 1.5, "markers": {"vertex_0": [0.0, 0.1, None]}, "inputs": {"payload": 0.1}}
+    sent["plan"] = [{"time": 2.0, "inputs": {"payload": 0.2}}]
     wrong = [b"{", b'{"markers": {}}', b'{"time": 1, "x": 2}', b'{"time": 1, "inputs": 2}', b"[" * 50_000]
+    wrong += [b'{"time": 1, "plan": {"payload": 1}}']
     wrong += [b'{"time": 1, "inputs": {"payload": [1%s]}}' % (b"0" * 400), b'{"time": 1, "markers": {"vertex_0": [1]}}']
     for text in (json.dumps(sent).encode(), *wrong):
         sender.sendto(text, listener.address)
@@ -303,7 +305,7 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     while sum(listener.refused.values()) + len(packets) < 1 + len(wrong) and time.monotonic() < until:
         packets += listener.packets()
     (packet,) = packets
-    assert (packet.time, packet.inputs) == (1.5, {"payload": 0.1})
+    assert (packet.time, packet.inputs, packet.plan) == (1.5, {"payload": 0.1}, [(2.0, {"payload": 0.2})])
     np.testing.assert_array_equal(packet.markers["vertex_0"], [0.0, 0.1, np.nan])
     assert sum(listener.refused.values()) == len(wrong)
     for words in (
@@ -312,6 +314,7 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
         "has no time",
         "has the field 'x'",
         "no object",
+        "plan of a packet is no list",
     ):
         assert sum(words in message for message in listener.refused) == 1
     assert sum("is no JSON" in message for message in listener.refused) == 2

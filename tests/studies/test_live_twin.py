@@ -11,7 +11,8 @@ from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load, recorded_trial
-from warp_resphys.studies.live_twin import LiveTwin, TwinSettings
+from warp_resphys.robot.twin.stream import Packet
+from warp_resphys.studies.live_twin import LiveTwin, TwinSettings, planned_packets
 from warp_resphys.studies.view import Page, _summary
 
 SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False)
@@ -53,6 +54,14 @@ def test_it_follows_a_file(robot, folder):
     assert np.linalg.norm(live.positions - trial.play(robot).q[-1, 0].numpy(), axis=1).mean() < 2e-4
     with pytest.raises(InputError, match="source is 'nothing': give udp://HOST:PORT, a trial of the run"):
         LiveTwin(robot, "nothing", SETTINGS)
+
+
+def test_the_commands_of_a_recording_are_its_plan():
+    packets = [Packet(0.0, {}, {"pressure": [1.0]}), Packet(0.1, {}, {}), Packet(0.2, {}, {"pressure": [2.0]})]
+    first, *others = planned_packets(packets)
+    assert first.plan == [(0.0, {"pressure": [1.0]}), (0.2, {"pressure": [2.0]})]
+    assert others == packets[1:]
+    assert list(planned_packets([])) == []
 
 
 def test_it_takes_packets_over_udp_and_goes_on_after_wrong_ones(robot):

@@ -73,9 +73,10 @@ def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
 
 def planned_packets(packets: Iterable[Packet]) -> Iterator[Packet]:
     """Returns packets of which the first has the commands of all as its plan."""
-    first, *others = packets
-    yield replace(first, plan=[(packet.time, packet.inputs) for packet in (first, *others) if packet.inputs])
-    yield from others
+    known = list(packets)
+    plan = [(packet.time, packet.inputs) for packet in known if packet.inputs]
+    for number, packet in enumerate(known):
+        yield packet if number else replace(packet, plan=plan)
 
 
 class LiveTwin:

@@ -6,7 +6,7 @@ The simulator itself, with its learned force, carries the mean. The error of the
 
 with the r slowest vibrations Phi about the first state, and the derivatives S and S' of the motion by the refined
 parameters theta. For each parameter a robot with another value runs beside, so that S follows by differences (a filter
-with separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359). A force on the body, a random walk, shifts its
+with separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359). A force on the body, which fades, shifts its
 equilibrium by b; and the markers sit o away from where they are bound. The covariance is that of (z, w, b, theta, o):
 an extended Kalman filter of reduced rank (Pham, Verron and Roubaud, J. Mar. Syst. 16 (1998) 323).
 """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.io.errors import InputError
+from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.robot.loading import load
 from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.robot.twin.kalman import Gate, conditioned, distances
@@ -396,6 +396,11 @@ def test_predictions_follow_a_plan_of_commands(robot):
     np.testing.assert_allclose(height.mean(axis=1), [0.0, 0.0, 0.0, 0.0, 2e-3], atol=1e-6)
     twin.take(5 * h)
     assert float((twin.now.state.q[0, fixed] - rest[fixed]).abs().max()) == 0.0  # a plan is no command
+    twin.plan([(5.6 * h, {"base": lifted})])
+    twin.take(5.5 * h)  # its step ends at 6 h, and what is planned before that acts from then on
+    height = twin.ahead().markers[:, fixed, 2] - rest[fixed, 2].numpy()
+    np.testing.assert_allclose(height.mean(axis=1), [0.0, 2e-3, 2e-3, 2e-3, 2e-3], atol=1e-6)
+    twin.plan([])
     with pytest.raises(InputError, match="there is no input 'wind'"):
         twin.plan([(0.1, {"wind": 1.0})])
     assert twin.ahead(7 * h).markers[1, fixed[0], 2] - rest[fixed[0], 2] == pytest.approx(0.0, abs=1e-6)
@@ -432,3 +437,19 @@ def test_it_goes_on_from_the_simulator_where_that_is_closer(robot):
             twin._steps[twin._newest].corrected = replace(belief, bias=belief.bias + 0.05 / size, turn=0)
     assert twin.counts["it went on from the simulator without markers, which was closer"] >= 1
     assert np.linalg.norm(twin.now.markers - still, axis=1).mean() < 1e-4
+
+
+def test_a_step_that_fails_only_with_its_neighbours_is_done_without_them(robot, swing, monkeypatch):
+    twin = followed(robot, swing[0][:10])
+    advance = twin.estimator.advance
+
+    def fails(belief, inputs, renew=True):
+        if renew:
+            raise ConvergenceError("", None, None)
+        return advance(belief, inputs, renew)
+
+    monkeypatch.setattr(twin.estimator, "advance", fails)
+    for number in range(10, 20):
+        twin.take(number * robot.time_step, swing[0][number])
+    assert np.linalg.norm(twin.now.markers - swing[1][19], axis=1).mean() < 2.0 * NOISE
+    assert twin.counts == {}

@@ -32,6 +32,7 @@ _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 _COUNTS = (0, 4, 5, 8)  # of the coefficients of a lens
 _UNDISTORTING = 30  # steps of Newton's method
+_UNDISTORTED = 0.01  # px: error of a ray
 
 
 @dataclass(frozen=True)
@@ -106,13 +107,14 @@ class Lens:
         """Returns the points (..., 3) of depth one in the axes of the camera that are seen at pixels (..., 2).
 
         Of a distorted image they are sought by Newton's method with the derivative of the undistorted one, which
-        converges where the distortion is well below the distance from the principal point.
+        converges where the distortion is well below the distance from the principal point; NaN elsewhere.
         """
         inverse = torch.linalg.inv(self.matrix[:2, :2].to(pixels)).mT
         flat = (pixels - self.matrix[:2, 2].to(pixels)) @ inverse
         for _ in range(0 if self.distortion is None else _UNDISTORTING):
             flat = flat - (self.pixels(_at_one(flat)) - pixels) @ inverse
-        return _at_one(flat)
+        off = (self.pixels(_at_one(flat)) - pixels).abs().amax(-1, keepdim=True)
+        return _at_one(flat.where(off < _UNDISTORTED, torch.nan))
 
 
 def _at_one(flat: torch.Tensor) -> torch.Tensor:

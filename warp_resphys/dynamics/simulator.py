@@ -317,8 +317,8 @@ class Simulator:
             start: (B, N, 3) initial guess [m]; the rest shape if omitted. If Newton's method does not converge from it
                 in 100 iterations, loads, inputs and motion of the fixed vertices are increased in steps.
             batch: number of environments, if no other argument implies it.
-            after: state whose memory of friction without rate the equilibrium continues; the undeformed body if
-                omitted.
+            after: state whose memory of friction without rate the equilibrium continues, of the batch or of one
+                environment; the undeformed body if omitted.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
@@ -333,6 +333,8 @@ class Simulator:
             given = [*inputs.fields.values(), *([] if start is None else [start])]
             batch = max([len(t) for t in given] + [constants.batch] + ([] if after is None else [after.batch]))
         state = self.rest_state(batch) if after is None else after
+        if state.batch == 1 < batch:
+            state = state.map(lambda value: torch.cat([value] * batch))
         self._checked(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)

@@ -125,7 +125,8 @@ def import_pictures(context: StageContext) -> None:
             masks = dict[int, NDArray[np.bool_]]()
             for frame in frames:
                 with_depth = pose.depth and frame.depth is not None
-                if pose.outline or (with_depth and (frame.mask is not None or chosen is not None)):
+                coloured = chosen is not None and frame.image != frame.depth
+                if pose.outline or (with_depth and (frame.mask is not None or coloured)):
                     masks[frame.number] = _mask(frame, chosen)
                     create(file, f"{name}/masks/{frame.number}", masks[frame.number])
                 if with_depth:
@@ -149,8 +150,8 @@ def import_pictures(context: StageContext) -> None:
             covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
             if frames:
                 log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
-            if masks:
-                shown = next(frame for frame in frames if frame.number in masks)
+            shown = next((frame for frame in frames if frame.number in masks and frame.image != frame.depth), None)
+            if shown is not None:
                 image = read_picture(shown.image)
                 _show_mask(context.run_dir / "masks" / f"{name}.png", image, masks[shown.number])
 
@@ -159,11 +160,15 @@ def _depth(frame: Frame, mask: NDArray[np.bool_] | None, data: PictureData) -> N
     """A depth image (H, W), zero where the mask does not show the body [m]."""
     assert frame.depth is not None
     depth = read_depth(frame.depth, data.cloud.depth_unit)
-    if mask is not None and mask.shape != depth.shape:
-        raise DataFileError(
-            f"{frame.depth} has {depth.shape[1]} x {depth.shape[0]} pixels, and its mask {mask.shape[1]} x "
-            f"{mask.shape[0]}: register the depths to the picture."
-        )
+    others = {} if mask is None else {"mask": mask.shape}
+    if frame.image != frame.depth:
+        others["picture"] = read_picture(frame.image).shape[:2]
+    for other, shape in others.items():
+        if shape != depth.shape:
+            raise DataFileError(
+                f"{frame.depth} has {depth.shape[1]} x {depth.shape[0]} pixels, and its {other} {shape[1]} x "
+                f"{shape[0]}: register the depths to the picture."
+            )
     return np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(np.float32)
 
 

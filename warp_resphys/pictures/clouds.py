@@ -25,6 +25,7 @@ from ..mesh.surface import closest_of, closest_points
 from .camera import PlacedCamera
 from .outlines import FloatArray, IntArray, Mask
 
+_STRAY: Final = 1.0  # % of the points that may lie far away in a direction, when their extent is measured
 _LEAST: Final = 20  # points on a body
 _NEIGHBOURS: Final = 8  # of a point
 _ISOLATED: Final = 3.0  # distance of the last of these, over the median of all points, beyond which it is an outlier
@@ -79,13 +80,17 @@ class Cloud:
         centre, vertices = camera.centre.numpy(), mesh.vertices
         places = camera.located(torch.as_tensor(self.measured), PlacedCamera.corrections({})).numpy()
         length = float(np.linalg.norm(vertices - centre, axis=1).max())
+        known = places[np.isfinite(places).all(1)]  # NaN where a lens cannot see
         away = np.linalg.norm(places - centre, axis=1)
         close = np.flatnonzero(away < _LONGER * length + self.reach)
-        size, extent = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (places, vertices))
+        if not len(known):
+            raise InputError("none of its points is in the view of its lens: check the lens (data.lens).")
+        ends = np.percentile(known, [_STRAY, 100.0 - _STRAY], axis=0)
+        size, extent = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (ends, vertices))
         if len(close) < _LEAST or not _SIZES[0] < size / extent < _SIZES[1]:
             raise InputError(
                 f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "
-                f"{size:.3g} m across and {np.median(away):.3g} m from the clamp, and the body is {extent:.3g} m "
+                f"{size:.3g} m across and {np.nanmedian(away):.3g} m from the clamp, and the body is {extent:.3g} m "
                 "across: check the unit (data.cloud.units of a scan, data.cloud.depth_unit of a depth image) and the "
                 "pose (world_to_cloud, world_to_camera)."
             )
@@ -94,6 +99,11 @@ class Cloud:
         if len(close) > count:
             close = np.random.default_rng(seed).choice(close, count, replace=False)
         close = close[~np.isin(closest_points(mesh, places[close]).triangles, clamped).all(1)]
+        if len(close) < _LEAST:
+            raise InputError(
+                f"{len(close)} of its {len(places)} points are left without clamp, background and isolated ones: "
+                "check the directions of its pose (world_to_cloud, world_to_camera)."
+            )
         longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
         return self._chosen(close[np.argsort(places[close] @ longest)])
 

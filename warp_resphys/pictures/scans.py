@@ -1,4 +1,4 @@
-"""Files of scans: points of a surface, and its outer normals where the file has triangles or normals."""
+"""Files of scans: points of a surface, and its outer normals where the file has triangles."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ _SAMPLED = 20_000  # points on the triangles of a surface
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
-def read_scan(path: Path, unit: float, seed: int = 0) -> tuple[FloatArray, FloatArray | None]:
-    """Reads the points (P, 3) of a scan [m], and its outer unit normals (P, 3); None without.
+def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray, FloatArray | None]:
+    """Reads the points (P, 3) of a scan [m], and its outer unit normals (P, 3); None without triangles.
 
     Of a surface of triangles, points are spread evenly over these, which must be counter-clockwise from outside.
 
@@ -27,7 +27,7 @@ def read_scan(path: Path, unit: float, seed: int = 0) -> tuple[FloatArray, Float
     Raises:
         DataFileError: it is missing or damaged, or has no points.
     """
-    normals = None
+    path, normals = Path(path), None
     try:
         if path.suffix == ".npy":
             points = np.asarray(read_arrays(path)[""], dtype=np.float64)

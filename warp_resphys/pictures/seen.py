@@ -140,7 +140,8 @@ class SeenPose:
 
     def copies(self, photo: Photo) -> int:
         """Number of pictures by the standing camera of one, which have nearly the same errors; one where it moves."""
-        mine = [own for own in self.photos if (own.lens, own.camera.lens) == (photo.lens, photo.camera.lens)]
+        lensless = photo.camera.lens is None
+        mine = [own for own in self.photos if own.lens == photo.lens and (own.camera.lens is None) == lensless]
         return len(mine) if all(torch.equal(own.camera.pose, photo.camera.pose) for own in mine) else 1
 
     @property

@@ -248,7 +248,8 @@ class LiveTwin:
             if len(packets) > 1 and now - self._drained > _BEHIND:
                 self.twin.restart("after it had fallen behind")
                 held = {name: value for packet in packets for name, value in packet.inputs.items()}
-                packets = [replace(packets[-1], inputs=held)]
+                plans = [packet.plan for packet in packets if packet.plan is not None]
+                packets = [replace(packets[-1], inputs=held, plan=plans[-1] if plans else None)]
             self._drained = now
             yield from packets
             return

@@ -87,6 +87,7 @@ class Twin:
         self._counts = Faults()
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
         self._planned: list[tuple[float, dict[str, Given]]] = []
+        self._latest = -np.inf  # time of the newest packet
         self._steps: dict[int, _Interval] = {}
         self._refined: FloatArray | None = None
         self._packets = self._stale = 0
@@ -100,6 +101,7 @@ class Twin:
             self._check_unit(frame, belief)
         for interval in self._steps.values():
             self._forget(interval)
+        self._latest = time
         self._origin, self._newest, self._again, self._stale, self._framed = time, 0, False, 0, False
         self._commands = [(-np.inf, 0, commands)]
         self._steps = {0: _Interval(predicted=belief)}
@@ -148,7 +150,7 @@ class Twin:
             self._steps[new] = _Interval()
         if number < self._newest:
             self._counts.add("packets out of order")
-        self._newest = max(self._newest, number)
+        self._newest, self._latest = max(self._newest, number), max(self._latest, time)
         if frame is not None:
             insort(self._steps[number].frames, (time, self._packets, frame), key=lambda entry: entry[:2])
             self._done = min(self._done, number - 1)
@@ -197,6 +199,7 @@ class Twin:
         self._stale = self._stale + 1 if time < now - self.patience - self._h else 0
         if self._stale >= _STALE:
             self._counts.add("starts with an earlier clock")
+            self._planned = []
             return True
         return False
 
@@ -280,7 +283,7 @@ class Twin:
         while True:
             commands = self._commanded(start)
             try:
-                return self.estimator.advance(belief, commands)
+                return self._stepped(belief, commands)
             except ConvergenceError:
                 self._counts.add("failed steps, after which the state was that of the simulator without markers")
                 return self._without_markers(belief, commands)
@@ -291,10 +294,17 @@ class Twin:
                 self._commands.remove(held[-1])
                 self._counts.add(f"a command was left out: {error}")
 
+    def _stepped(self, belief: Belief, commands: dict[str, Given]) -> Belief:
+        """A step; without the environments beside it that renew its derivatives, where it fails with them."""
+        try:
+            return self.estimator.advance(belief, commands)
+        except ConvergenceError:
+            return self.estimator.advance(belief, commands, renew=False)
+
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
         """A step from the state of the simulator without markers; at rest, if that fails as well."""
         try:
-            return self.estimator.advance(self.estimator.without_markers(belief), commands)
+            return self.estimator.advance(self.estimator.without_markers(belief), commands, renew=False)
         except ConvergenceError:
             return self.estimator.begin(commands, belief.parameters)
 
@@ -384,7 +394,7 @@ class Twin:
         belief = self._belief_at(self._update())
         assert self._origin is not None
         held, now = self._commanded(np.inf), self._origin + self._newest * self._h
-        planned = [entry for entry in self._planned if entry[0] > now - _ROUNDING * self._h]
+        planned = [entry for entry in self._planned if entry[0] > self._latest]
         steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - _ROUNDING)), 1)
         markers, state = [self.estimator.markers(belief)[0]], belief
         with torch.no_grad():
@@ -393,7 +403,7 @@ class Twin:
                     held = held | planned.pop(0)[1]
                 try:
                     state = self.estimator.advance(state, {**held, **inputs}, renew=False)
-                except ConvergenceError:
+                except (ConvergenceError, InputError):
                     self._counts.add("predictions that failed")
                     raise
                 markers.append(self.estimator.markers(state)[0])

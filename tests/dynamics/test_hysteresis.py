@@ -186,6 +186,16 @@ class TestPoses:
         # The same load again changes nothing.
         torch.testing.assert_close(simulator.static_equilibrium(pull(0.05), after=again).q, again.q, rtol=0, atol=1e-9)
 
+    def test_several_loads_after_one_pose_are_what_they_are_alone(self):
+        simulator = Simulator(CLAMPED, SLIDING, 0.01, WEIGHTLESS, solver=TIGHT)
+        bent = simulator.static_equilibrium(pull(0.15))
+        loads = [pull(0.05), pull(0.1)]
+        both = Inputs(torch.cat([load.external_force.reshape(1, -1, 3) for load in loads]))
+        together = simulator.static_equilibrium(both, after=bent)
+        for row, load in enumerate(loads):
+            alone = simulator.static_equilibrium(load, after=bent)
+            torch.testing.assert_close(together.q[row], alone.q[0], rtol=0, atol=1e-8)
+
     def test_a_state_without_memory_was_strained_in_proportion(self):
         """A pose that a motion begins from is in equilibrium in its first step, with or without its memory."""
         simulator = Simulator(CLAMPED, SLIDING, 0.01, WEIGHTLESS, solver=TIGHT)

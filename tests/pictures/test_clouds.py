@@ -219,6 +219,41 @@ def test_background_and_isolated_points_are_left_out():
             Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)
 
 
+def test_a_scan_that_points_the_other_way_is_said():
+    with pytest.raises(InputError, match=r"check the directions of its pose \(world_to_cloud"):
+        Cloud(scan(REST, 0.0, 500) * (-1.0, 1.0, 1.0)).around(SCANNER, MESH, CLAMP)
+
+
+def test_one_stray_pixel_is_no_other_unit():
+    image = depths(REST)
+    count = len(Cloud.of_depth(image).around(CAMERA, MESH, CLAMP, 10_000).measured)
+    image[0, 0] = 65.535
+    assert abs(len(Cloud.of_depth(image).around(CAMERA, MESH, CLAMP, 10_000).measured) - count) <= 1
+
+
+def test_a_lens_sees_no_rays_where_it_cannot_be_undistorted():
+    lens = Lens(LENS.matrix, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64))
+    pixels = torch.tensor([[160.0, 120.0], [250.0, 160.0], [3000.0, 2000.0]], dtype=torch.float64)
+    rays = lens.rays(pixels)
+    torch.testing.assert_close(lens.pixels(rays[:2]), pixels[:2], rtol=0, atol=1e-6)
+    assert rays[2, :2].isnan().all()
+
+
+def test_pictures_with_lenses_made_apart_are_copies_of_one_camera(beam):
+    photos = tuple(
+        Photo(name, PlacedCamera(Lens(LENS.matrix.clone()), ABOVE, CENTRE), cloud=None) for name in ("0", "1")
+    )
+    assert replace(beam[0], photos=photos).copies(photos[0]) == 2
+
+
+def test_a_scan_is_read_by_its_name(tmp_path):
+    points = scan(REST, 0.0, 50)
+    np.save(tmp_path / "scan.npy", 1e3 * points)
+    read, normals = wr.read_scan(str(tmp_path / "scan.npy"), unit=1e-3)
+    np.testing.assert_allclose(read, points)
+    assert normals is None
+
+
 def test_two_lenses_have_values_of_their_own(beam):
     """Two depth cameras, of which one has a longer lens than is assumed."""
     pose, q = beam

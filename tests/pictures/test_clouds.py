@@ -120,7 +120,7 @@ def test_closest_points_do_not_depend_on_how_many_triangles_are_tried():
 
 @pytest.mark.parametrize("kind", ["scan", "depth"])
 def test_derivatives_of_clouds_are_those_of_differences(beam, kind):
-    """Of each residual, but of a few points whose closest triangle is another one a moment later."""
+    """Derivatives of all residuals, but of a few points whose closest triangle is another one a moment later."""
     pose, q = beam
     if kind == "scan":
         own = with_cloud(pose, Cloud(scan(q, 1e-3)), count=300)
@@ -184,8 +184,8 @@ def test_a_turned_scan_with_outliers(beam, outliers):
     deviation = result.uncertainty.deviation["youngs_modulus"]
     assert deviation < 0.15 * TRUTH["youngs_modulus"]
     assert abs(result.parameters["youngs_modulus"] - TRUTH["youngs_modulus"]) < 3.0 * deviation
-    found = Rotation.from_rotvec([result.parameters[name] for name in PLACES[3:]])
-    assert (found * turn.inv()).magnitude() < 0.05
+    turned = Rotation.from_rotvec([result.parameters[name] for name in PLACES[3:]])
+    assert (turned * turn.inv()).magnitude() < 0.05
     at_clamp = [result.parameters[name] for name in PLACES[:3]]
     assert at_clamp == pytest.approx(turn.apply(CENTRE) + shift - CENTRE, abs=2e-3)
     assert own.difference(own.photos[0], own.shape(result.parameters), result.parameters).cloud_mm < 1.0
@@ -271,10 +271,10 @@ def test_two_lenses_have_values_of_their_own(beam):
     assert own.lenses == ("left", "right")
     ranges = {**MODULUS, "focal_factor@left": Bounds(0.9, 1.1), "focal_factor@right": Bounds(0.9, 1.1)}
     first = {"youngs_modulus": 2e5, "focal_factor@left": 1.0, "focal_factor@right": 1.0}
-    found = wr.ParameterSearch(PictureMisfit([own], ranges)).run([first], 30).parameters
-    assert found["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.02)
-    assert found["focal_factor@left"] == pytest.approx(1.0, abs=5e-3)
-    assert found["focal_factor@right"] == pytest.approx(1.05, abs=5e-3)
+    identified = wr.ParameterSearch(PictureMisfit([own], ranges)).run([first], 30).parameters
+    assert identified["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.02)
+    assert identified["focal_factor@left"] == pytest.approx(1.0, abs=5e-3)
+    assert identified["focal_factor@right"] == pytest.approx(1.05, abs=5e-3)
     assert values_of(own, {"a": 1.0, "a@left": 2.0, "a@right": 3.0}, "left") == {"a": 2.0}
     with pytest.raises(InputError, match="middle is neither a pose, a material nor a lens"):
         PictureMisfit([own], {"focal_factor@middle": Bounds(0.9, 1.1)})

@@ -196,13 +196,13 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[
         given = [np.stack([frame.pose, frame.pose]) for frame in frames if frame.pose is not None]
         return _of_standing(path, frames, np.array(given).reshape(-1, 2, 4, 4), data)
     tag, lenses = Tag(**dict(data.tag)), read_lenses(data)
-    found = [tag.poses(read_picture(frame.image), lenses[frame.lens]) for frame in frames]
-    if hidden := [frame.image for frame, own in zip(frames, found, strict=True) if not own]:
+    tagged = [tag.poses(read_picture(frame.image), lenses[frame.lens]) for frame in frames]
+    if hidden := [frame.image for frame, own in zip(frames, tagged, strict=True) if not own]:
         raise DataFileError(
             f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame out, "
             "or give its world_to_camera."
         )
-    both = np.array([np.stack([own[0], own[-1]]) for own in found]).reshape(-1, 2, 4, 4)
+    both = np.array([np.stack([own[0], own[-1]]) for own in tagged]).reshape(-1, 2, 4, 4)
     return _of_standing(path, frames, both, data)
 
 

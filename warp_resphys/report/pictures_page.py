@@ -78,7 +78,7 @@ class PictureResult:
 
     @property
     def compared(self) -> str:
-        """What models are compared by: outlines; a cloud where there are none; without that, tracked points."""
+        """Kind of distance by which models are compared: outlines, else clouds, else tracked points."""
         kinds = {"outlines": self.outline_mm, "clouds": self.cloud_mm}
         return next((kind for kind, values in kinds.items() if values["sysid"] is not None), "tracked points")
 

@@ -106,7 +106,7 @@ class PictureData(Settings):
     kind: Literal["pictures"]
     folder: Word | None = setting(None, "of the pictures")
     lens: _Lenses | None = setting(
-        None, "of the camera; of several cameras, a name for each: {left: {file: left.yaml}, right: {...}}"
+        None, "of the camera; of several cameras, by their names: {left: {file: left.yaml}, right: {...}}"
     )
     tag: TagSettings | None = setting(None, "on the clamp; null: frames have world_to_camera")
     stands: bool = setting(

@@ -299,6 +299,8 @@ class Twin:
         try:
             return self.estimator.advance(belief, commands)
         except ConvergenceError:
+            if belief.wait:  # It had none.
+                raise
             return self.estimator.advance(belief, commands, renew=False)
 
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:

@@ -441,14 +441,14 @@ def test_it_goes_on_from_the_simulator_where_that_is_closer(robot):
 
 def test_a_step_that_fails_only_with_its_neighbours_is_done_without_them(robot, swing, monkeypatch):
     twin = followed(robot, swing[0][:10])
-    advance = twin.estimator.advance
+    step, alone = robot.step, twin.estimator._count
 
-    def fails(belief, inputs, renew=True):
-        if renew and not belief.wait:
+    def fails(state, **inputs):
+        if state.batch > alone:
             raise ConvergenceError("", None, None)
-        return advance(belief, inputs, renew)
+        return step(state, **inputs)
 
-    monkeypatch.setattr(twin.estimator, "advance", fails)
+    monkeypatch.setattr(robot, "step", fails)
     for number in range(10, 20):
         twin.take(number * robot.time_step, swing[0][number])
     assert np.linalg.norm(twin.now.markers - swing[1][19], axis=1).mean() < 2.0 * NOISE

@@ -10,6 +10,7 @@ import torch
 
 from ..experiment.files import DRIVEN
 from ..experiment.models import Learned
+from ..io.errors import DataFileError
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from .baselines import LinearModel
 from .reduced import ReducedModel
@@ -46,9 +47,16 @@ def write_reduced(path: Path, model: ReducedModel) -> None:
 
 
 def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
-    """Reads a reduced model, to which the learned force of its robot is added."""
+    """Reads a reduced model, to which the learned force of its robot is added.
+
+    Raises:
+        DataFileError: the file is missing, damaged, or of an earlier version.
+    """
     tensors, plain = read_checkpoint(path, _REDUCED)
-    return ReducedModel.restored({name: tensor.numpy() for name, tensor in tensors.items()}, plain, learned)
+    try:
+        return ReducedModel.restored({name: tensor.numpy() for name, tensor in tensors.items()}, plain, learned)
+    except KeyError as error:
+        raise DataFileError(f"{path} is of an earlier version: delete it and run the same command again.") from error
 
 
 def read_quality(path: Path) -> Mapping[str, Any]:

@@ -51,12 +51,12 @@ class Polynomial:
         while order > 0 and len(powers(variables, order)) > _SHARE_OF_POINTS * len(points):
             order -= 1
         coefficients = solve_ridge(Monomials(points).values(order), values.reshape(len(values), -1))
-        return cls(coefficients.reshape(-1, *values.shape[1:]), order)
+        return cls(coefficients.reshape(len(coefficients), *values.shape[1:]), order)
 
     def __call__(self, at: FloatArray | Monomials) -> FloatArray:
         """Values (T, *shape) at points (T, n)."""
         at = at if isinstance(at, Monomials) else Monomials(at)
-        return np.asarray((at.values(self.order) @ self._flat).reshape(-1, *self._shape))
+        return np.asarray((at.values(self.order) @ self._flat).reshape(len(at.points), *self._shape))
 
     def slopes(self, at: FloatArray | Monomials) -> FloatArray:
         """Derivatives (T, n, *shape) with respect to the variables at points (T, n)."""
@@ -64,7 +64,29 @@ class Polynomial:
         n = at.points.shape[1]
         if self._sloped is None:
             self._sloped = (derivatives(n, self.order) @ self._flat).swapaxes(0, 1).reshape(len(self._flat), -1)
-        return np.asarray((at.values(self.order) @ self._sloped).reshape(-1, n, *self._shape))
+        return np.asarray((at.values(self.order) @ self._sloped).reshape(len(at.points), n, *self._shape))
+
+
+class SquaredPolynomial(Polynomial):
+    """Symmetric matrices (..., r, r) without negative eigenvalues, of n variables: squares of polynomials."""
+
+    @classmethod
+    def fitted(cls, points: FloatArray, values: FloatArray, order: int) -> "SquaredPolynomial":
+        """Fits matrices (S, ..., r, r) at points (S, n); negative eigenvalues count as zero."""
+        sizes, vectors = np.linalg.eigh(0.5 * (values + values.mT))
+        roots = vectors * np.sqrt(np.maximum(sizes, 0.0))[..., None, :] @ vectors.mT
+        root = Polynomial.fitted(points, roots, order)
+        return cls(root.coefficients, root.order)
+
+    def __call__(self, at: FloatArray | Monomials) -> FloatArray:
+        """Values (T, ..., r, r) at points (T, n)."""
+        root = super().__call__(at)
+        return np.asarray(root @ root.mT)
+
+    def slopes(self, at: FloatArray | Monomials) -> FloatArray:
+        """Derivatives (T, n, ..., r, r) with respect to the variables at points (T, n)."""
+        product = super().slopes(at) @ super().__call__(at).mT[:, None]
+        return np.asarray(product + product.mT)
 
 
 @cache
@@ -101,9 +123,13 @@ def _products(variables: int, order: int) -> tuple[list[int], list[int]]:
     return factors, [place[tuple(row)] for row in lower.tolist()]
 
 
-def solve_ridge(features: FloatArray, values: FloatArray) -> FloatArray:
-    """Solves least squares of values (S, V) on features (S, F), which may be collinear; returns (F, V)."""
+def solve_ridge(features: FloatArray, values: FloatArray, alike: bool = False) -> FloatArray:
+    """Solves least squares of values (S, V) on features (S, F), which may be collinear; returns (F, V).
+
+    Features that are alike have one unit and size, so that those that hardly occur have no part in the solution.
+    """
     scale = np.sqrt(np.mean(features**2, axis=0))
+    scale = np.full_like(scale, scale.max()) if alike else scale
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = features / scale
     normal = scaled.T @ scaled / len(features) + _RIDGE * np.eye(features.shape[1])

@@ -2,49 +2,56 @@ r"""A reduced model of a robot: its equilibria, the slowest vibrations about the
 
 In coordinates z = Psi^T M x of r modes,
 
-    z'' + D(u) z' + A(u) (z - z_0(u)) = G(u) (c - c_0(u)),
+    z'' + D(u) z' + A(u) (z - z_0(u)) + sum_k B_k(u) y_k = G(u) (c - c_0(u)),    y_k' = z' - y_k / tau_k,
 
-with u the inputs and c the outputs of the learned force's network, evaluated on the body that z and z' describe
-(hyper-reduction: no degree of freedom of the full model is left). z_0(u) is the equilibrium under u and a force of
-fixed outputs c_0(u), affine in u: a fit of the network's outputs. With Phi(u) the vibrations about it,
-K phi = omega^2 M phi, and T = Psi^T M Phi,
+with u the inputs after their response to the commands, y_k what has not relaxed yet in a Prony branch, and c the
+outputs of the learned force's network, evaluated on the body that z and z' describe (hyper-reduction: no degree of
+freedom of the full model is left). z_0(u) is the equilibrium under u and a force of fixed outputs c_0(u), affine in u:
+a fit of the network's outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T
+the orthogonal matrix next to Psi^T M Phi,
 
-    A = T (omega^2 - Phi^T dF/dx Phi) T^-1,   D = T (alpha + beta omega^2) T^-1,   G = T Phi^T dF/dc,
+    A = T (omega^2 - Phi^T dF/dx Phi) T^T,   D = T Phi^T V Phi T^T,   B_k = T Phi^T V_k Phi T^T,   G = T Phi^T dF/dc,
 
-where F is the learned force of fixed outputs, which turns with the body, and alpha and beta are the Rayleigh damping.
-Observed points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact for small dz. z_0 and y_0 are cubic
-polynomials of the inputs, and A, D, G and C are quadratic, fitted to equilibria and the vibrations about them
-(interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share one basis Psi). H is
-constant, fitted to motions. As in the robot, the network is evaluated at the state before a step, so a step is linear
-in z. With s = (z, z'), and the integrator's g (1/3 where BDF2 has a previous state, else 0) and step length h',
+where F is the learned force of fixed outputs, which turns with the body, and V and V_k are the damping of the full
+model and the stiffness of a branch. Observed points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact
+for small dz. The vertices are at x_0(u) + Psi dz. z_0, y_0 and x_0 are cubic polynomials of the inputs, A, G and C are
+quadratic, and D and B_k are squares of cubic ones, so that no motion gains energy by them, fitted to equilibria and the
+vibrations about them (interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share
+one basis Psi). H is constant, fitted to motions. As in the robot,
+the network is evaluated at the state before a step, so a step is linear in z. With s = (z, z'), and the integrator's g
+(1/3 where BDF2 has a previous state, else 0) and step length h',
 
-    s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + force(s_k)),   J = [N; N / h'],   N = (1 / h'^2 + D / h' + A)^-1,
+    s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + P z_k - sum B e y + force(s_k)),     J = [N; N / h'],
+    N = (1 / h'^2 + D / h' + A + P)^-1,   P = sum B gamma,   y_{k+1} = e y_k + gamma (z_{k+1} - z_k),
 
-whose derivatives `ReducedMotion` has. B models are stepped together. Inputs are in units of `ReducedModel.scale`.
+with sums over the branches, and e and gamma of `energies.viscosity`. `ReducedMotion` has the derivatives. B models are
+stepped together. Inputs are in units of `ReducedModel.scale`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..data.input_response import InputResponse
+from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
 from ..io.errors import ConvergenceError, InputError
 from .plan import Response
-from .polynomials import Monomials, Polynomial
+from .polynomials import Monomials, Polynomial, SquaredPolynomial
 from .reduced_force import ForceAlong, ReducedForce
 from .world import BoolArray, FloatArray
 
 _REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50
 _HALVINGS: Final = 8
-_POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown")
+_POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown", "branches", "shape")
 _FORCE_POLYNOMIALS: Final = ("places", "seen", "usual", "push")
-_PLAIN: Final = ("time_step", "integrator", "labels", "name", "delay", "rise", "filters", "quality")
+_PLAIN: Final = ("time_step", "integrator", "labels", "name", "acts", "filters", "times", "quality")
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,8 @@ class ReducedState:
     Attributes:
         z: (B, r) coordinates.
         v: (B, r) their rates [1/s].
-        acting: (B, n) inputs after delay and lag, in units of the model's scale.
+        strains: (K, B, r) y_k of the Prony branches.
+        acting: (B, n) inputs after their response to the commands, in units of the model's scale.
         memory: of the inputs' response, entries (..., B, n).
         previous: (2, B, r) coordinates and rates one step earlier.
         looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
@@ -62,10 +70,16 @@ class ReducedState:
 
     z: FloatArray
     v: FloatArray
+    strains: FloatArray
     acting: FloatArray
     memory: Mapping[str, FloatArray]
     previous: FloatArray
     looks_back: BoolArray
+
+    def moved(self, z: FloatArray, v: FloatArray, time_step: float) -> "ReducedState":
+        """Returns the state with its coordinates (B, r) and rates changed at once, and a past that fits them."""
+        previous = self.previous + np.stack([z - time_step * v, v])
+        return replace(self, z=self.z + z, v=self.v + v, strains=self.strains + z, previous=previous)
 
     def where(self, chosen: BoolArray, other: "ReducedState") -> "ReducedState":
         """Joins two states: this one where chosen (B,), the other one elsewhere."""
@@ -95,14 +109,17 @@ class ReducedModel:
         labels: of the M observed points.
         name: of the input.
         scale: (n,) of the inputs.
-        delay: from commands to inputs [s].
-        rise: time constant of the inputs' first-order lag [s].
+        acts: arguments of `InputResponse`, from the commands to the inputs.
         filters: F time constants of the filtered inputs that the network takes [s].
+        times: K relaxation times tau_k of the Prony branches [s].
         static: z_0, (r,).
         observed: y_0, (3 M,) [m].
         stiffness: A, (r, r) [1/s^2].
         damping: D, (r, r) [1/s].
         shown: C, (3 M, r) [m].
+        branches: B_k, (K, r, r) [1/s^2].
+        shape: x_0, (3 N,) displacements of the vertices [m].
+        basis: Psi, (3 N, r).
         curved: H, (r, r, 3 M), symmetric [m].
         force: the learned force; None for a simulator alone.
         quality: errors, and counts of the samples that the model was fitted to.
@@ -116,14 +133,17 @@ class ReducedModel:
     labels: tuple[str, ...]
     name: str
     scale: FloatArray
-    delay: float
-    rise: float
+    acts: Mapping[str, Any]
     filters: tuple[float, ...]
+    times: tuple[float, ...]
     static: Polynomial
     observed: Polynomial
     stiffness: Polynomial
-    damping: Polynomial
+    damping: SquaredPolynomial
     shown: Polynomial
+    branches: SquaredPolynomial
+    shape: Polynomial
+    basis: FloatArray
     curved: FloatArray
     force: ReducedForce | None = None
     quality: Mapping[str, Any] = field(default_factory=dict)
@@ -147,8 +167,14 @@ class ReducedModel:
 
     @cached_property
     def response(self) -> InputResponse:
-        """Delay and lag of the inputs, and the filters whose outputs the network takes."""
-        return InputResponse(self.time_step, None, self.delay or None, self.rise or None, filters=self.filters)
+        """Response of the inputs to the commands, and the filters whose outputs the network takes."""
+        return InputResponse(self.time_step, **self.acts, filters=self.filters)
+
+    @cached_property
+    def relaxation(self) -> tuple[FloatArray, FloatArray]:
+        """Factors e and gamma (K,) of the Prony branches in a step."""
+        decay, gamma = relaxation(torch.tensor(self.times, dtype=torch.float64), self.time_step)
+        return decay.numpy(), gamma.numpy()
 
     def rest(self, inputs: FloatArray | None = None, count: int = 1) -> ReducedState:
         """Returns the state of B models in equilibrium under inputs (n,), zero if omitted.
@@ -156,11 +182,12 @@ class ReducedModel:
         Raises:
             ConvergenceError: there is no equilibrium, because the learned force is too large.
         """
-        u = np.zeros((1, self.parts)) if inputs is None else (inputs / self.scale)[None]
-        z = self._equilibrium(Monomials(u))[0]
-        z, u = np.repeat(z, count, axis=0), np.repeat(u, count, axis=0)
-        still = np.stack([z, np.zeros_like(z)])
-        return ReducedState(still[0], still[1], u, self.response.steady(u), still, np.zeros(count, dtype=np.bool_))
+        commands = np.zeros((count, self.parts)) if inputs is None else np.tile(inputs, (count, 1))
+        u = self.response.scaled(commands) / self.scale
+        z = np.repeat(self._equilibrium(Monomials(u[:1]))[0], count, axis=0)
+        still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
+        memory, begins = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
+        return ReducedState(still[0], still[1], relaxed, u, memory, still, begins)
 
     def _equilibrium(self, u: Monomials) -> tuple[FloatArray, ForceAlong | None]:
         """Solves A (z - z_0) = learned force by Newton's method with step halving; returns z (1, r) and the force."""
@@ -197,7 +224,7 @@ class ReducedModel:
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        u = Monomials((inputs / self.scale)[None])
+        u = Monomials((self.response.scaled(inputs) / self.scale)[None])
         z, force = self._equilibrium(u)
         a, slope = self.stiffness(u)[0], self.static.slopes(u)[0].T
         by_u = a @ slope - np.einsum("nrs,s->rn", self.stiffness.slopes(u)[0], (z - self.static(u))[0])
@@ -207,11 +234,17 @@ class ReducedModel:
             by_state, more, by_means = (slopes[0] for slopes in force.slopes())
             a, by_u = a - by_state[:, : self.modes], by_u + more + by_means.sum(1)
         by_z, direct = (slopes[0] for slopes in self.point_slopes(z, u))
-        return self.points(z, u)[0], (direct + by_z @ np.linalg.solve(a, by_u)) / self.scale
+        by_commands = self.acts.get("factor", 1.0) / self.scale
+        return self.points(z, u)[0], (direct + by_z @ np.linalg.solve(a, by_u)) * by_commands
 
     def observe(self, state: ReducedState) -> FloatArray:
         """Observed points (B, 3 M) in a state [m]."""
         return self.points(state.z, Monomials(state.acting))
+
+    def positions(self, state: ReducedState) -> FloatArray:
+        """Displacements (B, N, 3) of the vertices in a state [m]."""
+        u = Monomials(state.acting)
+        return (self.shape(u) + (state.z - self.static(u)) @ self.basis.T).reshape(len(state.z), -1, 3)
 
     def points(self, z: FloatArray, u: Monomials) -> FloatArray:
         """Observed points (S, 3 M) at coordinates (S, r) under S inputs [m]."""
@@ -235,9 +268,10 @@ class ReducedModel:
         Args:
             start: their state.
             inputs: (T, B, n) commanded during each step, in their unit.
-            bias: (r,) added to the equilibria z_0.
+            bias: (r,) or (B, r), added to the equilibria z_0; (B, r) for T = 1.
         """
-        acting, means, memory = self.response(start.memory, inputs / self.scale)
+        acting, means, memory = self.response(start.memory, inputs)
+        acting, means = acting / self.scale, means / self.scale
         steps, batch, n = acting.shape
         u, r, h = Monomials(acting.reshape(-1, n)), self.modes, self.time_step
         back = np.repeat(start.looks_back[None] & (self.integrator == "bdf2"), steps, axis=0)
@@ -246,22 +280,37 @@ class ReducedModel:
         step = np.where(back, 2.0 / 3.0 * h, h).reshape(-1, 1)
         base, a, damping = self.static(u), self.stiffness(u), self.damping(u)
         inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
-        inverse = np.linalg.inv(inertia + a)
+        branches, (decay, gamma) = self.branches(u), self.relaxation
+        held, carried = np.einsum("k,skrq->srq", gamma, branches), decay[:, None, None] * branches
+        inverse = np.linalg.inv(inertia + a + held)
         pull = (a @ (base if bias is None else base + bias)[..., None])[..., 0]
         force = self._force(u, means.reshape(len(means), len(u.points), n))
-        now, before, states = np.stack([start.z, start.v]), start.previous, []
+        now, before, states = np.stack([start.z, start.v]), start.previous, list[FloatArray]()
+        strain, strains = start.strains, list[FloatArray]()
         for k in range(steps):
             rows = slice(k * batch, (k + 1) * batch)
             at, rate = (1.0 + share[rows]) * now - share[rows] * before
             right = (inertia[rows] @ at[..., None])[..., 0] + rate / step[rows] + pull[rows]
+            right += (held[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
             if force is not None:
                 right += force(rows, now)
             z = (inverse[rows] @ right[..., None])[..., 0]
+            strain = self.relaxed(strain, z - now[0])
             now, before = np.stack([z, (z - at) / step[rows]]), now
             states.append(now)
-        end = ReducedState(now[0], now[1], acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
-        series = np.stack(states, axis=1).reshape(2, -1, r)
-        return ReducedMotion(self, u, bias, share, step, inertia, inverse, force, series[0], series[1], end)
+            strains.append(strain)
+        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
+        series, past = (
+            np.stack(states, axis=1).reshape(2, -1, r),
+            np.stack(strains, axis=1).reshape(-1, len(u.points), r),
+        )
+        matrices = inertia, inverse, held, carried.sum(1)
+        return ReducedMotion(self, u, bias, share, step, *matrices, force, series[0], series[1], past, end)
+
+    def relaxed(self, strains: FloatArray, change: FloatArray) -> FloatArray:
+        """Returns y_k after a step in which the coordinates change; (K, ...) and (...)."""
+        decay, gamma = (value.reshape(-1, *np.ones(change.ndim, dtype=int)) for value in self.relaxation)
+        return np.asarray(decay * strains + gamma * change)
 
     def respond(
         self,
@@ -272,19 +321,18 @@ class ReducedModel:
     ) -> Response:
         """Predicts the observed points of one model (B = 1); `PredictionModel` documents the arguments."""
         motion = self.move(start, inputs[:, None], bias)
-        slopes = None if basis is None else motion.slopes(basis / self.scale[:, None])
+        slopes = None if basis is None else motion.slopes(basis)
         return Response(motion.y, slopes)
 
     def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
         """Advances one model by a step under inputs (n,); returns the state and its derivatives by z, v and b."""
         motion = self.move(start, inputs[None, None], bias)
-        by_bias = motion.impulse @ self.stiffness(motion.u)
-        return motion.end, np.concatenate([motion.by_state, by_bias], axis=2)[0]
+        return motion.end, np.concatenate([motion.by_state, motion.by_bias], axis=2)[0]
 
     def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         """Returns arrays and plain data for `restored`, without the network."""
         polynomials = {name: getattr(self, name) for name in _POLYNOMIALS}
-        arrays = {"scale": self.scale, "curved": self.curved}
+        arrays = {"scale": self.scale, "curved": self.curved, "basis": self.basis}
         if self.force is not None:
             polynomials |= {name: getattr(self.force, name) for name in _FORCE_POLYNOMIALS}
             arrays |= {"told": self.force.conditions, "told_by": self.force.conditions_by}
@@ -306,16 +354,20 @@ class ReducedModel:
         Raises:
             InputError: the model has a learned force, and ``learned`` is None.
         """
-        polynomials = {name: Polynomial(arrays[name], order) for name, order in plain["orders"].items()}
+        kinds = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
+        polynomials = {
+            name: kinds.get(name, Polynomial)(arrays[name], order) for name, order in plain["orders"].items()
+        }
         own = {key: plain[key] for key in _PLAIN} | {name: polynomials.pop(name) for name in _POLYNOMIALS}
-        own |= {key: tuple(own[key]) for key in ("labels", "filters")}
+        own |= {key: tuple(own[key]) for key in ("labels", "filters", "times")}
         force = None
         if polynomials and learned is None:
             raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
         if polynomials and learned is not None:
             conditions: dict[str, Any] = {"conditions": arrays["told"], "conditions_by": arrays["told_by"]}
             force = ReducedForce(learned.network, learned.range_, **conditions | polynomials)
-        return cls(**own, scale=arrays["scale"], curved=arrays["curved"], force=force)
+        own |= {name: arrays[name] for name in ("scale", "curved", "basis")}
+        return cls(**own, force=force)
 
 
 @dataclass(frozen=True)
@@ -325,14 +377,17 @@ class ReducedMotion:
     Attributes:
         model: the reduced model.
         u: monomials of the (S, n) inputs.
-        bias: (r,) added to the equilibria z_0.
+        bias: (r,) or (B, r), added to the equilibria z_0.
         share: (S, 1) g, weight of the previous state.
         step: (S, 1) h' [s].
         inertia: (S, r, r) 1 / h'^2 + D / h'.
         inverse: (S, r, r) N.
+        held: (S, r, r) P.
+        carried: (S, r, r) sum of B e.
         force: the learned force along the motion, if the model has one.
         z: (S, r) after each step.
         v: (S, r) after each step [1/s].
+        strains: (K, S, r) y_k after each step.
         end: the last state.
     """
 
@@ -343,9 +398,12 @@ class ReducedMotion:
     step: FloatArray
     inertia: FloatArray
     inverse: FloatArray
+    held: FloatArray
+    carried: FloatArray
     force: ForceAlong | None
     z: FloatArray
     v: FloatArray
+    strains: FloatArray
     end: ReducedState
 
     @property
@@ -357,6 +415,11 @@ class ReducedMotion:
     def impulse(self) -> FloatArray:
         """J, derivatives (S, 2 r, r) of the state after a step with respect to a force."""
         return np.concatenate([self.inverse, self.inverse / self.step[..., None]], axis=1)
+
+    @property
+    def by_bias(self) -> FloatArray:
+        """Derivatives (S, 2 r, r) of the state after a step with respect to the bias in it."""
+        return self.impulse @ self.model.stiffness(self.u)
 
     @cached_property
     def _carried(self) -> FloatArray:
@@ -374,26 +437,42 @@ class ReducedMotion:
     def by_state(self) -> FloatArray:
         """Derivatives (S, 2 r, 2 r) of the state after each step with respect to the state before it."""
         slopes = (1.0 + self.share[..., None]) * self._carried
+        slopes[..., : self.model.modes] += self.impulse @ self.held
         return slopes if self._force_slopes is None else slopes + self.impulse @ self._force_slopes[0]
+
+    @cached_property
+    def by_moved(self) -> FloatArray:
+        """`by_state` for states that are moved at once, with their past and branches (`ReducedState.moved`)."""
+        r = self.model.modes
+        past = np.eye(2 * r)
+        past[:r, r:] -= self.model.time_step * np.eye(r)
+        slopes = self.by_state - self.share[..., None] * self._carried @ past
+        slopes[..., :r] -= self.impulse @ self.carried
+        return slopes
 
     def slopes(self, basis: FloatArray) -> FloatArray:
         """Derivatives (T, 3 M, P) of `y` of one model by parameters, from those of the commands (T, n, P)."""
         model, u = self.model, self.u
-        by_parameters, by_means = model.response.from_rest(basis)
+        by_parameters, by_means = (x / model.scale[:, None] for x in model.response.from_rest(basis))
         base = model.static(u)
         off = self.z - (base if self.bias is None else base + self.bias)
         by_u = model.stiffness(u) @ model.static.slopes(u).swapaxes(1, 2)
         by_u = by_u - np.einsum("tnrs,ts->trn", model.stiffness.slopes(u), off)
         by_u = by_u - np.einsum("tnrs,ts->trn", model.damping.slopes(u), self.v)
+        by_u = by_u - np.einsum("tnkrs,kts->trn", model.branches.slopes(u), self.strains)
         pushed = by_u @ by_parameters
         if self._force_slopes is not None:
             _, more, means = self._force_slopes
             pushed = pushed + more @ by_parameters + np.einsum("trfn,ftnp->trp", means, by_means)
         direct, before = self.impulse @ pushed, self.share[..., None] * self._carried
+        stiff = model.relaxation[0][:, None, None] * model.branches(u)
         now = past = np.zeros(direct.shape[1:])
-        z_slopes = []
+        strain, z_slopes = np.zeros((len(model.times), model.modes, direct.shape[2])), []
         for k in range(len(direct)):
-            now, past = self.by_state[k] @ now - before[k] @ past + direct[k], now
+            moved = self.by_state[k] @ now - before[k] @ past + direct[k]
+            moved -= self.impulse[k] @ (stiff[k] @ strain).sum(0)
+            strain = model.relaxed(strain, moved[: model.modes] - now[: model.modes])
+            now, past = moved, now
             z_slopes.append(now[: model.modes])
         by_z, own = model.point_slopes(self.z, u)
         return by_z @ np.array(z_slopes) + own @ by_parameters

@@ -14,7 +14,7 @@ from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State
-from .polynomials import Polynomial, solve_ridge
+from .polynomials import Polynomial, SquaredPolynomial, solve_ridge
 from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
@@ -32,7 +32,8 @@ class _Statics(NamedTuple):
 
     q: torch.Tensor  # (S, N, 3) [m]
     y: FloatArray  # (S, 3 M) observed points [m]
-    u: FloatArray  # (S, n) inputs as shares
+    commands: FloatArray  # (S, n) in the unit of the input
+    u: FloatArray  # (S, n) inputs in units of the scale
     outputs: FloatArray | None  # (S, c) of the network
 
 
@@ -55,7 +56,7 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     tangents = []
     for row in range(min(sampling.tangents, len(statics.u))):
         outputs = None if statics.outputs is None else statics.outputs[row]
-        tangents.append(source.tangent(statics.q[row : row + 1], statics.u[row], max(sampling.modes), outputs))
+        tangents.append(source.tangent(statics.q[row : row + 1], statics.commands[row], max(sampling.modes), outputs))
         on_progress(1)
     on_progress(sampling.tangents - len(tangents))
     counts = {"asked": sampling.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
@@ -106,23 +107,24 @@ def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> 
     """
     asked = sampling.equilibria
     unit = qmc.Sobol(source.parts, seed=sampling.seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
-    unit[0] = 0.0
+    commands = source.commands(unit)
+    commands[0] = np.clip(0.0, *source.commands(np.array([[0.0], [1.0]])))
     batches = []
     with torch.no_grad():
-        for shares in np.array_split(unit, -(-asked // sampling.batch)):
-            batches.append(source.equilibria(shares))
-            on_progress(len(shares))
-        q, u = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])
+        for some in np.array_split(commands, -(-asked // sampling.batch)):
+            batches.append(source.equilibria(some))
+            on_progress(len(some))
+        q, commands = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])
         y = source.robot.observe(RobotState(State(q, torch.zeros_like(q)))).flatten(1).double().cpu().numpy()
-    if len(u) < _LEAST_SETTLED * asked:
+    if len(commands) < _LEAST_SETTLED * asked:
         raise ConvergenceError(
-            f"the robot has an equilibrium under {len(u)} of {asked} inputs in its range: its learned force is too "
-            "large for a reduced model.",
+            f"the robot has an equilibrium under {len(commands)} of {asked} inputs in its range: its learned force is "
+            "too large for a reduced model.",
             q,
             None,
         )
     outputs = [batch[2] for batch in batches if batch[2] is not None]
-    return _Statics(q, y, u, np.concatenate(outputs) if outputs else None)
+    return _Statics(q, y, commands, source.acting(commands), np.concatenate(outputs) if outputs else None)
 
 
 def _assembled(
@@ -138,9 +140,12 @@ def _assembled(
     """
     unit = statics.u
     shapes = torch.stack([tangent.shapes for tangent in tangents])  # (S', 3 N, r)
-    projector = source.mass[:, None] * _common(shapes, source.mass)
+    basis = _common(shapes, source.mass)
+    projector = source.mass[:, None] * basis
     turned = torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy()
-    back = np.linalg.inv(turned)
+    left, _, right = np.linalg.svd(turned)
+    turned = left @ right  # T is nearly orthogonal, but singular where a vibration leaves the subspace.
+    back = turned.mT
     z_statics = ((statics.q - source.rest).flatten(1).double() @ projector).cpu().numpy()
     z, rates = (
         torch.einsum("tbd,dr->tbr", field.flatten(2).double(), projector).cpu().numpy()
@@ -151,7 +156,12 @@ def _assembled(
         return Polynomial.fitted(unit[: len(tangents)], values, TANGENT_ORDER)
 
     stiffness = fitted(turned @ np.stack([tangent.stiffness for tangent in tangents]) @ back)
-    damping = fitted(turned @ np.stack([tangent.damping for tangent in tangents]) @ back)
+
+    def squared(values: FloatArray) -> SquaredPolynomial:
+        """Fits matrices (S, ..., r, r) of the vibrations."""
+        turn = turned.reshape(len(tangents), *np.ones(values.ndim - 3, dtype=int), *turned.shape[1:])
+        return SquaredPolynomial.fitted(unit[: len(tangents)], turn @ values @ turn.mT, STATIC_ORDER)
+
     z_usual, force = z_statics, None
     if statics.outputs is not None and source.learned is not None:
         network = source.learned.network
@@ -167,20 +177,25 @@ def _assembled(
         at_rest = Polynomial.fitted(unit, places, STATIC_ORDER)
         force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push)
     modes, labels = shapes.shape[2], source.robot.labels
+    static, psi = Polynomial.fitted(unit, z_usual, STATIC_ORDER), basis.cpu().numpy()
+    shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (z_statics - static(unit)) @ psi.T
     model = ReducedModel(
         source.robot.time_step,
         source.robot.simulator.integrator,
         labels,
         source.input.name,
         source.scale,
-        source.delay,
-        source.rise,
+        source.acts,
         source.filters,
-        Polynomial.fitted(unit, z_usual, STATIC_ORDER),
+        source.times,
+        static,
         Polynomial(np.zeros((1, 3 * len(labels))), 0),
         stiffness,
-        damping,
+        squared(np.stack([tangent.damping for tangent in tangents])),
         fitted(np.stack([tangent.shown for tangent in tangents]) @ back),
+        squared(np.stack([tangent.branches for tangent in tangents])),
+        Polynomial.fitted(unit, shape, STATIC_ORDER),
+        psi,
         np.zeros((modes, modes, 3 * len(labels))),
         force,
     )
@@ -196,11 +211,15 @@ def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatAr
 
 
 def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
-    """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace of vibrations (S, 3 N, r)."""
+    """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace of vibrations (S, 3 N, r).
+
+    In that subspace it is next to the first of them, so that A is nearly diagonal there.
+    """
     root = mass.sqrt()[:, None]
     columns = (root * shapes).permute(1, 0, 2).flatten(1)
     basis = torch.linalg.svd(columns, full_matrices=False)[0][:, : shapes.shape[2]]
-    return torch.where(root > 0.0, basis / root.clamp_min(1e-300), 0.0)
+    left, _, right = torch.linalg.svd(basis.mT @ (root * shapes[0]))
+    return torch.where(root > 0.0, basis @ left @ right / root.clamp_min(1e-300), 0.0)
 
 
 def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tuple[FloatArray, ...]) -> ReducedModel:
@@ -218,7 +237,9 @@ def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tu
     off, remainder = residual(*motions)
     first, second = np.triu_indices(model.modes)
     curved = np.zeros((model.modes, model.modes, remainder.shape[1]))
-    curved[first, second] = 0.5 * solve_ridge(off[:, first] * off[:, second], remainder - observed(motions[1]))
+    curved[first, second] = 0.5 * solve_ridge(
+        off[:, first] * off[:, second], remainder - observed(motions[1]), alike=True
+    )
     return replace(model, observed=observed, curved=curved + curved.swapaxes(0, 1))
 
 
@@ -229,16 +250,18 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
         series[:, first:] for series in (z, rates, motions.y, motions.acting, motions.commands)
     )
     memories = [model.response.steady(np.zeros(commands.shape[1:]))]
-    for now in commands:
+    strains = [np.zeros((len(model.times), *z.shape[1:]))]
+    for number, now in enumerate(commands):
         memories.append(model.response(memories[-1], now[None])[2])
+        strains.append(model.relaxed(strains[-1], z[number + 1] - z[number]))
     off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
-        start = ReducedState(z[at], rates[at], acting[at - 1], memories[at], before, looks)
-        predicted, true = model.move(start, commands[at : at + steps] * model.scale).y, y[at + 1 : at + steps + 1]
+        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks)
+        predicted, true = model.move(start, commands[at : at + steps]).y, y[at + 1 : at + steps + 1]
         off.append(_distances(predicted, true).mean())
         moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())
-    whole = model.move(model.rest(count=z.shape[1]), commands * model.scale).y
+    whole = model.move(model.rest(count=z.shape[1]), commands).y
     return {
         "window_s": _WINDOW,
         "window_error_mm": float(np.mean(off)),

@@ -10,8 +10,9 @@ import scipy.sparse.linalg
 import torch
 
 from ..data.actuation import InputSequences
-from ..data.input_response import InputResponse, response_of
-from ..energies.materials import VISCOUS
+from ..data.input_response import SLOPES, InputResponse, response_of
+from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
+from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
 from ..io.errors import InputError
 from ..robot.inputs import RobotInput
@@ -70,8 +71,8 @@ class Motions:
         q: (T + 1, B, N, 3) [m].
         v: (T + 1, B, N, 3) [m/s].
         y: (T + 1, B, 3 M) observed points [m].
-        commands: (T, B, n) as shares.
-        acting: (T, B, n) inputs after delay and lag, as shares.
+        commands: (T, B, n) in the unit of the input.
+        acting: (T, B, n) inputs after their response to the commands, in units of the scale.
     """
 
     q: torch.Tensor
@@ -90,6 +91,7 @@ class Tangent:
         stiffness: (r, r) [1/s^2].
         damping: (r, r) [1/s].
         shown: (3 M, r) derivatives of the observed points with respect to the vibrations' amplitudes.
+        branches: (K, r, r) of the Prony branches [1/s^2].
         push: (r, c) derivatives of the force with respect to the network's outputs; None without a network.
     """
 
@@ -97,6 +99,7 @@ class Tangent:
     stiffness: FloatArray
     damping: FloatArray
     shown: FloatArray
+    branches: FloatArray
     push: FloatArray | None
 
     def slowest(self, modes: int) -> "Tangent":
@@ -106,6 +109,7 @@ class Tangent:
             self.stiffness[:modes, :modes],
             self.damping[:modes, :modes],
             self.shown[:, :modes],
+            self.branches[:, :modes, :modes],
             None if self.push is None else self.push[:modes],
         )
 
@@ -119,7 +123,7 @@ def driven_input(robot: Robot) -> RobotInput:
     inputs = [robot.inputs[name] for name in robot.driven if name in robot.description.seen]
     if len(inputs) != 1:
         raise InputError(
-            f"control needs a robot whose trials are driven by one input, and {robot.description.name} has "
+            f"a reduced model needs a robot whose trials are driven by one input, and {robot.description.name} has "
             f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles."
         )
     return inputs[0]
@@ -129,26 +133,38 @@ def check_reducible(robot: Robot) -> None:
     """Refuses a robot that cannot be reduced.
 
     Raises:
-        InputError: a data-driven robot, one without markers, with a moving base or a material with memory, or whose
+        InputError: a data-driven robot, one without markers, with a moving base or hysteresis in a material, or whose
             network is recurrent or nodal.
     """
     description = robot.description
     if robot.is_data_driven:
         raise InputError("a data-driven model has no stiffness to reduce: choose resphys or sysid.")
     if not robot.labels:
-        raise InputError(f"{description.name} has no markers: control follows markers of the robot.")
+        raise InputError(f"{description.name} has no markers: a reduced model predicts markers.")
     if description.told_of_base is not None:
-        raise InputError(f"the base of {description.name} moves: control is for robots with a fixed base.")
-    if any(material.prony or material.hysteresis for material in robot.simulator.materials.values()):
-        raise InputError(
-            "a material with memory cannot be reduced: remove its Prony branches and sliders (material.prony, "
-            "material.hysteresis)."
-        )
+        raise InputError(f"the base of {description.name} moves: reduced models have a fixed base.")
+    if any(material.hysteresis for material in robot.simulator.materials.values()):
+        raise InputError("a material with hysteresis cannot be reduced: remove its sliders (material.hysteresis).")
     network = None if description.learned is None else description.learned.network
     if network is not None and network.recurrent is not None:
         raise InputError("a recurrent network cannot be reduced: train one without a recurrent state.")
     if network is not None and any(coder.basis is None for coder in (network.position, *network.coders)):
-        raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced for control.")
+        raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced.")
+
+
+def check_plannable(robot: Robot) -> None:
+    """Refuses a robot whose input does not follow its commands linearly: plans need the derivatives.
+
+    Raises:
+        InputError: such a response, or no input, or several.
+    """
+    driven = driven_input(robot)
+    for word in ("slew", "dead_band", "zero", "backlash", *SLOPES):
+        if f"{driven.name}_{word}" in robot.parameters:
+            raise InputError(
+                f"{driven.name}_{word} is identified, but plans need an input without slew rate, curve, dead band, "
+                "zero or backlash: take it out of identify.parameters, or set control=none."
+            )
 
 
 class Source:
@@ -161,36 +177,46 @@ class Source:
 
     def __init__(self, robot: Robot, driven: RobotInput) -> None:
         self.robot, self.input, simulator = robot, driven, robot.simulator
+        assert driven.low is not None
         assert driven.high is not None
-        self.scale = np.asarray(driven.high, dtype=np.float64)
+        self._low, self._high = (np.asarray(bound, dtype=np.float64) for bound in (driven.low, driven.high))
         self.parts, self.rest = len(driven.parts), simulator.rest_positions
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
-        values = {name: value[0] for name, value in robot.parameters.items()}
-        factor, delay, rise, slew, curve, dead_band, zero, backlash, _ = response_of(driven.quantity, values)
-        unknown = {"slew": slew, "dead_band": dead_band, "zero": zero or None, "backlash": backlash}
-        if curve is not None or any(value is not None for value in unknown.values()):
-            other = next((word for word, value in unknown.items() if value is not None), "")
-            one = f"{driven.name}_{other if curve is None else next(iter(curve[1]))}"
-            raise InputError(
-                f"{one} is identified, but reduced models have no slew rate, curve, dead band, zero or backlash: "
-                "take it out of identify.parameters, or set control=none."
-            )
-        self._factor, self.delay, self.rise = (
-            float(1.0 if factor is None else factor),
-            float(delay or 0.0),
-            float(rise or 0.0),
-        )
-        damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, "mass_damping"))}
-        self._elastic = robot.with_parameters(**damping)
+        values = {name: float(value[0]) for name, value in robot.parameters.items()}
+        names = "factor", "delay", "rise", "slew", "curve", "dead_band", "zero", "backlash", "lower"
+        acts = zip(names, response_of(driven.quantity, values), strict=True)
+        self.acts: dict[str, Any] = {name: value for name, value in acts if value is not None}
+        self.response = InputResponse(robot.time_step, **self.acts)
+        reach = np.abs(self.response.scaled(np.stack([self._low, self._high]))).max(0)
+        self.scale = np.where(reach > 0.0, reach, 1.0)
+        damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))}
+        words = {name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name}
+        ratios = dict.fromkeys(words, 0.0)
+        self._viscous, self._elastic = robot.with_parameters(**ratios), robot.with_parameters(**damping, **ratios)
+        self._branches, times = list[Robot](), list[float]()
+        for name, word in words.items():
+            others = {other: 0.0 for other in ratios if other != name}
+            self._branches.append(robot.with_parameters(**damping, **others))
+            name = name.replace(word, PRONY_TIME)
+            times.append(float(torch.as_tensor(robot.parameters.get(name, simulator.constants.get(name)))))
+        self.times = tuple(times)
         free = np.ones(simulator.body.n_vertices)
         free[simulator.body.fixed_vertices] = 0.0
         mass = robot.constants.mass[0].double() * torch.as_tensor(free, device=self.rest.device)
         self.mass = mass.repeat_interleave(3)  # (3 N,) [kg]
 
-    def given(self, shares: FloatArray) -> dict[str, Any]:
-        """Keyword argument of the robot's methods for inputs (B, n) as shares of the scale."""
-        return {self.input.name: self.robot.simulator.tensor(shares * self.scale)}
+    def commands(self, shares: FloatArray) -> FloatArray:
+        """Commands (..., n) for shares of the range of the trials."""
+        return self._low + shares * (self._high - self._low)
+
+    def acting(self, commands: FloatArray) -> FloatArray:
+        """Inputs (..., n) under constant commands, in units of the scale."""
+        return np.asarray(self.response.scaled(commands) / self.scale)
+
+    def given(self, commands: FloatArray) -> dict[str, Any]:
+        """Keyword argument of the robot's methods for commands (B, n) in the unit of the input."""
+        return {self.input.name: self.robot.simulator.tensor(commands)}
 
     def conditions(self) -> tuple[FloatArray, FloatArray]:
         """Standardised inputs (k,) of the network beside the state, at zero inputs, and their derivatives.
@@ -206,9 +232,11 @@ class Source:
         conditions = self.robot.conditions(still, **nothing)
         assert conditions is not None
         blocks = 1 + len(self.filters)
-        changes = np.diag(np.tile(self._factor * self.scale, blocks))
+        changes = np.diag(np.tile(self.scale, blocks))
+        conditions = conditions.double().clone()
+        conditions[:, conditions.shape[1] - len(changes) :] = 0.0
         changes = np.pad(changes, ((0, 0), (conditions.shape[1] - len(changes), 0)))
-        encode, conditions = network.actuation.encode, conditions.double()
+        encode = network.actuation.encode
         base = encode(conditions)
         by = encode(conditions + torch.as_tensor(changes).to(conditions)) - base
         return base[0].cpu().numpy(), by.mT.cpu().numpy()
@@ -223,7 +251,7 @@ class Source:
             time = float(np.exp(random.uniform(np.log(fastest), np.log(_SLOWEST))))
             source = InputSequences(_MEAN, _DEVIATION, time, limit=1.0, rest=2.0 * robot.time_step)
             drawn.append(source.draw(steps, robot.time_step, self.parts, random)[1:])
-        commands = np.stack(drawn, axis=1)
+        commands = self.commands(np.stack(drawn, axis=1))
         every = max(steps // sampling.tenths, 1)
 
         def on_step(number: int) -> None:
@@ -233,9 +261,10 @@ class Source:
         with torch.no_grad():
             motion = robot.rollout(robot.begin(batch), on_step=on_step, **self.given(commands))
         on_progress(max(sampling.tenths - steps // every, 0))
-        acting, _ = InputResponse(robot.time_step, None, self.delay or None, self.rise or None).from_rest(commands)
         y = motion.markers.flatten(2).double().cpu().numpy()
-        return Motions(motion.q.float(), motion.v.float(), y, commands, acting)
+        return Motions(
+            motion.q.float(), motion.v.float(), y, commands, self.response.from_rest(commands)[0] / self.scale
+        )
 
     def _outputs(self, state: RobotState, given: dict[str, torch.Tensor]) -> FloatArray:
         """Outputs (B, c) of the network in a step from a state."""
@@ -248,21 +277,21 @@ class Source:
         outputs = network.standardised(inputs)[0] if range_ is None else range_.outputs(network, inputs)
         return np.asarray(outputs.double().cpu().numpy())
 
-    def equilibria(self, shares: FloatArray) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:
-        """Computes equilibria under inputs (B, n); inputs without an equilibrium are left out.
+    def equilibria(self, commands: FloatArray) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:
+        """Computes equilibria under commands (B, n); those without an equilibrium are left out.
 
         Returns:
-            Positions (S, N, 3) [m], their inputs (S, n), and the network's outputs (S, c) there, if there is one.
+            Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there, if there is one.
         """
-        q, rests = self.robot.settle_some(len(shares), **self.given(shares))
-        q, shares = q[rests], shares[rests.cpu().numpy()]
+        q, rests = self.robot.settle_some(len(commands), **self.given(commands))
+        q, commands = q[rests], commands[rests.cpu().numpy()]
         if self.learned is None:
-            return q, shares, None
-        if not len(shares):
-            return q, shares, np.zeros((0, self.learned.network.linear.shape[1]))
-        given = self.given(shares)
-        state = RobotState(State(q, torch.zeros_like(q)), self.robot.begin_memory(given, len(shares)))
-        return q, shares, self._outputs(state, given)
+            return q, commands, None
+        if not len(commands):
+            return q, commands, np.zeros((0, self.learned.network.linear.shape[1]))
+        given = self.given(commands)
+        state = RobotState(State(q, torch.zeros_like(q)), self.robot.begin_memory(given, len(commands)))
+        return q, commands, self._outputs(state, given)
 
     def _pull(self, state: State, outputs: FloatArray) -> torch.Tensor:
         """Learned force (B, N, 3) of network outputs (B, c) on a body in a state [N]."""
@@ -271,11 +300,11 @@ class Source:
         force = coder.decode(torch.as_tensor(outputs).to(coder.scale)).to(state.q)
         return force if frames is None else frames.to_world(state.q, state.v, force)
 
-    def tangent(self, q: torch.Tensor, share: FloatArray, modes: int, outputs: FloatArray | None) -> Tangent:
-        """Linearises about an equilibrium (1, N, 3) under inputs (n,) and the force of network outputs (c,)."""
-        robot, still = self.robot, torch.zeros_like(q)
-        state = RobotState(State(q, still), robot.begin_memory(self.given(share[None])))
-        hessian, inertia, free = self._elastic.linearised(state, **self.given(share[None]))
+    def tangent(self, q: torch.Tensor, commands: FloatArray, modes: int, outputs: FloatArray | None) -> Tangent:
+        """Linearises about an equilibrium (1, N, 3) under commands (n,) and the force of network outputs (c,)."""
+        robot, still, given = self.robot, torch.zeros_like(q), self.given(commands[None])
+        state = RobotState(State(q, still), robot.begin_memory(given))
+        hessian, inertia, free = self._elastic.linearised(state, **given)
         stiffness = (hessian - inertia).tocsc()
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()
         mass = scipy.sparse.diags_array(self.mass.cpu().numpy()[coordinates]).tocsc()
@@ -285,11 +314,17 @@ class Source:
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
         shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
         own = np.diag(values[order])
-        damped, inertia = self.robot.linearised(state, **self.given(share[None]))[:2]
+        damped, inertia = self._viscous.linearised(state, **given)[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
         step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
         damping = step * (kept.T @ ((damped - hessian) @ kept))
+        branches, gamma = (
+            np.zeros((len(self.times), *own.shape)),
+            relaxation(torch.tensor(self.times), robot.time_step)[1],
+        )
+        for number, branch in enumerate(self._branches):
+            branches[number] = kept.T @ ((branch.linearised(state, **given)[0] - hessian) @ kept) / float(gamma[number])
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)
 
         def seen(by: torch.Tensor) -> torch.Tensor:
@@ -297,7 +332,7 @@ class Source:
 
         shown = torch.func.jacfwd(seen)(zero).double().cpu().numpy()
         if outputs is None:
-            return Tangent(shapes, own, damping, shown, None)
+            return Tangent(shapes, own, damping, shown, branches, None)
         outputs, width = outputs[None], len(outputs)
         by_q = np.zeros_like(own)
         if robot.frames is not None:  # The force turns with the body after the step, so that it contributes to A.
@@ -306,7 +341,7 @@ class Source:
         unit = self._pull(State(q.expand(width, -1, -1), still.expand(width, -1, -1)), np.eye(width))
         zero_force = self._pull(State(q, still), np.zeros((1, width)))
         push = (shapes.mT @ (unit - zero_force).flatten(1).mT.double()).cpu().numpy()
-        return Tangent(shapes, own - by_q, damping, shown, push)
+        return Tangent(shapes, own - by_q, damping, shown, branches, push)
 
 
 def _moved(amounts: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:

@@ -53,7 +53,7 @@ from .files import (
 from .laboratory import Laboratory
 from .open_loop import Follower
 from .reduction import reduce
-from .sampling import Sampling, driven_input
+from .sampling import Sampling, check_plannable, driven_input
 from .task import Task, motion_name, motions_of
 from .world import FloatArray
 
@@ -69,6 +69,7 @@ def reduce_robot(context: StageContext) -> None:
     settings: ReduceStage = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
     sampling = Sampling(**dict(settings.reduction), seed=settings.seed)
+    check_plannable(robot)
     with Progress(context.name, sampling.total, "samples") as progress:
         reduced = reduce(robot, sampling, progress.advance)
     write_reduced(context.run_dir / reduced_file(settings.model), reduced)

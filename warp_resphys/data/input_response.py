@@ -142,7 +142,7 @@ class InputResponse:
 
 
 def response_of(
-    quantity: Quantity, parameters: Mapping[str, torch.Tensor]
+    quantity: Quantity, parameters: Mapping[str, Any]
 ) -> tuple[Number, Number, Number, Number, Curve | None, Number, Number, Number, float]:
     """Returns the identified factor, delay, rise, slew, curve, dead band, zero, backlash, and the least input."""
     own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}

@@ -42,7 +42,9 @@ def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: A
 MASS_DAMPING: Final = "mass_damping"
 # constants of viscosity, whose names end so if they are those of a region
 VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
-_PRONY_TIME = Quantity("prony_time", "s", 0.0)
+PRONY_RATIOS: Final = ("prony_ratio", "prony_modulus")  # likewise, of relaxation, and of the times with their numbers
+PRONY_TIME: Final = "prony_time"
+_PRONY_TIME = Quantity(PRONY_TIME, "s", 0.0)
 _YIELD_STRAIN = Quantity("hysteresis_strain", "", 0.0)
 _ITEMS: Final = {"prony": "branch", "hysteresis": "slider", "fibres": "family"}  # of groups
 

@@ -28,7 +28,8 @@ from .description import Description
 from .inputs import Given, InputReader, inputs_of
 from .motion import Motion
 from .state import RobotState
-from .twin.estimator import FullEstimator, TwinNoise
+from .twin.estimator import TwinNoise
+from .twin.full import FullEstimator
 from .twin.kalman import Gate
 from .twin.twin import Twin
 

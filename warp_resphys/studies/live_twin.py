@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..control.reduced_twin import ReducedEstimator, reduced_of
 from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..mesh.mesh import boundary_triangles, surface_vertices
@@ -44,14 +45,20 @@ class TwinSettings(Settings):
     refine: dict[str, Positive]
     noise: Positive = setting(unit="m")
     planned: bool
+    engine: Literal["full", "reduced"]
 
     def twin_of(self, robot: Robot) -> Twin:
         """Returns a twin with these settings.
 
         Raises:
-            InputError: the robot has no such parameter, or no simulator.
+            InputError: the robot has no such parameter, or no simulator, or cannot be reduced.
         """
-        return robot.twin(self.refine, self.horizon, self.patience, noise=TwinNoise(markers=self.noise))
+        noise = TwinNoise(markers=self.noise)
+        if self.engine == "full":
+            return robot.twin(self.refine, self.horizon, self.patience, noise=noise)
+        if self.refine:
+            raise InputError(f"a reduced model has no {next(iter(self.refine))} to refine: set twin.engine=full.")
+        return Twin(ReducedEstimator(robot, reduced_of(robot), {}, noise), self.horizon, self.patience)
 
 
 def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:

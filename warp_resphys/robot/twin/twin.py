@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ...io.errors import ConvergenceError, InputError
 from ..inputs import Given, InputReader
 from ..state import RobotState
-from .estimator import Belief, FullEstimator
+from .estimator import Belief, TwinEstimator
 from .kalman import Correction, FloatArray
 from .scores import REMEMBERED, Disagreement, Forecast, Scores
 from .stream import Faults
@@ -72,7 +72,7 @@ class Twin:
         InputError: a horizon or a patience that is not positive.
     """
 
-    def __init__(self, estimator: FullEstimator, horizon: float = 0.2, patience: float = 0.3) -> None:
+    def __init__(self, estimator: TwinEstimator[Any], horizon: float = 0.2, patience: float = 0.3) -> None:
         for name, value in (("horizon", horizon), ("patience", patience)):
             if not 0.0 < value < np.inf:
                 raise InputError(f"{name} is {value:g}: give seconds, more than zero.")
@@ -283,7 +283,7 @@ class Twin:
         while True:
             commands = self._commanded(start)
             try:
-                return self._stepped(belief, commands)
+                return self.estimator.advance(belief, commands)
             except ConvergenceError:
                 self._counts.add("failed steps, after which the state was that of the simulator without markers")
                 return self._without_markers(belief, commands)
@@ -293,15 +293,6 @@ class Twin:
                     raise
                 self._commands.remove(held[-1])
                 self._counts.add(f"a command was left out: {error}")
-
-    def _stepped(self, belief: Belief, commands: dict[str, Given]) -> Belief:
-        """A step; without the environments beside it that renew its derivatives, where it fails with them."""
-        try:
-            return self.estimator.advance(belief, commands)
-        except ConvergenceError:
-            if belief.wait:  # It had none.
-                raise
-            return self.estimator.advance(belief, commands, renew=False)
 
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
         """A step from the state of the simulator without markers; at rest, if that fails as well."""
@@ -360,7 +351,7 @@ class Twin:
         markers, deviations = self.estimator.markers(belief)
         return Estimate(
             self._origin + self._newest * self._h,
-            belief.state.select([0]),
+            self.estimator.robot_state(belief),
             markers,
             deviations,
             self.estimator.refined(belief),
@@ -411,7 +402,9 @@ class Twin:
                 markers.append(self.estimator.markers(state)[0])
         times = now + self._h * np.arange(steps + 1, dtype=np.float64)
         deviations = self.estimator.markers(state)[1]
-        prediction = Forecast(times, np.stack(markers), self._scores.scale * deviations, state.state.select([0]))
+        prediction = Forecast(
+            times, np.stack(markers), self._scores.scale * deviations, self.estimator.robot_state(state)
+        )
         seen = self._last_seen()
         if not inputs and seconds is None and seen is not None:
             self._scores.pending.append((replace(prediction, deviations=deviations), seen))

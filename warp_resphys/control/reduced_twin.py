@@ -1,0 +1,137 @@
+"""The state of a robot, estimated from its markers on its reduced model: a twin of a few milliseconds a frame."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from ..io.errors import ConvergenceError, InputError
+from ..io.progress import Progress
+from ..robot.inputs import Given, InputReader
+from ..robot.robot import Robot
+from ..robot.state import RobotState
+from ..robot.twin.estimator import Belief, TwinEstimator, TwinNoise
+from ..robot.twin.kalman import Gate
+from ..stepping.state import State
+from .files import read_reduced, reduced_file, write_reduced
+from .polynomials import Monomials
+from .reduced import ReducedModel, ReducedState
+from .reduction import reduce
+from .sampling import Sampling
+from .world import FloatArray
+
+_SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [rad/s]
+
+
+def reduced_of(robot: Robot) -> ReducedModel:
+    """Returns the reduced model of a robot, from its run's folder; it is computed and kept there the first time.
+
+    Raises:
+        InputError: the robot cannot be reduced.
+        ConvergenceError: it has no equilibrium for inputs in the range of its trials.
+        DataFileError: the file is damaged.
+    """
+    path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
+    if path is not None and path.exists():
+        return read_reduced(path, robot.description.learned)
+    sampling = Sampling()
+    with Progress("reduced model", sampling.total, "samples") as progress:
+        model = reduce(robot, sampling, progress.advance)
+    if path is not None:
+        write_reduced(path, model)
+    return model
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReducedBelief(Belief):
+    """Estimate of the state of a reduced model.
+
+    Attributes:
+        state: of two models: the estimate, and the one without markers.
+    """
+
+    state: ReducedState
+
+
+class ReducedEstimator(TwinEstimator[ReducedBelief]):
+    """Estimates the state of a robot with its reduced model, in whose coordinates all derivatives are exact.
+
+    Args:
+        robot: whose vertices and inputs it has.
+        model: of the robot.
+        inputs: constant commands under which it rests at first.
+        noise: of markers and simulator.
+        gate: for markers that jump.
+
+    Raises:
+        InputError: an input that the model does not have.
+        ConvergenceError: there is no equilibrium.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        model: ReducedModel,
+        inputs: Mapping[str, Given],
+        noise: TwinNoise | None = None,
+        gate: Gate | None = None,
+    ) -> None:
+        self.model, self._reader = model, InputReader(robot.inputs, robot.simulator)
+        stiffness = model.stiffness(model.rest(self._commands(inputs)).acting)[0]
+        frequencies = np.sqrt(np.abs(np.diag(stiffness))).clip(_SLOWEST)
+        reach = float(np.sqrt((model.basis**2).sum() / (len(model.basis) / 3) / model.modes))
+        super().__init__(robot, inputs, {}, frequencies, reach, noise, gate)
+
+    def _commands(self, inputs: Mapping[str, Given]) -> FloatArray:
+        """Values (n,) of the model's input."""
+        given = {name: self._reader.read(name, value, 1)[0] for name, value in inputs.items()}
+        values = given.pop(self.model.name, torch.zeros(self.model.parts))
+        for name, value in given.items():
+            if bool((value != 0.0).any()):
+                raise InputError(f"the reduced model has no input but {self.model.name}, and {name} is given.")
+        return np.asarray(values.double().cpu().numpy())
+
+    @override
+    def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> ReducedBelief:
+        return ReducedBelief(**vars(self._first(np.zeros(0))), state=self.model.rest(self._commands(inputs), 2))
+
+    @override
+    def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
+        commands = np.tile(self._commands(inputs), (1, 2, 1))
+        motion = self.model.move(belief.state, commands, np.stack([belief.bias, np.zeros_like(belief.bias)]))
+        if not np.isfinite(motion.z).all():
+            raise ConvergenceError("the reduced model diverged.", motion.z, None)
+        transition = np.concatenate([motion.by_moved, motion.by_bias], axis=2)[0]
+        return replace(self._propagated(belief, transition), state=motion.end)
+
+    @override
+    def robot_state(self, belief: ReducedBelief) -> RobotState:
+        simulator, (rate, *_) = self.robot.simulator, belief.state.v
+        moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
+        return RobotState(State(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster)))
+
+    @override
+    def _seen(self, belief: ReducedBelief, ago: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        state, u = belief.state, Monomials(belief.state.acting)
+        z = state.z - ago * state.v
+        now, free = self.model.points(z, u).reshape(2, -1, 3)
+        by_z = self.model.point_slopes(z, u)[0][0].reshape(self.count, 3, -1)
+        by_place = np.eye(3 * self.count).reshape(self.count, 3, -1)
+        slopes = np.concatenate([by_z, -ago * by_z, np.zeros_like(by_z), by_place], axis=2)
+        return now + belief.places, slopes, free
+
+    @override
+    def _free(self, belief: ReducedBelief) -> ReducedBelief:
+        free = {name: value[..., [1, 1], :] for name, value in belief.state.arrays().items() if value.ndim > 1}
+        return replace(belief, state=ReducedState.from_arrays({**belief.state.arrays(), **free}))
+
+    @override
+    def _moved(self, belief: ReducedBelief, z: FloatArray, w: FloatArray, parameters: FloatArray) -> ReducedBelief:
+        moved, faster = (np.stack([change, np.zeros_like(change)]) for change in (z, w))
+        return replace(belief, state=belief.state.moved(moved, faster, self.time_step))
+
+    @override
+    def _furthest(self, belief: ReducedBelief, z: FloatArray, parameters: FloatArray) -> float:
+        return float(np.linalg.norm((self.model.basis @ z).reshape(-1, 3), axis=1).max())

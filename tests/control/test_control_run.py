@@ -7,6 +7,7 @@ from dataclasses import replace
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import torch
 
 import warp_resphys
 from support.configured import check, composed
@@ -20,20 +21,26 @@ from warp_resphys.control.files import plans_file, read_baselines, read_plan, re
 from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Horizon, Limits, Planner
+from warp_resphys.control.polynomials import SquaredPolynomial
+from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_of
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
-from warp_resphys.control.sampling import Sampling
+from warp_resphys.control.sampling import Sampling, check_plannable
 from warp_resphys.control.stages import controllers_of
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.robot.twin.estimator import TwinNoise
+from warp_resphys.robot.twin.twin import Twin
 from warp_resphys.studies.gradient_check import central_difference
+from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.studies.run_speed import command_sheet, time_commands
 
 CONTROL = [
     "experiment=tendon_rod_control",
     *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *("+simulation.prony_ratio_1=0.0", "+simulation.prony_time_1=0.05"),
     *("data.steps=40", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1"),
     *("data.horizons=[]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}"),
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
@@ -122,13 +129,38 @@ class TestReducedModel:
         assert quality["window_relative"] < 0.05
 
     def test_of_several_numbers_of_modes_the_best_is_taken(self, folder):
-        """Of three, one of a pair of vibrations of a round rod is missing."""
+        """Of one, one of a pair of vibrations of a round rod is missing."""
         robot = warp_resphys.load(folder, "sysid")
-        sampling = Sampling((3, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
+        sampling = Sampling((1, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
         quality = reduce(robot, sampling).quality
         assert quality["modes"] == 4
-        assert list(quality["tried"]) == ["3", "4"]
-        assert quality["window_relative"] == quality["tried"]["4"] < 0.7 * quality["tried"]["3"]
+        assert list(quality["tried"]) == ["1", "4"]
+        assert quality["window_relative"] == quality["tried"]["4"] < 0.5 * quality["tried"]["1"]
+
+    def test_a_material_that_relaxes_keeps_its_branches(self, folder):
+        """Small vibrations after a push are those of the full robot, and others without the branches."""
+        robot = warp_resphys.load(folder, "sysid").with_parameters(prony_ratio_1=1.5)
+        model = reduce(robot, Sampling((4,), equilibria=20, tangents=20, motions=2, seconds=0.4))
+        assert model.times == (0.05,)
+        start, speed = robot.begin(), 1e-2 * model.basis[:, 0].reshape(1, -1, 3)
+        pushed = replace(start, body=replace(start.body, v=robot.simulator.tensor(speed)))
+        q = robot.rollout(pushed, 30).q[:, 0].double().numpy()
+        mass, shape = robot.constants.mass[0].double().numpy(), model.basis[:, 0].reshape(-1, 3)
+        true = np.einsum("tni,n,ni->t", q[1:] - q[0], mass, shape)
+        commands, rest = np.zeros((30, 1, 3)), model.rest()
+        still = replace(rest, v=rest.v + 1e-2 * np.eye(4)[:1])
+        elastic = replace(model, branches=SquaredPolynomial(0.0 * model.branches.coefficients, model.branches.order))
+        off, without = (np.linalg.norm((one.move(still, commands).z - rest.z)[:, 0] - true) for one in (model, elastic))
+        assert off < 0.03 * np.linalg.norm(true)
+        assert without > 0.2 * np.linalg.norm(true)
+
+    @pytest.mark.parametrize("word", ["slew", "dead_band", "slope_2"])
+    def test_plans_need_a_linear_response(self, robot, word):
+        check_plannable(robot)
+        robot = robot.with_parameters()
+        robot.parameters[f"tendon_tension_{word}"] = robot.parameters["tendon_tension_rise"]
+        with pytest.raises(InputError, match=f"tendon_tension_{word} is identified"):
+            check_plannable(robot)
 
     def test_a_number_of_modes_that_fails_leaves_the_others(self, folder, monkeypatch):
         robot = warp_resphys.load(folder, "sysid")
@@ -182,6 +214,72 @@ class TestReducedModel:
         task = Task(far, robot.labels, robot.time_step, 3)
         with pytest.raises(InputError, match=r"path circle: .*-350.0\) mm is .* mm away"):
             task.check_reach(model, 1e-3)
+
+
+class TestReducedTwin:
+    """A twin on the reduced model follows the full robot, from a state that it was not given."""
+
+    noise, commands = 1e-4, (0.3, 0.0, 0.1)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def corrected(cls, folder):
+        return warp_resphys.load(folder)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def swing(cls, corrected):
+        """Markers (T + 1, M, 3) of the robot, let go from a push while its tendons are commanded."""
+        rest = corrected.simulator.rest_positions
+        push = 0.02 * torch.tensor([0.6, 0.8, 0.0]).to(rest) * (rest[:, 2:] < rest[:, 2].mean()) / len(rest)
+        start = corrected.settle(tendon_tension=cls.commands, external_force=push)
+        motion = corrected.rollout(start, 60, tendon_tension=cls.commands).markers[:, 0].numpy()
+        return motion + cls.noise * np.random.default_rng(0).standard_normal(motion.shape)
+
+    def twin(self, corrected, **more):
+        noise = TwinNoise(markers=self.noise)
+        return Twin(ReducedEstimator(corrected, reduced_of(corrected), {}, noise), **more)
+
+    def test_it_looks_ahead(self, corrected, swing):
+        twin = self.twin(corrected, horizon=0.1)
+        for number, frame in enumerate(swing):
+            twin.take(number * corrected.time_step, frame, tendon_tension=self.commands)
+            if number > 10:
+                twin.ahead()
+        off, now = twin.disagreement, twin.now
+        assert off.predictions == 40
+        assert off.twin < 0.3 * off.held
+        assert off.twin < 0.5 * off.simulator
+        seen = corrected.observe(now.state)[0].numpy()
+        assert np.abs(seen - now.markers).max() < 1e-3
+
+    def test_packets_that_come_late_change_nothing(self, corrected, swing):
+        both = [self.twin(corrected) for _ in range(2)]
+        order = list(range(20))
+        order[7], order[9] = order[9], order[7]
+        for twin, numbers in zip(both, (range(20), order), strict=True):
+            for number in numbers:
+                twin.take(number * corrected.time_step, swing[number], tendon_tension=self.commands)
+                _ = twin.now
+        np.testing.assert_array_equal(both[0].now.markers, both[1].now.markers)
+
+    def test_other_inputs_are_refused(self, corrected, swing):
+        twin = self.twin(corrected)
+        with pytest.raises(InputError, match="no input but tendon_tension, and base is given"):
+            twin.take(0.0, swing[0], base=[1e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+        twin.take(0.0, swing[0], base=np.zeros(6))
+        twin.take(0.05, swing[5], base=[1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+        twin.take(0.10, swing[10])
+        assert [count for why, count in twin.counts.items() if "and base is given" in why] == [1]
+
+    def test_it_is_a_setting(self, folder):
+        settings = TwinSettings(
+            horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"
+        )
+        twin = settings.twin_of(warp_resphys.load(folder))
+        assert isinstance(twin.estimator, ReducedEstimator)
+        with pytest.raises(InputError, match="no youngs_modulus to refine"):
+            settings.changed(refine={"youngs_modulus": 1e3}).twin_of(twin.estimator.robot)
 
 
 class TestPlans:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.control.polynomials import Polynomial, powers
+from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, powers
 from warp_resphys.control.reduced import ReducedModel
 from warp_resphys.control.reduced_force import ReducedForce
 from warp_resphys.learning.networks import build_model
@@ -14,13 +14,14 @@ from warp_resphys.learning.predictors import Range
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
 
-MODES, PARTS, POINTS, FILTERS = 3, 2, 2, (0.1, 0.5)
+MODES, PARTS, POINTS, FILTERS, VERTICES = 3, 2, 2, (0.1, 0.5), 4
 NETWORK = {"kind": "reduced", "position_modes": 4, "velocity_modes": 2, "force_modes": 3, "blocks": 1, "layers": 1,
            "width": 8, "activation": "silu"}  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=["implicit_euler", "bdf2"])
 def model(request):
+    """The second one has two Prony branches, and a learned force that fades out."""
     random = np.random.default_rng(0)
     torch.manual_seed(0)
 
@@ -33,7 +34,7 @@ def model(request):
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
     network = build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
     network = network.double().requires_grad_(False)
-    missed = torch.ones(1, 2, dtype=torch.float64) if request.param == "bdf2" else None  # It then fades out.
+    missed, times = (torch.ones(1, 2, dtype=torch.float64), (0.02, 0.3)) if request.param == "bdf2" else (None, ())
     seen = np.zeros((6, 2 * MODES))
     seen[:4, :MODES], seen[4:, MODES:] = random.standard_normal((4, MODES)), random.standard_normal((2, MODES))
     force = ReducedForce(
@@ -47,23 +48,32 @@ def model(request):
         polynomial(2, random.standard_normal((MODES, 3)), 0.1),
     )
     curved = random.standard_normal((MODES, MODES, 3 * POINTS))
+    damping, branches = polynomial(2, np.eye(MODES), 0.1), polynomial(2, np.tile(10.0 * np.eye(MODES), (2, 1, 1)), 0.5)
+    acts = {"factor": 0.8, "delay": 0.013, "rise": 0.03}
     return ReducedModel(
         0.01,
         request.param,
         ("a", "b"),
         "pressure",
         np.full(PARTS, 5.0),
-        0.013,
-        0.03,
+        acts,
         FILTERS,
+        times,
         polynomial(3, np.zeros(MODES), 0.1),
         polynomial(3, np.zeros(3 * POINTS), 0.1),
         polynomial(2, np.diag([400.0, 900.0, 2500.0]), 5.0),
-        polynomial(2, np.eye(MODES), 0.1),
+        _squared(damping.coefficients),
         polynomial(2, random.standard_normal((3 * POINTS, MODES)), 0.1),
+        _squared(branches.coefficients[:, : len(times)]),
+        polynomial(3, np.zeros(3 * VERTICES), 0.1),
+        random.standard_normal((3 * VERTICES, MODES)),
         curved + curved.swapaxes(0, 1),
         force,
     )
+
+
+def _squared(coefficients):
+    return SquaredPolynomial(coefficients + coefficients.swapaxes(-1, -2), 2)
 
 
 def assert_slope(function, slope):
@@ -113,6 +123,43 @@ def test_a_transition_is_linearised(model):
             return float(weights @ np.concatenate([state.z[0], state.v[0]]))
 
         assert_slope(after, weights @ slope @ way[number])
+
+
+def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(model):
+    random, inputs = np.random.default_rng(6), np.array([2.5, 1.0])
+    start = model.move(model.rest(np.full(PARTS, 2.0)), np.tile(inputs, (4, 1, 1))).end
+    weights, way = random.standard_normal(2 * MODES), random.standard_normal((2, 1, MODES))
+    motion = model.move(start, inputs[None, None])
+    for number, slope in enumerate(np.split(motion.by_moved[0], 2, axis=1)):
+
+        def after(x, number=number):
+            changed = start.moved(*(x * way[one] * (one == number) for one in range(2)), model.time_step)
+            state = model.move(changed, inputs[None, None]).end
+            return float(weights @ np.concatenate([state.z[0], state.v[0]]))
+
+        assert_slope(after, weights @ slope @ way[number, 0])
+
+
+def test_a_branch_relaxes_as_a_maxwell_element(model):
+    """Coordinates that are moved at once and stay there: what has not relaxed decays with the branch's time."""
+    strains, change = np.zeros((len(model.times), 1, MODES)), np.ones((1, MODES))
+    strains = model.relaxed(strains + change, 0.0 * change)
+    for _ in range(9):
+        strains = model.relaxed(strains, 0.0 * change)
+    for strain, time in zip(strains, model.times, strict=True):
+        np.testing.assert_allclose(strain, np.exp(-10 * model.time_step / time))
+
+
+def test_squares_of_polynomials_have_no_negative_eigenvalues():
+    random = np.random.default_rng(7)
+    points, roots = random.uniform(-1.0, 1.0, (60, 2)), 0.3 * random.standard_normal((6, 3, 3))
+    true = SquaredPolynomial(roots + roots.swapaxes(1, 2) + 9.0 * np.eye(3) * (np.arange(6) == 0)[:, None, None], 2)
+    again = SquaredPolynomial.fitted(points, true(points), 2)
+    np.testing.assert_allclose(again(points), true(points), rtol=1e-5, atol=1e-5)
+    assert np.linalg.eigvalsh(again(10.0 * points)).min() > -1e-6
+    way = random.standard_normal(2)
+    slope = float(np.einsum("n,nij->", way, again.slopes(points[:1])[0]))
+    assert_slope(lambda x: float(again(points[:1] + x * way).sum()), slope)
 
 
 def test_models_at_once_do_not_see_each_other_and_begin_again_by_themselves(model):

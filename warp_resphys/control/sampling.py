@@ -199,7 +199,9 @@ class Source:
             others = {other: 0.0 for other in ratios if other != name}
             self._branches.append(robot.with_parameters(**damping, **others))
             name = name.replace(word, PRONY_TIME)
-            times.append(float(torch.as_tensor(robot.parameters.get(name, simulator.constants.get(name)))))
+            times.append(
+                float(torch.as_tensor(robot.parameters.get(name, simulator.constants.get(name)), dtype=torch.float64))
+            )
         self.times = tuple(times)
         free = np.ones(simulator.body.n_vertices)
         free[simulator.body.fixed_vertices] = 0.0

@@ -1,4 +1,5 @@
 # The public names of the package. Type checkers read this file; `__init__.py` imports a name when it is first used.
+from .control.reduced_twin import reduced_twin as reduced_twin
 from .data.camera import CameraMarkers as CameraMarkers
 from .data.camera import Lens as Lens
 from .data.markers import Markers as Markers

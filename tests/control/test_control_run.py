@@ -22,7 +22,7 @@ from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Horizon, Limits, Planner
 from warp_resphys.control.polynomials import SquaredPolynomial
-from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_of
+from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_twin
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
 from warp_resphys.control.sampling import Sampling, check_plannable
@@ -32,7 +32,6 @@ from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.io.errors import ConvergenceError, DataFileError, InputError
 from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.robot.twin.estimator import TwinNoise
-from warp_resphys.robot.twin.twin import Twin
 from warp_resphys.studies.gradient_check import central_difference
 from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.studies.run_speed import command_sheet, time_commands
@@ -237,8 +236,7 @@ class TestReducedTwin:
         return motion + cls.noise * np.random.default_rng(0).standard_normal(motion.shape)
 
     def twin(self, corrected, **more):
-        noise = TwinNoise(markers=self.noise)
-        return Twin(ReducedEstimator(corrected, reduced_of(corrected), {}, noise), **more)
+        return reduced_twin(corrected, noise=TwinNoise(markers=self.noise), **more)
 
     def test_it_looks_ahead(self, corrected, swing):
         twin = self.twin(corrected, horizon=0.1)

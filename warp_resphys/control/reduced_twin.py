@@ -14,6 +14,7 @@ from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..robot.twin.estimator import Belief, TwinEstimator, TwinNoise
 from ..robot.twin.kalman import Gate
+from ..robot.twin.twin import Twin
 from ..stepping.state import State
 from .files import read_reduced, reduced_file, write_reduced
 from .polynomials import Monomials
@@ -42,6 +43,31 @@ def reduced_of(robot: Robot) -> ReducedModel:
     if path is not None:
         write_reduced(path, model)
     return model
+
+
+def reduced_twin(
+    robot: Robot,
+    horizon: float = 0.2,
+    patience: float = 0.3,
+    noise: TwinNoise | None = None,
+    gate: Gate | None = None,
+    **inputs: Given,
+) -> Twin:
+    """Returns a twin like `Robot.twin`, on the reduced model of a robot (`reduced_of`).
+
+    Args:
+        robot: whose trials are driven by one input.
+        horizon: of predictions [s].
+        patience: how late packets may come [s].
+        noise: of markers and simulator.
+        gate: for markers that jump.
+        inputs: commands before the first packet, as for `Robot.step`.
+
+    Raises:
+        InputError: the robot cannot be reduced; an unknown input, or one that the reduced model does not have.
+        ConvergenceError: there is no equilibrium.
+    """
+    return Twin(ReducedEstimator(robot, reduced_of(robot), inputs, noise, gate), horizon, patience)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control.reduced_twin import ReducedEstimator, reduced_of
+from ..control.reduced_twin import reduced_twin
 from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..mesh.mesh import boundary_triangles, surface_vertices
@@ -58,7 +58,7 @@ class TwinSettings(Settings):
             return robot.twin(self.refine, self.horizon, self.patience, noise=noise)
         if self.refine:
             raise InputError(f"a reduced model has no {next(iter(self.refine))} to refine: set twin.engine=full.")
-        return Twin(ReducedEstimator(robot, reduced_of(robot), {}, noise), self.horizon, self.patience)
+        return reduced_twin(robot, self.horizon, self.patience, noise)
 
 
 def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:

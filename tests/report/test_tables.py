@@ -159,7 +159,7 @@ class TestIdentification:
 
     def test_where_markers_and_recordings_lie(self):
         offsets = {"A": [0.001, 0.0, 0.0], "B": [0.0, 0.003, 0.004]}
-        said = placement_text("sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]})
+        said = placement_text("sysid", {"offsets": offsets, "shift": [0.0, 0.002, 0.0], "turn": [0.0, 0.0, 0.1]}, {})
         said = said.replace(NO_BREAK_SPACE, " ")
         assert "B the most, by 5.0 mm" in said
         assert "by 2.0 mm and rotated by 5.7°" in said

@@ -56,7 +56,7 @@ class Laboratory(World):
         self._constants, self.input, self.count = self._simulator.prepare(), name, count
         self.time_step, self.parts = settings.time_step, self._simulator.counts[name]
         binding = settings.binding
-        markers = bound_markers(binding, self._simulator.body.mesh, setup.tracked, tuple(binding.tracked))
+        markers = bound_markers(binding, self._simulator.body.mesh, setup.tracked, binding.observed)
         self._read = markers.to(self._simulator.rest_positions)
         self._substeps = substeps_of(settings.time_step, settings.laboratory, "laboratory")
         self.noise = settings.laboratory.noise

@@ -137,6 +137,22 @@ class JoinedMarkers(Markers):
     parts: tuple[SurfaceMarkers | RigidMarkers, ...]  # the markers of each kind
     order: torch.Tensor  # (m,) index of the markers in the concatenated parts
 
+    @classmethod
+    def of(cls, parts: Sequence["BoundMarkers"], places: Sequence[list[int]]) -> "BoundMarkers":
+        """Returns the markers of parts with their indices among all markers; the part itself if there is one."""
+        if len(parts) == 1:
+            return parts[0]
+        flat, order = list[SurfaceMarkers | RigidMarkers](), list[int]()
+        for part, own in zip(parts, places, strict=True):
+            if isinstance(part, JoinedMarkers):
+                flat += part.parts
+                order += [own[number] for number in torch.argsort(part.order).tolist()]
+            else:
+                flat.append(part)
+                order += own
+        vertices = torch.cat([part.vertices.flatten() for part in flat])
+        return cls(vertices, tuple(flat), torch.as_tensor(np.argsort(order)))
+
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return torch.cat([part(positions) for part in self.parts], 1)[:, self.order]
@@ -147,6 +163,9 @@ class JoinedMarkers(Markers):
         in_parts = by[torch.argsort(self.order).to(by.device)].split(counts)
         parts = tuple(part.moved(offsets) for part, offsets in zip(self.parts, in_parts, strict=True))
         return replace(self, parts=parts)
+
+
+BoundMarkers = SurfaceMarkers | RigidMarkers | JoinedMarkers
 
 
 def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tensor:
@@ -200,7 +219,7 @@ def bind_markers(
     vertices: ArrayLike | None = None,
     largest_distance: float = 0.02,
     patch: float = 0.02,
-) -> Markers:
+) -> BoundMarkers:
     """Binds markers to a body at rest.
 
     A marker is bound to a triangle of `surface.closest_points`. Beside an edge, a ``normal`` one stands on the plane of
@@ -237,14 +256,14 @@ def bind_markers(
     flat = np.array(kinds) == "normal"
     on_surface = flat | (np.array(kinds) == "frame")
     parts: list[SurfaceMarkers | RigidMarkers] = []
-    places: list[int] = []
+    places: list[list[int]] = []
     if on_surface.any():
         arrays = (feet.triangles, points, feet.points, flat)
         parts.append(_on_triangles(mesh, *(array[on_surface] for array in arrays)))
-        places += np.flatnonzero(on_surface).tolist()
+        places.append(np.flatnonzero(on_surface).tolist())
     if rigid := [number for number, name in enumerate(kinds) if name == "rigid"]:
-        parts.append(_on_vertices(mesh, vertices, points[rigid]))
-        places += rigid
+        parts.append(follow_vertices(mesh, vertices, points[rigid]))
+        places.append(rigid)
     for number in [number for number, name in enumerate(kinds) if name == "patch"]:
         near = np.flatnonzero(np.linalg.norm(mesh.vertices - feet.points[number], axis=1) <= patch)
         if len(near) < _LEAST_PATCH:
@@ -252,12 +271,9 @@ def bind_markers(
                 f"Marker '{names[number]}' follows {len(near)} vertices within {1e3 * patch:.3g} mm of its foot: "
                 "widen the patch."
             )
-        parts.append(_on_vertices(mesh, near, points[number][None]))
-        places.append(number)
-    if len(parts) == 1:
-        return parts[0]
-    order = torch.as_tensor(np.argsort(places))
-    return JoinedMarkers(torch.cat([part.vertices.flatten() for part in parts]), tuple(parts), order)
+        parts.append(follow_vertices(mesh, near, points[number][None]))
+        places.append([number])
+    return JoinedMarkers.of(parts, places)
 
 
 def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:
@@ -294,7 +310,12 @@ def _on_triangles(
     return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets, frame)))
 
 
-def _on_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:
+def follow_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:
+    """Returns points (m, 3) of the undeformed body [m] that follow the rigid motion of some of its vertices (S,).
+
+    Raises:
+        InputError: vertices that are missing, too few, on one line or not in the mesh.
+    """
     chosen = np.unique(np.asarray([] if vertices is None else vertices, dtype=np.int64))
     if len(chosen) < 3 or chosen[0] < 0 or chosen[-1] >= len(mesh.vertices):
         raise InputError(

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..data.marker_view import MarkerView
-from ..data.markers import Markers, bind_markers
+from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
+from ..data.rigid_bodies import arms, corners_of
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
@@ -50,8 +51,10 @@ from ..settings.mesh import (
     SymmetrySettings,
     TetrahedralBox,
 )
-from ..settings.trials import BindingSettings, MarkerSettings
+from ..settings.trials import BindingSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
+
+FloatArray = NDArray[np.float64]
 
 _DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
@@ -265,22 +268,52 @@ def _with_regions(mesh: Mesh, settings: BodySettings) -> Mesh:
 
 
 def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labels: Sequence[str]) -> Markers:
-    """Binds markers at places (M, 3) on the undeformed body [m], in float64 on the CPU, by the group ``markers``.
+    """Binds observed points at places (M, 3) on the undeformed body [m], in float64 on the CPU, by `markers`.
 
     Raises:
         InputError: see `bind_markers`.
-        MeshError: no vertex lies at ``markers.bind_to``.
+        MeshError: no vertex lies at ``markers.bind_to``, or where a rigid body is mounted.
     """
-    to = settings.bind_to
-    return bind_markers(
-        mesh,
-        places,
-        labels,
-        kind=settings.bind,
-        vertices=None if to is None else select_vertices(mesh, **to.arguments()),
-        largest_distance=settings.largest_distance,
-        patch=settings.patch,
-    )
+    to, points = settings.bind_to, np.asarray(places, dtype=np.float64)
+    parts, rows = list[BoundMarkers](), list[list[int]]()
+    for name, own in corners_of(labels).items():
+        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[name], mesh), points[own]))
+        rows.append(list(range(own.start, own.stop)))
+    if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
+        markers = bind_markers(
+            mesh,
+            points[marked],
+            [labels[row] for row in marked],
+            kind=settings.bind,
+            vertices=None if to is None else select_vertices(mesh, **to.arguments()),
+            largest_distance=settings.largest_distance,
+            patch=settings.patch,
+        )
+        parts, rows = [markers, *parts], [marked, *rows]
+    return JoinedMarkers.of(parts, rows)
+
+
+def mounted_on(settings: RigidBodySettings, mesh: Mesh) -> NDArray[np.int64]:
+    """Returns the vertices of the part or the plate that a rigid body is mounted on.
+
+    Raises:
+        MeshError: the mesh has no such region or no vertex there.
+    """
+    if settings.part is None:
+        assert settings.at is not None
+        return select_vertices(mesh, **settings.at.arguments())
+    return np.unique(mesh.cells[mesh.region(settings.part)])
+
+
+def nominal_places(settings: BindingSettings, mesh: Mesh) -> FloatArray:
+    """(M, 3) nominal places of the observed points [m]; rigid bodies are aligned with the body, at their part's centre.
+
+    Raises:
+        MeshError: see `bound_markers`.
+    """
+    places = np.array([*settings.tracked.values()], dtype=np.float64).reshape(-1, 3)
+    bodies = settings.rigid_bodies.values()
+    return np.concatenate([places, *(mesh.vertices[mounted_on(b, mesh)].mean(axis=0) + arms(b.length) for b in bodies)])
 
 
 def marker_view_of(
@@ -296,7 +329,9 @@ def marker_view_of(
     Raises:
         InputError: see `MarkerView`.
     """
-    return MarkerView.of([settings.tracked[label] for label in labels], settings.plane, settings.frame, sets)
+    # Rigid bodies are seen in all coordinates, where nominal positions do not matter.
+    nominal = [settings.tracked.get(label, (0.0, 0.0, 0.0)) for label in labels]
+    return MarkerView.of(nominal, settings.plane, settings.frame, sets)
 
 
 def build_simulator(

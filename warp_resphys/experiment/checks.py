@@ -204,6 +204,11 @@ def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
         raise InputError(
             "refinement knows one placement of the markers, and trials name sessions: set refinement=none."
         )
+    placement, markers = identify.placement, run.markers
+    if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
+        raise InputError(
+            "identify.placement.mounting is of rigid bodies, and markers.rigid_bodies is empty: leave it out."
+        )
     for name, limits in identify.parameters.items():
         if limits.per == "material":
             raise InputError(

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, product
 from statistics import mean, pstdev
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError
 from ..io.fan_out import ALONE, Workers
@@ -134,7 +136,13 @@ def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float
     """Root mean square displacement of the observed points [m], by trial."""
     amplitudes: dict[str, float] = {}
     for batch in experiment.batches(names):
-        amplitudes |= dict(zip(batch, experiment.trials(batch).amplitude.tolist(), strict=True))
+        trials = experiment.trials(batch)
+        observed, held = (
+            torch.from_numpy(as_markers(points.cpu().numpy(), experiment.dataset.labels))
+            for points in (trials.observed, trials.held)
+        )
+        seen = replace(trials, observed=observed, held=held)
+        amplitudes |= dict(zip(batch, seen.amplitude.tolist(), strict=True))
     return amplitudes
 
 
@@ -150,7 +158,7 @@ def summary(
     simulated: Mapping[str, FloatArray],
     left: Mapping[str, IntArray],
 ) -> dict[str, Any]:
-    """Contents of errors.json.
+    """Contents of errors.json; a rigid body counts as one marker, and has errors of its orientation as well.
 
     Args:
         context: context of the stage.
@@ -163,9 +171,10 @@ def summary(
     assert isinstance(settings, EvaluateStage)
     names, every = groups["1"], [name for group in groups.values() for name in group]
     count, step = len(names), settings.time_step
-    observed = counted(experiment, every)
+    points = counted(experiment, every)
+    observed = as_markers(points, dataset.labels)
     first = [first_frame(experiment, [name]) for name in every]
-    models = dict(simulated)
+    models = {model: as_markers(values, dataset.labels) for model, values in simulated.items()}
     if dataset.bound is None:
         models["reconstruction"] = _reconstructed(context, names)
     test = {model: values[:count] for model, values in models.items()}
@@ -184,14 +193,20 @@ def summary(
         content["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
     else:
         seen = observed[:count]
-        content["per_marker"] = {model: errors_per_marker(x, seen, dataset.labels) for model, x in test.items()}
+        labels = owners(dataset.labels)
+        content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}
+    if bodies := corners_of(dataset.labels):
+        content["orientations_deg"] = {
+            model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
+            for model, x in simulated.items()
+        }
     content |= _over_time(settings, test, observed, errors)
     if left:
         content["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
     if len(groups) > 1:
         at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(groups)}
         content["scales"] = {
-            scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in simulated.items()}
+            scale: {m: summarise(_errors(models[m][rows], observed[rows], first)) for m in simulated}
             for scale, rows in at.items()
         }
         if left:
@@ -201,6 +216,18 @@ def summary(
             }
     sideways = _sideways(experiment, names)
     return {**content, **({"sideways_mm": sideways} if sideways else {})}
+
+
+def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
+    """Mean error of the orientation of a rigid body where it was seen [degrees]; None if a roll-out diverged.
+
+    Args:
+        simulated: (R, T, 4, 3) its points [m].
+        observed: (R, T, 4, 3) [m], NaN where it was not seen.
+    """
+    seen = np.isfinite(observed).all(axis=(-2, -1))
+    mean = float(np.degrees(angles(observed, simulated)[seen].mean())) if seen.any() else math.nan
+    return mean if math.isfinite(mean) else None
 
 
 def _thirds(errors: Mapping[str, Sequence[FloatArray]], number: int) -> dict[str, dict[str, list[float]]]:
@@ -338,8 +365,10 @@ def check_mesh(context: StageContext) -> None:
                 shown = []
                 for experiment, mesh_errors in zip(experiments, errors, strict=True):
                     markers, trials = _simulated(experiment, model, names)
-                    seen = trials.seen.cpu().numpy()
-                    mesh_errors += _distances(markers, trials.observed.cpu().numpy(), seen)
+                    labels = experiment.dataset.labels
+                    markers, observed = as_markers(markers, labels), as_markers(trials.observed.cpu().numpy(), labels)
+                    seen = np.asarray(np.isfinite(observed).all(axis=-1))
+                    mesh_errors += _distances(markers, observed, seen)
                     shown.append(markers)
                     progress.advance(len(names))
                 moved += _distances(shown[0], shown[1], seen)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import as_markers
 from .experiment import Experiment
 from .sensitivity import Sensitivity, responses
 
@@ -50,7 +51,8 @@ def free_fits(
             )
             fit = _least(*parts)  # Trials count alike.
             shared |= {} if fit is None else dict.fromkeys(members, fit)
-    return [_fitted(name, error, columns[name], shared.get(name)) for name, error in errors.items()]
+    labels = experiment.dataset.labels
+    return [_fitted(name, error, columns[name], shared.get(name), labels) for name, error in errors.items()]
 
 
 def _columns(linear: Sensitivity, words: Mapping[str, str]) -> dict[str, FloatArray]:
@@ -74,16 +76,20 @@ def _rate(points: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def _fitted(
-    name: str, error: FloatArray, columns: Mapping[str, FloatArray], shared: FloatArray | None
+    name: str,
+    error: FloatArray,
+    columns: Mapping[str, FloatArray],
+    shared: FloatArray | None,
+    labels: Sequence[str],
 ) -> dict[str, Any]:
     """Entry of a trial, see `free_fits`, from its errors (T, M, 3) [m] and the places that its session shares."""
     left, values = dict[str, float](), dict[str, float]()
     for quantity, slopes in columns.items():
         if (own := _least([error], [slopes])) is not None:
-            left[quantity] = _mean(error + slopes @ own)
+            left[quantity] = _mean(error + slopes @ own, labels)
             values |= {quantity: float(own[0])} if len(own) == 1 else {}
-    left |= {} if shared is None else {"session": _mean(error + columns["places"] @ shared)}
-    return {"name": name, "as_is_mm": _mean(error), "left_mm": left, "values": values}
+    left |= {} if shared is None else {"session": _mean(error + columns["places"] @ shared, labels)}
+    return {"name": name, "as_is_mm": _mean(error, labels), "left_mm": left, "values": values}
 
 
 def _least(errors: Sequence[FloatArray], columns: Sequence[FloatArray]) -> FloatArray | None:
@@ -96,6 +102,6 @@ def _least(errors: Sequence[FloatArray], columns: Sequence[FloatArray]) -> Float
     return np.asarray(np.linalg.lstsq(matrix, -right)[0])
 
 
-def _mean(error: FloatArray) -> float:
-    """Mean length of errors (T, M, 3) of markers that were seen [mm]."""
-    return float(1e3 * np.nanmean(np.linalg.norm(error, axis=-1)))
+def _mean(error: FloatArray, labels: Sequence[str]) -> float:
+    """Mean length of errors (T, M, 3) of markers and rigid bodies that were seen [mm]."""
+    return float(1e3 * np.nanmean(np.linalg.norm(as_markers(error, labels), axis=-1)))

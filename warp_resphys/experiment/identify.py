@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..data.rigid_bodies import corners_of
 from ..io.errors import ConvergenceError
 from ..io.files import write_json
 from ..io.progress import Progress
@@ -183,10 +184,13 @@ def _placement(experiment: Experiment) -> dict[str, Any]:
     wanted, markers = settings.identify.placement, settings.markers
     if wanted is None or markers is None:
         return {}
-    turn = None if wanted.turn is None else math.radians(wanted.turn)
+    turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
     standing = [*markers.reference.values()] or [*markers.tracked.values()]
-    accuracy = Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions)
-    return {"accuracy": accuracy, "labels": experiment.dataset.labels, "centre": np.mean(standing, axis=0).tolist()}
+    labels, bound = experiment.dataset.labels, experiment.dataset.bound
+    assert bound is not None
+    bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(labels).values())
+    accuracy = Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies)
+    return {"accuracy": accuracy, "labels": labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
 def again_of(key: str) -> list[str]:

@@ -7,6 +7,7 @@ step. Driven bodies are resampled to the time steps, during which inputs are con
 
 import logging
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..data.base_motion import at_times, check_steps
 from ..data.recordings.processing import smooth
 from ..data.recordings.quality import quality
 from ..data.registration import Registration
+from ..data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
 from ..io.stages import StageContext
@@ -54,14 +56,14 @@ def import_recordings(context: StageContext) -> None:
         log.warning("import: %s", text)
     training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
     offsets = np.stack([_offset(observer, x) for x in observed])  # (R, M, 3) [m]
-    mean = _mean_offset(offsets, observed, training)
-    mesh, bound = observer.simulator.body.mesh, observer.nominal + mean
-    bound_markers(settings.markers, mesh, bound, tracked)  # Refuses a marker that is far off.
-    shifts = _shifts(settings.data, observed, mean, offsets)
+    bound = _mounted(observer, observed, observer.nominal + _mean_offset(offsets, observed, training))
+    bound_markers(settings.markers, observer.simulator.body.mesh, bound, tracked)  # Refuses a marker that is far off.
+    shifts = _shifts(observer, observed, bound, offsets)
+    mountings = _mountings(observer, observed, bound, offsets)
     verticals = _verticals(observed, settings)
     gravity = _gravity(verticals, settings)
     _dataset(observer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
-    _write_quality(context, observed, tracked, shifts, verticals, gravity)
+    _write_quality(context, observed, tracked, shifts, verticals, gravity, mountings)
 
 
 def import_scaled(context: StageContext) -> None:
@@ -75,7 +77,7 @@ def import_scaled(context: StageContext) -> None:
     assert dataset.bound is not None
     observed = observer.observe(observer.settings.trials)
     offsets = np.stack([_offset(observer, x) for x in observed])
-    shifts = _shifts(observer.settings.data, observed, dataset.bound - observer.nominal, offsets)
+    shifts = _shifts(observer, observed, dataset.bound, offsets)
     _dataset(observer, observed, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
 
 
@@ -99,10 +101,13 @@ def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) ->
 
 
 def _offset(observer: Observer, trial: Observed) -> FloatArray:
-    """(M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen."""
+    """(M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen.
+
+    Those of rigid bodies are turned back with their part, so that they are places on the undeformed body.
+    """
     offset = np.full_like(observer.nominal, np.nan)
     offset[trial.columns] = trial.places - observer.reader.expected(trial.settings)[: len(trial.columns)]
-    return offset
+    return np.einsum("mij,mi->mj", observer.reader.turned(trial.settings), offset)
 
 
 def _mean_offset(offsets: FloatArray, observed: Sequence[Observed], training: Container[str]) -> FloatArray:
@@ -119,12 +124,51 @@ def _mean_offset(offsets: FloatArray, observed: Sequence[Observed], training: Co
     return mean
 
 
-def _shifts(data: ReadingSettings, observed: Sequence[Observed], mean: FloatArray, offsets: FloatArray) -> FloatArray:
-    """(R, M, 3) shifts that move the markers of each trial to their mean places [m]; zero if alignment is shared."""
-    if data.alignment == "shared":
+def _mounted(observer: Observer, observed: Sequence[Observed], bound: FloatArray) -> FloatArray:
+    """(M, 3) places of observed points (M, 3), those of a rigid body as its pose at rest has them [m].
+
+    Raises:
+        InputError: no trial shows a rigid body at rest.
+    """
+    for name, own in corners_of(observer.tracked).items():
+        if not any(x.shows_places and x.settings.has(name) for x in observed):
+            raise InputError(
+                f"markers.rigid_bodies.{name}: its mounting on the body is unknown, as no trial shows it while the "
+                "body is undeformed or at rest under its own weight alone: add such a trial, as a pose or a motion."
+            )
+        bound[own] = motion_between(observer.nominal[own], bound[own]).apply(observer.nominal[own])
+    return bound
+
+
+def _mountings(
+    observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray
+) -> dict[str, dict[str, Any]]:
+    """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial."""
+    mountings: dict[str, dict[str, Any]] = {x.settings.name: {} for x in observed}
+    for name, own in corners_of(observer.tracked).items():
+        shown = [row for row, x in enumerate(observed) if x.shows_places and x.settings.has(name)]
+        places = observer.nominal[own] + offsets[shown][:, own]
+        away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[own].mean(axis=0), axis=-1)
+        turned = np.degrees(angles(bound[own], places))
+        for row, distance, angle in zip(shown, away, turned, strict=True):
+            mountings[observed[row].settings.name][name] = {"distance_mm": distance, "angle_deg": angle}
+        log.info(
+            "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f degrees; the trials "
+            "differ from this by up to %.2f mm and %.2f degrees",
+            *(name, _MILLI * np.linalg.norm(np.mean(bound[own] - observer.nominal[own], axis=0))),
+            *(np.degrees(angles(observer.nominal[own], bound[own])), away.max(), turned.max()),
+        )
+    return mountings
+
+
+def _shifts(observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray) -> FloatArray:
+    """(R, M, 3) shifts that move the markers of each trial to their places [m]; zero if alignment is shared."""
+    if observer.settings.data.alignment == "shared":
         return np.zeros_like(offsets)
     shows_places = np.array([x.shows_places for x in observed])
-    return np.where(shows_places[:, None, None], mean - offsets, 0.0)
+    turned = np.stack([observer.reader.turned(x.settings) for x in observed])
+    shifts = np.einsum("rmij,rmj->rmi", turned, bound - observer.nominal - offsets)
+    return np.where(shows_places[:, None, None], shifts, 0.0)
 
 
 def _check_unit(driven: Sequence[FloatArray], data: ReadingSettings, drive: Drive) -> None:
@@ -269,6 +313,7 @@ def _write_quality(
     shifts: FloatArray,
     verticals: FloatArray | None,
     gravity: FloatArray,
+    mountings: Mapping[str, Any],
 ) -> None:
     """Writes quality.json and registration.json for all released trials and a few driven trials."""
     settings: ImportStage = context.settings
@@ -280,7 +325,9 @@ def _write_quality(
         if row in driven and row not in shown:
             continue
         name = trial.settings.name
-        measured = quality(trial.raw, reference if trial.base is None else [], trial.release, longest_gap=gap)
+        labels = trial.raw.labels
+        raw = replace(trial.raw, labels=owners(labels), positions=as_markers(trial.raw.positions, labels))
+        measured = quality(raw, reference if trial.base is None else [], trial.release, longest_gap=gap)
         qualities[name] = measured.to_plain()
         if trial.settings.is_released:
             for warning in measured.warnings:
@@ -289,28 +336,28 @@ def _write_quality(
             count = len(measured.warnings)
             log.info("import: %s: %d remarks on its quality in the report", measured.source.name, count)
         # Residuals of the tracked markers of a loaded body do not concern the registration.
-        standing = None if trial.shows_places else reference
-        labels = [tracked[number] for number in trial.columns]
-        registrations[name] = _summary(trial.registration, labels, -shifts[row, trial.columns], standing)
+        fitted = [*settings.markers.tracked, *reference] if trial.shows_places else reference
+        moved = {tracked[n]: -shifts[row, n] for n in trial.columns if tracked[n] in settings.markers.tracked}
+        registrations[name] = _summary(trial.registration, moved, fitted)
+        if mountings[name]:
+            registrations[name]["mounting"] = mountings[name]
         if verticals is not None:
             registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
     write_json(context.run_dir / QUALITY, qualities)
     write_json(context.run_dir / REGISTRATION, registrations)
 
 
-def _summary(
-    registration: Registration, tracked: Sequence[str], shift: FloatArray, only: Sequence[str] | None
-) -> dict[str, Any]:
+def _summary(registration: Registration, shifts: Mapping[str, FloatArray], only: Sequence[str]) -> dict[str, Any]:
     """Entry of registration.json; lengths are in millimetres, except positions in the frame of the body in metres.
 
-    Positions and residuals include all markers, or ``only`` some of them.
+    Positions and residuals are those of ``only`` some markers, whose places are known.
     """
-    rows = [row for row, name in enumerate(registration.names) if only is None or name in only]
+    rows = [row for row, name in enumerate(registration.names) if name in only]
     names = [registration.names[row] for row in rows]
     return {
         "positions": dict(zip(names, registration.positions[rows].tolist(), strict=True)),
         "rms_mm": _MILLI * registration.rms,
         "residual_mm": dict(zip(names, _MILLI * registration.residual[rows], strict=True)),
         "outliers": list(registration.outliers),
-        "shift_mm": dict(zip(tracked, (_MILLI * shift).tolist(), strict=True)),
+        "shift_mm": {label: (_MILLI * shift).tolist() for label, shift in shifts.items()},
     }

@@ -21,6 +21,7 @@ from ..data.base_motion import in_frame, rigid
 from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import Recording
 from ..data.rigid import RigidTransform
+from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
@@ -33,7 +34,7 @@ from ..settings.trials import Trial
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
-from .build import bound_markers, build_simulator
+from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
@@ -43,6 +44,7 @@ from .target import substeps_of, target_settings
 FloatArray = NDArray[np.float64]
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
+_LARGEST_MOUNTING = 0.02  # m, of each coordinate of a rigid body from the centre of what carries it
 _POSE_SECONDS = 0.25  # duration of the recording of a static pose
 _FURTHEST_ZERO = 3.0  # standard deviations, of recorded inputs
 
@@ -55,7 +57,7 @@ class Setup:
         gravity: (3,) gravity in the frame of the body [m/s^2].
         rotation: rotation from the frame of the body to the frame of the recordings.
         translation: (3,) translation between these frames [m].
-        tracked: (M, 3) places of the tracked markers on the undeformed body [m].
+        tracked: (M, 3) places of the observed points on the undeformed body [m].
         reference: (S, 3) places of the reference markers [m].
     """
 
@@ -74,7 +76,7 @@ class Setup:
         """(T, M + S, 3) all markers in the frame of the recordings [m].
 
         Args:
-            positions: (T, M, 3) tracked markers in the frame of the body [m].
+            positions: (T, M, 3) observed points in the frame of the body [m].
             base: (T, 6) motion of the base, with which the reference markers move.
         """
         reference = rigid(base).apply(np.broadcast_to(self.reference, (len(positions), *self.reference.shape)))
@@ -124,6 +126,10 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     poses = base_of(common, trial, times)
     positions = setup.recorded(series, poses)
     noise = laboratory.noise * draw.standard_normal(positions.shape)
+    for own in corners_of(settings.binding.observed).values():
+        turns = np.radians(laboratory.orientation_noise) * draw.standard_normal((len(positions), 3))
+        spoke = positions[:, own] - positions[:, own].mean(axis=1, keepdims=True)
+        noise[:, own] = noise[:, own][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
     actuation = None
     if trial.sequence is not None:
         least = getattr(driving_quantity(laboratory), "lower", -np.inf)
@@ -133,10 +139,12 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
     base = in_frame(poses, setup.frame) if common == "recorded" else None
     path = context.run_dir / trial.recording
-    labels = (*settings.binding.tracked, *settings.binding.reference)
+    labels = (*settings.binding.observed, *settings.binding.reference)
     recording = Recording(labels, positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
-    write_recording(path, recording, {"payload_kg": trial.payload})
-    return float(np.linalg.norm(noise[:, : series.shape[1]], axis=-1).mean())
+    lengths = {name: body.length for name, body in settings.binding.rigid_bodies.items()}
+    write_recording(path, with_axes(recording, lengths), {"payload_kg": trial.payload})
+    moved = as_markers(noise[:, : series.shape[1]], settings.binding.observed)
+    return float(np.linalg.norm(moved, axis=-1).mean())
 
 
 def _random_of(settings: PlayedSettings, trial: Trial) -> np.random.Generator:
@@ -174,7 +182,7 @@ def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], nois
         "gravity": setup.gravity,
         "rotation": setup.rotation.as_matrix(),
         "translation": setup.translation,
-        "bound": dict(zip(settings.binding.tracked, setup.tracked, strict=True)),
+        "bound": dict(zip(settings.binding.observed, setup.tracked, strict=True)),
         "noise_mm": 1e3 * noise,
         **({"zeros": {t.name: _zero_of(settings, t) for t in trials}} if settings.laboratory.zero_noise else {}),
         "released_s": {name: at for name, at in released.items() if at is not None},
@@ -182,7 +190,7 @@ def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], nois
 
 
 def make_setup(settings: PlayedSettings) -> Setup:
-    """Draws the pose of the body and the places of its markers from the seed.
+    """Draws the pose of the body, the places of its markers and the mountings of its rigid bodies from the seed.
 
     The vertical of the recordings is ``data.up``, as with levelled cameras, and the body is tilted by
     ``laboratory.tilt``. If ``data.up`` is null, the body is not tilted and the frame of the recordings is arbitrary.
@@ -201,10 +209,16 @@ def make_setup(settings: PlayedSettings) -> Setup:
         upright, _ = Rotation.align_vectors(up[None], -gravity[None] / strength)
         rotation = Rotation.from_rotvec(turn * up) * upright
     translation = draw.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, 3)
-    nominal = np.array([*binding.tracked.values(), *binding.reference.values()], dtype=np.float64)
+    body = build_body(target_settings(settings, laboratory), settings.payload_at)
+    count, observed = len(binding.tracked), nominal_places(binding, body.mesh)
+    nominal = np.array([*observed[:count], *binding.reference.values()], dtype=np.float64)
     places = nominal + laboratory.placement_noise * draw.standard_normal(nominal.shape)
-    count = len(binding.tracked)
-    return Setup(gravity, rotation, translation, places[:count], places[count:])
+    for own in corners_of(binding.observed).values():
+        mounting, centre = Rotation.random(random_state=draw), observed[own].mean(axis=0)
+        moved = centre + draw.uniform(-_LARGEST_MOUNTING, _LARGEST_MOUNTING, 3)
+        observed[own] = moved + mounting.apply(observed[own] - centre)
+    observed[:count] = places[:count]
+    return Setup(gravity, rotation, translation, observed, places[count:])
 
 
 def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simulator:
@@ -262,7 +276,7 @@ class _Played(ResumableRollout):
         self._trials = [by_name[name] for name in part.names]
         self._tip, released = settings.tip, self._trials[0].is_released
         self._substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
-        markers = bound_markers(binding, simulator.body.mesh, setup.tracked, tuple(binding.tracked))
+        markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed)
         self._markers = markers.to(self.like)
         payload = np.array([trial.payload for trial in self._trials])
         hung = payload_inputs(simulator.body, settings.payload_at, payload)

@@ -17,6 +17,7 @@ from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
 from ..data.rigid import RigidTransform
+from ..data.rigid_bodies import owners
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, listed
 from ..io.stages import StageContext
@@ -222,9 +223,8 @@ class Observer:
         only_reference: bool = False,
     ) -> Registration:
         chosen = self.markers.register_with
-        use = list(self.markers.reference) if only_reference else recording.labels if chosen is not None else None
-        if use is not None and chosen is not None:
-            use = [label for label in use if label in chosen]
+        use = [*self.markers.reference] if only_reference else [*self.markers.tracked, *self.markers.reference]
+        use = [label for label in use if label in recording.labels and (chosen is None or label in chosen)]
         return register_markers(
             *(self._turned_back(places, self.reader.view(trial)), expected, recording.labels),
             source=recording.source,
@@ -250,8 +250,8 @@ class Observer:
         lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
         if lost:
             raise DataFileError(
-                f"{moving.source}: {listed(lost)} cannot be seen in the {self.data.seconds:g} s after the release; "
-                "leave it out of markers.tracked."
+                f"{moving.source}: {listed(owners(lost))} cannot be seen in the {self.data.seconds:g} s after the "
+                "release; leave it out of the configured markers."
             )
         check_motion(moving, tracked)
         # Inputs of released bodies are taken as constant.
@@ -342,8 +342,8 @@ def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it
     lost = [recording.labels[column] for column in hidden if recording.labels[column] in tracked]
     if lost:
         raise DataFileError(
-            f"{recording.source}: {listed(lost)} cannot be seen while the body {while_it}, so its place on the body is "
-            "unknown; leave it out of markers.tracked."
+            f"{recording.source}: {listed(owners(lost))} cannot be seen while the body {while_it}, so its place on the "
+            "body is unknown; leave it out of the configured markers."
         )
     return central_places(recording, centre)
 
@@ -357,5 +357,8 @@ def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
         )
     lost = [label for label in tracked if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]
     if lost:
-        raise DataFileError(f"{recording.source}: 'rest' has no place of {listed(lost)}; leave it out of the markers.")
+        raise DataFileError(
+            f"{recording.source}: 'rest' has no place of {listed(owners(lost))}; leave it out of the configured "
+            "markers."
+        )
     return recording.rest

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import as_markers
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Covered, Intervals, Predicted, coverage
@@ -80,9 +81,10 @@ def intervals_of(
 
     Those of a robot, which does not know the variance due to the parameters, are `without_spread`.
     """
-    settings, rest = experiment.settings, experiment.dataset.bound
+    settings, bound = experiment.settings, experiment.dataset.bound
     assert isinstance(settings, EvaluateStage)
-    assert rest is not None
+    assert bound is not None
+    rest = as_markers(bound, experiment.dataset.labels)
     observed = experiment.dataset.observed[experiment.dataset.rows(names)]
     test = settings.groups["1"]
     target = counted(experiment, test)
@@ -126,7 +128,7 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
     data, names = read_dataset(dataset), list(folders)
     if data.bound is None or len(names) < 3:
         return {}
-    target = list(data.observed[data.rows(names)])
+    target, rest = list(data.observed[data.rows(names)]), as_markers(data.bound, data.labels)
     models: dict[str, Any] = {}
     for model in (*BASELINES, *INTERVAL_MODELS):
         simulated, spreads = list[FloatArray](), list[FloatArray]()
@@ -139,8 +141,8 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
         trials = _predicted(data, names, simulated, target, spreads if len(spreads) == len(names) else None)
         covered = list[Covered]()
         for out, trial in enumerate(trials):
-            intervals = Intervals.calibrated(trials[:out] + trials[out + 1 :], data.bound)
-            covered += [] if intervals is None else [intervals.covered(trial, data.bound)]
+            intervals = Intervals.calibrated(trials[:out] + trials[out + 1 :], rest)
+            covered += [] if intervals is None else [intervals.covered(trial, rest)]
         if len(covered) == len(names):
             models[model] = {**coverage(covered), "by_trial": _by_trial(names, covered)}
     return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
@@ -153,10 +155,14 @@ def _predicted(
     observed: Sequence[FloatArray],
     spreads: Sequence[FloatArray] | NDArray[np.float64] | None = None,
 ) -> list[Predicted]:
-    """Trials as they were predicted and observed."""
+    """Trials as they were predicted and observed; rigid bodies count as one marker."""
+    labels = dataset.labels
     rows = zip(simulated[: len(names)], observed, since_change(dataset, names), strict=True)
-    known = [None] * len(names) if spreads is None else spreads
-    return [Predicted(*row, spread) for row, spread in zip(rows, known, strict=True)]
+    known = [None] * len(names) if spreads is None else [as_markers(x, labels, -1) for x in spreads]
+    return [
+        Predicted(as_markers(x, labels), as_markers(y, labels), since, spread)
+        for (x, y, since), spread in zip(rows, known, strict=True)
+    ]
 
 
 def _by_trial(names: Sequence[str], covered: Sequence[Covered]) -> dict[str, float]:

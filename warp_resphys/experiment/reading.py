@@ -17,13 +17,14 @@ from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.text import Table
 from ..data.registration import axes_rotation
+from ..data.rigid_bodies import corners_of, motion_between, with_corners
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..settings.stages import ImportStage
 from ..settings.trials import ReadingSettings, Trial
 from ..stepping.inputs import Inputs
 from .actuators import Drive
-from .build import bound_markers, marker_view_of
+from .build import bound_markers, marker_view_of, nominal_places
 from .files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
@@ -45,8 +46,8 @@ class Reader:
         drive: input that drives the body; None without actuators.
 
     Attributes:
-        tracked: labels of the tracked markers.
-        nominal: (M, 3) nominal places of the tracked markers on the undeformed body [m].
+        tracked: labels of the tracked markers and of the points of rigid bodies.
+        nominal: (M, 3) their nominal places on the undeformed body [m].
         rotation: (3, 3) rotation from the frame of the recordings to the frame of the body; None if registration
             determines it.
         vertical: upward directions in the frames of the recordings and of the body; None if either is unknown.
@@ -55,8 +56,9 @@ class Reader:
 
     def __init__(self, settings: ImportStage, run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
         self.data, self.markers, self._payload_at = settings.data, settings.markers, settings.payload_at
-        self.tracked = list(self.markers.tracked)
-        self.nominal, self._reference = _places(self.markers.tracked), _places(self.markers.reference)
+        self.tracked = list(self.markers.observed)
+        self.nominal = nominal_places(self.markers, simulator.body.mesh)
+        self._reference = _places(self.markers.reference)
         axes, table = self.data.axes, self.data.table
         self.rotation = None if axes is None else axes_rotation(axes)
         self.vertical = vertical_of(self.data.up, settings.gravity)
@@ -89,6 +91,16 @@ class Reader:
         if self._hanging is None:
             self._hanging = self._posed(Inputs())[0]
         return self._seen(trial, self._hanging)
+
+    def turned(self, trial: Trial) -> FloatArray:
+        """(M, 3, 3) rotation of a rigid body from the undeformed body to the expected places; identity for markers."""
+        turns = np.tile(np.eye(3), (len(self.tracked), 1, 1))
+        if not trial.is_released:
+            self.expected(trial)
+            assert self._hanging is not None
+            for own in corners_of(self.tracked).values():
+                turns[own] = motion_between(self.nominal[own], self._hanging[own]).rotation
+        return turns
 
     def _seen(self, trial: Trial, places: FloatArray) -> FloatArray:
         """(M', 3) places of a trial's markers as seen in its recording, from places (M, 3) of all tracked ones."""
@@ -138,6 +150,8 @@ class Reader:
             assert trial.file is not None
             given = self.data.units, self.data.rate, trial.labels, self._table, self._bag
             recording = read_recording(Path(trial.file), *given)
+        lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
+        recording = with_corners(recording, lengths)
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(

@@ -5,7 +5,9 @@ from itertools import combinations
 
 import numpy as np
 
+from ..data.markers import follow_vertices
 from ..data.registration import axes_rotation
+from ..data.rigid_bodies import owners
 from ..fem.body import Body
 from ..io.errors import InputError, listed
 from ..mesh.mesh import select_vertices
@@ -14,7 +16,7 @@ from ..settings.stages import PlayedSettings
 from ..settings.trials import MarkerSettings, RecordedData, Trial
 from .actuators import Drive, drive_of
 from .body_checks import check_target, naming
-from .build import build_material, marker_view_of
+from .build import build_material, marker_view_of, mounted_on
 from .files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from .laboratory import input_sequences
 from .reading import standing_enough
@@ -88,21 +90,29 @@ def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings
         )
     if markers.bind_to is not None:
         select_vertices(body.mesh, **markers.bind_to.arguments())
+    for name, mounted in markers.rigid_bodies.items():
+        if mounted.part is not None and mounted.part not in body.rigid:
+            raise InputError(
+                f"markers.rigid_bodies.{name}.part is {mounted.part!r}, but the rigid parts of the body are "
+                f"{listed([*body.rigid])}: choose one, or name the vertices of a stiff plate in at."
+            )
+        with naming(f"markers.rigid_bodies.{name}: "):
+            follow_vertices(body.mesh, mounted_on(mounted, body.mesh), np.zeros((1, 3)))
 
 
 def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Trial]) -> None:
     """Checks the markers of the trials."""
-    tracked = [*markers.tracked]
+    tracked = markers.observed
     for trial in trials:
         if not trial.tracked(tracked):
             raise InputError(
                 f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
-                f"markers.tracked: {listed(tracked)}."
+                f"markers.tracked or rigid_bodies: {listed(owners(tracked))}."
             )
     everywhere = {number for trial in all_trials(run).values() for number in trial.tracked(tracked)}
     if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
         raise InputError(
-            f"markers.tracked names {listed(nowhere)}, which no trial has in data.trials.NAME.labels: add it there, "
+            f"markers names {listed(owners(nowhere))}, which no trial has in data.trials.NAME.labels: add it there, "
             "or leave it out."
         )
     if markers.frame == "own":

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
@@ -237,16 +238,16 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         length = 1
     return TrialResults(
         names=tuple(test),
-        labels=dataset.labels,
+        labels=owners(dataset.labels),
         begins=begins,
         times=times[:, :length],
-        target=target[:, :length],
-        positions={model: points[:, :length] for model, points in positions.items()},
-        bound=bound,
+        target=as_markers(target[:, :length], dataset.labels),
+        positions={model: as_markers(points[:, :length], dataset.labels) for model, points in positions.items()},
+        bound=as_markers(bound, dataset.labels),
         gravity=dataset.gravity,
         time_step=dataset.time_step,
         since=since_change(dataset, test)[:, :length],
-        spreads={model: values[:, :length] for model, values in spreads.items()},
+        spreads={model: as_markers(values[:, :length], dataset.labels, -1) for model, values in spreads.items()},
         **_seen(run, dataset),
     )
 

@@ -14,11 +14,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..data.markers import Markers
 from ..data.observation import Observation
+
+FloatArray = NDArray[np.float64]
 
 _DIRECTIONS = 3
 _ITERATIONS = 4  # enough, as rotations by a few degrees are nearly linear
@@ -33,17 +37,37 @@ class Accuracy:
         shift: of each coordinate of the origin of the recording's frame [m].
         turn: of each component of its rotation vector [rad].
         between_sessions: of what the placement of a session differs from that of all by, over those above.
+        mounting: of each component of the rotation vector of a rigid body on the part that carries it [rad]; its
+            position has that of markers.
+        rigid_bodies: index of the first of the four points of each rigid body, and these on the undeformed body,
+            (4, 3) relative to their mean [m].
     """
 
     markers: float | None = None
     shift: float | None = None
     turn: float | None = None
     between_sessions: float = 0.5
+    mounting: float | None = None
+    rigid_bodies: tuple[tuple[int, FloatArray], ...] = ()
 
-    def deviations(self, like: torch.Tensor) -> torch.Tensor:
-        """(3 M + 6,) standard deviations of offsets, shift and turn, for a tensor (..., M, 3) like the markers."""
-        sizes = [self.markers or 0.0] * (3 * like.shape[-2]) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
-        return like.new_tensor(sizes)
+    def directions(self, like: torch.Tensor) -> torch.Tensor:
+        """(3 M + 6, K) offsets, shift and turn by one standard deviation, for a tensor (..., M, 3) like the markers.
+
+        A marker has three offsets; the points of a rigid body are shifted and turned together, to first order.
+        """
+        count = like.shape[-2]
+        sizes = [self.markers or 0.0] * (3 * count) + [self.shift or 0.0] * 3 + [self.turn or 0.0] * 3
+        directions = torch.diag(like.new_tensor(sizes))
+        kept = torch.ones(len(sizes), dtype=torch.bool)
+        for first, corners in self.rigid_bodies:
+            rows, eye = slice(3 * first, 3 * first + 12), torch.eye(3).to(like)
+            arms = like.new_tensor(corners)[:, None].expand(4, 3, 3)
+            turned = torch.linalg.cross(eye.expand(4, 3, 3), arms, dim=-1).mT  # (4, 3, 3) of a point, by the rotation
+            directions[rows, rows] = 0.0
+            directions[rows, 3 * first : 3 * first + 3] = (self.markers or 0.0) * eye.repeat(4, 1)
+            directions[rows, 3 * first + 3 : 3 * first + 6] = (self.mounting or 0.0) * turned.flatten(0, 1)
+            kept[3 * first + 6 : 3 * first + 12] = False
+        return directions[:, kept.to(like.device)]
 
 
 @dataclass(frozen=True)
@@ -202,17 +226,18 @@ def estimate_placement(
     """
     own = [""] * len(errors) if sessions is None else [*sessions]
     names = [*dict.fromkeys(own)]
-    count, common = errors[0].shape[-2], accuracy.deviations(errors[0])
-    size, further = len(common), len(names) if len(names) > 1 else 0
-    scale = torch.cat([common, *[accuracy.between_sessions * common] * further])
-    solution = torch.zeros_like(scale)
+    count, common = errors[0].shape[-2], accuracy.directions(errors[0])
+    size, further = common.shape[1], len(names) if len(names) > 1 else 0
+    solution = common.new_zeros(size * (1 + further))
 
     def placement(values: torch.Tensor) -> Placement:
-        return Placement(values[:-6].view(count, 3), values[-6:-3], values[-3:], centre)
+        moved = common @ values
+        return Placement(moved[:-6].view(count, 3), moved[-6:-3], moved[-3:], centre)
 
     def at(values: torch.Tensor) -> dict[str, Placement]:
-        parts = (scale * values).split(size)
-        return {name: placement(parts[0] + (parts[1 + k] if further else 0.0)) for k, name in enumerate(names)}
+        first, *others = values.split(size)
+        own = [accuracy.between_sessions * other for other in others] or [0.0]
+        return {name: placement(first + other) for name, other in zip(names, own, strict=True)}
 
     def columns(placements: Mapping[str, Placement]) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Residuals (R, T, M, 3) and their derivatives (R, T, M, 3, K), weighted."""
@@ -222,23 +247,23 @@ def estimate_placement(
         ):
             root, where = weight.sqrt()[:, None, None, None] * visible[..., None], placements[session]
             placed = where.apply(nominal + (rotation @ where.offsets[..., None])[..., 0])
-            slopes = error.new_zeros(*error.shape, len(scale))
-            jacobian = by_placement(where, placed, rotation) * root[..., None]
-            for block in (0, 1 + names.index(session)) if further else (0,):
-                columns = slice(block * size, (block + 1) * size)
-                slopes[..., columns] = jacobian * scale[columns]
+            slopes = error.new_zeros(*error.shape, len(solution))
+            slopes[..., :size] = by_placement(where, placed, rotation) * root[..., None] @ common
+            if further:
+                own_columns = slice((1 + names.index(session)) * size, (2 + names.index(session)) * size)
+                slopes[..., own_columns] = accuracy.between_sessions * slopes[..., :size]
             result.append(((error + placed - nominal) * root, slopes))
         return result
 
     for _ in range(_ITERATIONS if accuracy.turn else 1):
-        normal, right = torch.diag(torch.full_like(scale, prior_weight)), torch.zeros_like(scale)
+        normal, right = torch.diag(torch.full_like(solution, prior_weight)), torch.zeros_like(solution)
         for residual, slopes in columns(at(solution)):
             jacobian = slopes.flatten(0, 3)
             normal = normal + jacobian.T @ jacobian
             right = right - jacobian.T @ (residual.flatten() - jacobian @ solution)
         solution = torch.linalg.solve(normal, right)
     placements = at(solution)
-    return Placed(placement(scale[:size] * solution[:size]), placements, solution, [c for _, c in columns(placements)])
+    return Placed(placement(solution[:size]), placements, solution, [c for _, c in columns(placements)])
 
 
 def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:

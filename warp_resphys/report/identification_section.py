@@ -8,6 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..data.rigid import root_mean_square
+from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
 from .data import MODELS, FloatArray, RunReport
@@ -87,7 +89,9 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(text) for text in uncertain]
     placed = {name: result["placement"] for name, result in identified.items() if result.get("placement")}
-    blocks += [Text(placement_text(name, placement)) for name, placement in placed.items()]
+    markers = data.settings.markers
+    lengths = {} if markers is None else {name: body.length for name, body in markers.rigid_bodies.items()}
+    blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
     return Part("Identification", [*blocks, *_loss_figures(data, identified, canvas)])
 
 
@@ -218,16 +222,27 @@ def _decimals(deviation: float) -> int:
     return max(0, 1 - math.floor(math.log10(deviation)))
 
 
-def placement_text(name: str, placed: Mapping[str, Any]) -> str:
-    """Return a sentence on the identified displacements of markers and recordings from their nominal positions."""
-    away = {label: 1e3 * math.dist(offset, (0.0, 0.0, 0.0)) for label, offset in placed["offsets"].items()}
+def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, float]) -> str:
+    """Return a sentence on the identified displacements of markers and recordings from their nominal positions.
+
+    Args:
+        name: Of the model.
+        placed: Its placement.
+        lengths: Of rigid bodies [m], by which an angle is a root mean square displacement of their points.
+    """
+    labels, offsets = [*placed["offsets"]], np.array([*placed["offsets"].values()])
+    away = dict(zip(owners(labels), 1e3 * np.linalg.norm(as_markers(offsets, labels), axis=1), strict=True))
     furthest = max(away, key=lambda label: away[label])
     shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
     text = (
         f"{MODELS[name][0]}, identified with the parameters: markers are displaced from their nominal positions, "
         f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
-        f"rotated by {math.degrees(turn):.1f}°."
+        f"rotated by {math.degrees(turn):.1f}°"
     )
+    for body, own in corners_of(labels).items():
+        angle = root_mean_square(offsets[own] - offsets[own].mean(axis=0)) / lengths[body]
+        text += f"; {body} is turned by {math.degrees(angle):.1f}° on what carries it"
+    text += "."
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 

@@ -288,6 +288,10 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", _numbers(by_label), metrics["errors_mm"]))
+    if turned := metrics.get("orientations_deg"):
+        bodies = next(iter(turned.values()))
+        by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
+        blocks.append(model_table("Orientation of each rigid body [degrees]", _numbers(by_body), metrics["errors_mm"]))
     return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
 
 

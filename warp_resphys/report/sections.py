@@ -154,7 +154,24 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
         return drawn_file(path, f"{shown}, from two sides.", caption)
 
     blocks = canvas.attempt("registration.png", picture)
-    return Part("Registration", [*blocks, residual_table(recordings.residuals)])
+    mountings = mounting_table(recordings.residuals)
+    return Part("Registration", [*blocks, residual_table(recordings.residuals), *([mountings] if mountings else [])])
+
+
+def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
+    """Return how the mountings of rigid bodies differ between the trials that show them at rest; None without any."""
+    mounted = {trial: fit["mounting"] for trial, fit in residuals.items() if "mounting" in fit}
+    if not mounted:
+        return None
+    names = list(dict.fromkeys(name for own in mounted.values() for name in own))
+    rows = []
+    for trial, own in mounted.items():
+        known = [own.get(name) for name in names]
+        cells = [(f"{x['distance_mm']:.2f}", f"{x['angle_deg']:.2f}") if x else (NONE, NONE) for x in known]
+        rows.append(Row(trial, [Cell(text) for pair in cells for text in pair]))
+    columns = [f"{name} [{unit}]" for name in names for unit in ("mm", "degrees")]
+    note = "Distance and angle of a rigid body at rest from its mounting, which is the mean over the training trials."
+    return PageTable("Mounting", columns, rows, note)
 
 
 def residual_table(residuals: Mapping[str, Any]) -> PageTable:

@@ -76,7 +76,8 @@ class GridTable(Settings):
 class PlacementSettings(Settings):
     """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
 
-    markers: Positive | None = setting(None, "of each coordinate of a marker's position", "m")
+    markers: Positive | None = setting(None, "of each coordinate of a marker's or a rigid body's position", "m")
+    mounting: Positive | None = setting(None, "of each component of a rigid body's rotation on its part", "degrees")
     shift: Positive | None = setting(None, "of each coordinate of the recordings' origin", "m")
     turn: Positive | None = setting(None, "of each component of the recordings' rotation", "degrees")
     between_sessions: Positive = setting(0.5, "of what a session differs from all by, over those above")

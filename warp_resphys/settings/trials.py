@@ -1,5 +1,6 @@
 """Settings of trials: their source, how they begin, their markers, and their split."""
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
@@ -121,7 +122,12 @@ class Trial(Settings):
 
     def tracked(self, labels: Any) -> list[int]:
         """Returns the indices of the labels of tracked markers that the trial has."""
-        return [number for number, label in enumerate(labels) if self.labels is None or label in self.labels]
+        return [number for number, label in enumerate(labels) if self.has(label)]
+
+    def has(self, label: str) -> bool:
+        """Whether the recording has a marker, a rigid body, or a point of one."""
+        name, _, corner = label.rpartition(" ")
+        return self.labels is None or label in self.labels or (corner in CORNERS and name in self.labels)
 
     @property
     def recording(self) -> str:
@@ -318,15 +324,49 @@ class RecordedData(ReadingSettings):
         return self
 
 
+CORNERS = ("+++", "+--", "-+-", "--+")  # of the tetrahedron that stands for a pose: signs of x, y and z
+
+
+class RigidBodySettings(Settings):
+    """A recorded pose, which is mounted on the body in an unknown way that its frames at rest show.
+
+    An error of ``position_deviation`` counts as much as one of ``orientation_deviation``.
+    """
+
+    part: Word | None = setting(None, "rigid part that it is mounted on")
+    at: PlaceSettings | None = setting(None, "vertices of a stiff plate that it is mounted on instead")
+    position_deviation: Positive = setting(1.0e-3, "expected error of a position", "m")
+    orientation_deviation: Positive = setting(1.0, "expected error of an orientation", "degrees")
+
+    @model_validator(mode="after")
+    def _is_mounted(self) -> Self:
+        if (self.part is None) == (self.at is None):
+            raise ValueError("part and at: give one of them, a rigid part or the vertices of a plate, as {x: 0.1}.")
+        return self
+
+    @property
+    def length(self) -> float:
+        """Length that an error of one radian counts as [m]."""
+        return self.position_deviation / math.radians(self.orientation_deviation)
+
+
 class BindingSettings(Settings):
     """Positions of markers on the undeformed body, and how they are bound to it."""
 
-    tracked: dict[str, Vector] = setting(description="positions by name; errors are measured on these", unit="m")
+    tracked: dict[str, Vector] = setting({}, "positions by name; errors are measured on these", "m")
+    rigid_bodies: dict[str, RigidBodySettings] = setting(
+        {}, "recorded poses (positions with quaternions) by name; errors are measured on these, too"
+    )
     reference: dict[str, Vector] = setting({}, "positions of fixed markers, for the registration", "m")
     bind: Literal["normal", "frame", "rigid", "patch"] = setting("normal", "how tracked markers follow the body")
     bind_to: PlaceSettings | None = setting(None, "vertices that rigid markers follow")
     patch: Positive = setting(0.02, "radius of the patch of vertices that a patch marker follows", "m")
     largest_distance: Positive = setting(0.02, "from the surface of the body", "m")
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Labels of the M observed points: tracked markers, then four points of each rigid body."""
+        return (*self.tracked, *(f"{name} {corner}" for name in self.rigid_bodies for corner in CORNERS))
 
 
 class MarkerSettings(BindingSettings):
@@ -357,9 +397,19 @@ class MarkerSettings(BindingSettings):
                 f"register_with names '{unknown[0]}', which is in neither tracked nor reference: choose from "
                 f"{', '.join((*self.tracked, *self.reference))}."
             )
-        if not self.tracked:
+        if not self.tracked and not self.rigid_bodies:
             raise ValueError("tracked is empty: name the markers that errors are measured on, with their places.")
-        if self.bind == "rigid" and self.bind_to is None:
+        if both := [name for name in self.rigid_bodies if name in (*self.tracked, *self.reference)]:
+            raise ValueError(
+                f"rigid_bodies has '{both[0]}', which is a marker in tracked or reference, too: its place is not "
+                "given, but estimated, so name it in rigid_bodies alone."
+            )
+        if self.rigid_bodies and (self.plane is not None or self.frame == "own" or self.labels == "assigned"):
+            raise ValueError(
+                "rigid_bodies need recordings in three dimensions, in the frame of the body, with names: leave plane, "
+                "frame and labels out."
+            )
+        if self.tracked and self.bind == "rigid" and self.bind_to is None:
             raise ValueError("bind is rigid: set markers.bind_to to the vertices that they follow, as {x: 0.1}.")
         return self
 
@@ -383,6 +433,7 @@ class PlaySettings(TargetSettings):
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
     noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")
     placement_noise: NotNegative = setting(description="of each coordinate of a marker's place", unit="m")
+    orientation_noise: NotNegative = setting(0.0, "of each component of a rigid body's rotation", unit="degrees")
     zero_noise: NotNegative = setting(0.0, "of the zero of a trial's recorded inputs, in the unit of the input")
     tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "of the body from level", "degrees")
     held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "before the release", "s")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...data.recordings.reading import read_recording
 from ...data.registration import register_markers
 from ...data.rigid import RigidTransform
+from ...data.rigid_bodies import with_corners
 from ...io.errors import InputError, ResphysError, listed
 from .robots import Steppable
 
@@ -105,7 +106,9 @@ def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
         DataFileError: the recording cannot be read (`read_recording`).
         InputError: it has commands of another number than the robot's one driven input.
     """
-    recording = read_recording(Path(path).expanduser())
+    markers, recording = robot.description.markers, read_recording(Path(path).expanduser())
+    if markers is not None:
+        recording = with_corners(recording, {name: body.length for name, body in markers.rigid_bodies.items()})
     driven = [name for name in robot.inputs if name in robot.description.seen]
     commands: Iterator[Mapping[str, Any]] = iter([{}] * len(recording.positions))
     if recording.actuation is not None and driven:

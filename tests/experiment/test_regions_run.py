@@ -1,14 +1,22 @@
-"""A beam of two silicones with a rigid cap, from YAML: identified by region, corrected, and taken along as a robot."""
+"""A beam of two silicones with a rigid cap, from YAML: identified by region, corrected, and taken along as a robot.
+
+Motion capture sees the pose of the cap alone, on which its rigid body is mounted in any way.
+"""
 
 import contextlib
 import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import warp_resphys
 from support.main_job import IN_RUN, run, run_without_report
+from warp_resphys.data.rigid_bodies import angles, arms
+from warp_resphys.experiment.files import DATASET, REGISTRATION, TRUTH, read_dataset
+from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.robot.description import Description, describe
+from warp_resphys.robot.twin.stream import recorded_packets
 
 TINY = [
     "experiment=beam_regions",
@@ -32,6 +40,9 @@ TINY = [
     "data.limit=null",
     "identify.substeps=2",
     "identify.max_evaluations=10",
+    "~markers.tracked",
+    "markers.rigid_bodies={plate: {part: cap}}",
+    "laboratory.orientation_noise=0.05",
     "correct_uncorrected=false",
     "simfree.trainer.epochs=10",
     "simfree.trainer.rollout_every=10",
@@ -55,12 +66,48 @@ def test_each_silicone_is_identified(folder):
     assert errors["sysid"]["mean"] < 0.2 * errors["simulation"]["mean"]
 
 
+def test_the_rest_frames_show_how_a_rigid_body_is_mounted(folder):
+    dataset, truth = read_dataset(folder / DATASET), json.loads((folder / TRUTH).read_text())["bound"]
+    assert dataset.labels == ("plate +++", "plate +--", "plate -+-", "plate --+")
+    true = np.array([truth[label] for label in dataset.labels])
+    np.testing.assert_allclose(dataset.bound.mean(axis=0), true.mean(axis=0), atol=2e-5)
+    assert np.degrees(angles(true, dataset.bound)) < 0.05
+    centre = [0.095, 0.015, 0.015]
+    assert np.linalg.norm(true.mean(axis=0) - centre) > 5e-3
+    assert np.degrees(angles(arms(1.0), true)) > 10.0
+    mountings = [own["mounting"]["plate"] for own in json.loads((folder / REGISTRATION).read_text()).values()]
+    assert max(own["distance_mm"] for own in mountings) < 0.02
+    assert max(own["angle_deg"] for own in mountings) < 0.1
+
+
+def test_positions_and_orientations_have_their_own_errors(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    seen = read_dataset(folder / DATASET)
+    with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
+        simulated = read_array(file, "sysid_observed")[0]
+    observed = seen.observed[seen.names.index("m50")]
+    away = np.linalg.norm((simulated - observed).mean(axis=1), axis=-1)
+    turned = [
+        Rotation.align_vectors(a - a.mean(axis=0), b - b.mean(axis=0))[0].magnitude()
+        for a, b in zip(simulated, observed, strict=True)
+        if np.isfinite(b).all()
+    ]
+    assert metrics["errors_mm"]["sysid"]["mean"] == pytest.approx(1e3 * np.nanmean(away))
+    assert metrics["per_marker"]["sysid"] == {"plate": pytest.approx(1e3 * np.nanmean(away))}
+    assert metrics["orientations_deg"]["sysid"]["plate"] == pytest.approx(np.degrees(np.mean(turned)))
+    assert metrics["orientations_deg"]["sysid"]["plate"] < 0.3 * metrics["orientations_deg"]["simulation"]["plate"]
+
+
 def test_a_robot_takes_its_regions_along(folder):
     described = describe(folder, "sysid")
     described.write(folder / "robot.safetensors")
     results = Description.read(folder / "robot.safetensors")
     assert {name: len(cells) for name, cells in results.mesh.regions.items()} == {"root": 5, "tip": 4, "cap": 1}
     robot = warp_resphys.load(folder / "robot.safetensors")
+    packet = next(recorded_packets(robot, folder / "recordings" / "m50.h5"))
+    assert {*robot.labels} < {*packet.markers}
+    points = np.array([packet.markers[label] for label in robot.labels])
+    np.testing.assert_allclose(points.mean(axis=0), packet.markers["plate"], atol=1e-12)
     body = robot.simulator.body
     cap = np.unique(body.mesh.cells[body.mesh.region("cap")])
     state = robot.begin()
@@ -85,6 +132,12 @@ def test_a_robot_takes_its_regions_along(folder):
         ("simulation.regions.cap.density=1000", "cap"),
         ("identify.parameters.youngs_modulus={lower: 1.0, upper: 2.0}", "identify.parameters names 'youngs_modulus'"),
         ("identify.integrator=midpoint", "midpoint"),
+        ("markers.rigid_bodies.plate.part=lid", "markers.rigid_bodies.plate.part is 'lid', but the rigid parts"),
+        ("markers.rigid_bodies.plate.part=root", "markers.rigid_bodies.plate.part is 'root', but the rigid parts"),
+        ("markers.rigid_bodies.plate.at={x: 0.1}", "markers.rigid_bodies.plate.part and at"),
+        ("markers.rigid_bodies={Base - 1: {part: cap}}", "markers.rigid_bodies has 'Base - 1'"),
+        ("markers.labels=assigned", "markers.rigid_bodies need recordings"),
+        ("markers.rigid_bodies={plate: {part: null, at: {x: 0.1, y: 0.0}}}", "markers.rigid_bodies.plate: "),
     ],
 )
 def test_regions_that_do_not_fit_cost_one_sentence(tmp_path, override, key):

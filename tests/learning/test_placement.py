@@ -8,8 +8,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_resphys import Body, Simulator
-from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
+from support.regions import beam
+from warp_resphys import Body, Corotated, Rigid, Simulator
+from warp_resphys.data.markers import KINDS, JoinedMarkers, MarkerMap, bind_markers, follow_vertices
+from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
@@ -115,6 +117,38 @@ def test_the_placement_minimises_its_sum_of_squares():
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
 
+def test_a_rigid_body_is_misplaced_as_a_whole():
+    """Beside two markers: its points have three shifts and three turns, at which the sum of squares is least."""
+    draw = torch.Generator().manual_seed(2)
+    spokes = arms(0.06) @ Rotation.from_rotvec([0.3, 1.0, -0.5]).as_matrix()
+    markers = JoinedMarkers.of(
+        [bind("patch"), follow_vertices(MESH, TIP, np.array([0.1, 0.03, 0.02]) + spokes)], [[0, 1, 2, 3], [4, 5, 6, 7]]
+    )
+    at, turns = (x[None] for x in DisplacedMarkers.split(DisplacedMarkers(markers, 8)(poses())))
+    errors = [1e-2 * torch.randn(1, 3, 8, 3, generator=draw, dtype=torch.float64)]
+    seen, weights = [torch.ones(1, 3, 8, dtype=torch.bool)], [torch.tensor([3.0]).double()]
+    accuracy = Accuracy(1e-3, 2e-3, None, mounting=0.05, rigid_bodies=((4, spokes),))
+
+    def offsets(values):
+        turned = torch.linalg.cross(values[15:18].expand(4, 3), torch.as_tensor(spokes), dim=-1)
+        return torch.cat([values[:12].view(4, 3), values[12:15] + turned])
+
+    def loss(values):
+        moved = (turns @ offsets(values)[..., None])[..., 0] + values[18:]
+        scaled = torch.cat([values[:15] / 1e-3, values[15:18] / 0.05, values[18:] / 2e-3])
+        return 3.0 * (errors[0] + moved).square().sum() + 1e-5 * scaled.square().sum()
+
+    placed = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
+    sizes = torch.tensor([1e-3] * 15 + [0.05] * 3 + [2e-3] * 3, dtype=torch.float64)
+    values = sizes * placed.deviations[:21]
+    np.testing.assert_allclose(placed.common.offsets, offsets(values), atol=1e-15)
+    assert float(values[15:18].norm()) > 0.01
+    gradients = [
+        torch.autograd.grad(loss(x.requires_grad_()), x)[0] for x in (torch.zeros(21).double(), values.clone())
+    ]
+    assert float((sizes * gradients[1]).norm()) < 1e-9 * float((sizes * gradients[0]).norm())
+
+
 # Poses of a beam under weights on two edges of its tip, so that it bends and twists.
 SIM = Simulator(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01)
 EDGES = select_vertices(MESH, x=0.1, y=0.0), select_vertices(MESH, x=0.1, y=0.03)
@@ -199,6 +233,50 @@ def test_a_prior_determines_what_poses_do_not():
     )
     assert apart.parameters["density"] == pytest.approx(1070.0, rel=0.02)  # the weights tell
     assert apart.uncertainty.deviation["density"] < 20.0
+
+
+def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
+    """A rigid body is mounted 3 mm and 2 degrees from where it is believed to be, and seen with noise."""
+    mesh = beam((5, 2, 2))
+    simulator = Simulator(
+        Body(mesh, select_vertices(mesh, x=0.0), rigid={"cap": Rigid(density=1240.0)}),
+        {"beam": Corotated(215e3, 0.45)},
+        time_step=0.01,
+    )
+    cap = np.unique(mesh.cells[mesh.region("cap")])
+    nominal = np.array([0.09, 0.02, 0.03]) + arms(0.06) @ Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()
+    turn, shift, middle = Rotation.from_rotvec([0.02, -0.02, 0.02]), np.array([2e-3, -2e-3, 1e-3]), nominal.mean(axis=0)
+    true = middle + shift + turn.apply(nominal - middle)
+    names, count = ("free", "light", "heavy"), 3
+    attached = torch.zeros(count, len(mesh.vertices), dtype=torch.float64)
+    attached[1:, np.intersect1d(cap, select_vertices(mesh, x=0.1, y=0.03))] = torch.tensor([[0.01], [0.02]]).double()
+    held = torch.as_tensor(nominal).expand(count, -1, -1)
+    blank = Trials(names, torch.zeros(count, 1).double(), held[:, None], held, Inputs(attached_mass=attached))
+    start = Start.resting(torch.as_tensor(mesh.vertices).expand(count, -1, -1))
+    with torch.no_grad():
+        seen = Replay(simulator, follow_vertices(mesh, cap, true), blank)(start)[0].numpy()
+    draw, places = np.random.default_rng(0), seen.mean(axis=2, keepdims=True)
+    shaken = Rotation.from_rotvec(2e-3 * draw.normal(size=(count, 3))).as_matrix()[:, None]
+    noisy = places + 1e-4 * draw.normal(size=places.shape) + (seen - places) @ shaken
+    pair = (
+        Replay(simulator, follow_vertices(mesh, cap, nominal), replace(blank, observed=torch.as_tensor(noisy))),
+        start,
+    )
+
+    ranges, guess = {"beam_youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}, [{"beam_youngs_modulus": 4e5}]
+    bodies = ((0, nominal - middle),)
+    accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies)
+    result = Identifier([pair], ranges, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist()).run(guess, 30)
+    naive = Identifier([pair], ranges).run(guess, 30)
+    off, plain = (abs(x.parameters["beam_youngs_modulus"] / 215e3 - 1.0) for x in (result, naive))
+    assert off < 0.03
+    assert plain > 3.0 * off
+    halved = Identifier([pair], ranges, shares=[0.5] * 4).run(guess, 30)  # Six of twelve coordinates are independent.
+    wider, narrow = (x.uncertainty.deviation["beam_youngs_modulus"] for x in (halved, naive))
+    assert wider / narrow == pytest.approx(math.sqrt(2.0 * (1.0 - 1.0 / 36.0) / (1.0 - 1.0 / 18.0)), rel=1e-3)
+    places = nominal + Placement.from_plain(result.placement, LABELS).offsets.numpy()
+    assert np.linalg.norm(places.mean(axis=0) - true.mean(axis=0)) < 3e-4
+    assert np.degrees(angles(true, places)) < 0.3
 
 
 @pytest.mark.slow

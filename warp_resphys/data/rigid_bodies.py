@@ -88,6 +88,14 @@ def owners(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(_owned(labels))
 
 
+def independent(labels: Sequence[str]) -> list[float] | None:
+    """Share of the coordinates of each point that are independent: six of the twelve of a rigid body; None for all."""
+    shares = np.ones(len(labels))
+    for own in corners_of(labels).values():
+        shares[own] = 0.5
+    return None if (shares == 1.0).all() else shares.tolist()
+
+
 def as_markers(points: ArrayLike, labels: Sequence[str], axis: int = -2) -> FloatArray:
     """Replaces the four points of a rigid body by its position, their mean; the labels are then their `owners`.
 

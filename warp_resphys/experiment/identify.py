@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data.rigid_bodies import corners_of
+from ..data.rigid_bodies import corners_of, independent
 from ..io.errors import ConvergenceError
 from ..io.files import write_json
 from ..io.progress import Progress
@@ -61,7 +61,7 @@ def identify(context: StageContext) -> None:
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
         for model, bounds in ranges.items():
             replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
-            nuisances = {"delay": settings.release.delay} | (_placement(experiment) if model == "sysid" else {})
+            nuisances = _nuisances(experiment) | (_placement(experiment) if model == "sysid" else {})
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
             known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
             guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
@@ -82,7 +82,7 @@ def identify(context: StageContext) -> None:
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
         axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}
         others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
-        nuisances = {"delay": settings.release.delay} | _placement(experiment)
+        nuisances = _nuisances(experiment) | _placement(experiment)
         identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **nuisances)
         counts, found = {name: axis.points for name, axis in grid.items()}, identified["sysid"]
         at = {**found["parameters"], **found.get("own", {})}
@@ -161,7 +161,7 @@ def _of_first_frames(
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
         try:
             replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
-            identifier = Identifier(replays, bounds, settings.release.window, known=known, delay=settings.release.delay)
+            identifier = Identifier(replays, bounds, settings.release.window, known=known, **_nuisances(experiment))
             result = identifier.run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:
             log.warning("identify: the first frames of %s show none of its own values: %s", name, error)
@@ -175,6 +175,13 @@ def bounds_of(settings: RangeSettings) -> Bounds:
     """Bounds of a parameter from its settings."""
     prior = None if settings.prior is None else Prior(**dict(settings.prior))
     return Bounds(settings.lower, settings.upper, settings.logarithmic, prior)
+
+
+def _nuisances(experiment: Experiment) -> dict[str, Any]:
+    """Arguments of an `Identifier`: delays of the trials, and which observed coordinates are independent."""
+    settings = experiment.settings
+    assert isinstance(settings, IdentifyStage)
+    return {"delay": settings.release.delay, "shares": independent(experiment.dataset.labels)}
 
 
 def _placement(experiment: Experiment) -> dict[str, Any]:

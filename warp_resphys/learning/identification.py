@@ -212,6 +212,7 @@ class Identifier(ParameterSearch):
         centre: (3,) about which recordings may be rotated [m].
         known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
         delay: standard deviation of the delay of motions that their inputs begin, fitted to each [s]; zero for none.
+        shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
     Raises:
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
@@ -227,5 +228,6 @@ class Identifier(ParameterSearch):
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
         delay: float = 0.0,
+        shares: Sequence[float] | None = None,
     ) -> None:
-        super().__init__(Misfit(replays, bounds, seconds, accuracy, centre, known, delay), labels)
+        super().__init__(Misfit(replays, bounds, seconds, accuracy, centre, known, delay, shares), labels)

@@ -43,6 +43,7 @@ class Misfit(BoundedMisfit):
         centre: (3,) about which recordings may be rotated [m].
         known: values of further parameters, which are not identified.
         delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisance.NuisanceFit`.
+        shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
     Attributes:
         simulator: of all replays; it raises where a solve fails.
@@ -60,6 +61,7 @@ class Misfit(BoundedMisfit):
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
         delay: float = 0.0,
+        shares: Sequence[float] | None = None,
     ) -> None:
         if not bounds:
             raise InputError("there is nothing to identify: name a parameter under identify.parameters.")
@@ -71,7 +73,7 @@ class Misfit(BoundedMisfit):
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
         self._known = {} if known is None else dict(known)
-        self._accuracy = accuracy
+        self._accuracy, self._shares = accuracy, None if shares is None else np.array(shares)
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
         count = sum(len(replay.trials.names) for replay, _ in replays)
@@ -156,7 +158,9 @@ class Misfit(BoundedMisfit):
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             flat = weighted.reshape(*weighted.shape[:2], -1)
             slopes = self._slopes(flat[1:] - flat[:1], moves, steps, observed)  # (R, 3 T M, P)
-            seen = observed.observed.shape[-1] * observed.seen.sum((1, 2)).cpu().numpy()
+            shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
+            shown = shown if self._shares is None else self._shares * shown
+            seen = observed.observed.shape[-1] * shown.sum(1)
             trials += zip(weighted[0].reshape(*weighted.shape[1:3], -1), slopes, seen.tolist(), strict=True)
             columns.append(slopes)
         jacobians, nuisance_slopes = nuisances.projected(columns, math.sqrt(self.prior_weight))

@@ -16,8 +16,8 @@ from .bounds import Bounds
 
 FloatArray = NDArray[np.float64]
 
-# Of a trial: weighted residuals (T, 3 M), their derivatives (3 T M, P), and the number of coordinates that were seen.
-Linearised = tuple[FloatArray, FloatArray, int]
+# Of a trial: weighted residuals (T, 3 M), their derivatives (3 T M, P), and the number of independent coordinates seen.
+Linearised = tuple[FloatArray, FloatArray, float]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,84 @@
+"""A rigid body on a hanging cap: its mounting follows from the pose of its part, and is refused where none shows it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.configured import settings
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording import ARM
+from warp_resphys.data.rigid_bodies import angles, motion_between
+from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_json
+from warp_resphys.io.stages import run_stages
+from warp_resphys.pipeline import acquisition_stages
+
+# The laboratory is the simulator, so that the cap hangs where the import expects it.
+HANGS = [
+    "experiment=beam_regions",
+    "~markers.tracked",
+    "markers.rigid_bodies={plate: {part: cap}}",
+    "mesh.divisions=[10,1,1]",
+    "laboratory.mesh.divisions=[10,1,1]",
+    "laboratory.material={model: corotated, youngs_modulus: 100e3, poissons_ratio: 0.499, density: 1070.0}",
+    "laboratory.material.regions={root: {}, tip: {youngs_modulus: 100e3}}",
+    "simulation.youngs_modulus=100e3",
+    "simulation.regions={root: {}, tip: {youngs_modulus: 100e3}}",
+    "laboratory.noise=1e-7",
+    "laboratory.placement_noise=0",
+    "laboratory.tilt=0",
+    "laboratory.trials={p0: {begins: static}, p30: {begins: static, payload: 0.03}}",
+    "laboratory.validation=[]",
+]
+
+
+def imported(folder, *overrides):
+    """The dataset of a run of the first stages."""
+    run_stages(acquisition_stages(settings(*HANGS, *overrides)), folder)
+    return read_dataset(folder / DATASET)
+
+
+def test_a_hanging_part_shows_the_mounting(tmp_path):
+    dataset = imported(tmp_path, "laboratory.train=[p0]", "laboratory.test=[p30]")
+    true = np.array([read_json(tmp_path / TRUTH)["bound"][label] for label in dataset.labels])
+    moved = motion_between(true, dataset.observed[0, 0])
+    assert np.degrees(Rotation.from_matrix(moved.rotation).magnitude()) > 10.0  # It hangs far down.
+    np.testing.assert_allclose(dataset.bound, true, atol=2e-5)
+    assert np.degrees(angles(true, dataset.bound)) < 0.01
+
+
+def test_a_mounting_that_no_trial_shows_is_refused(tmp_path):
+    loaded = "laboratory.trials={p20: {begins: static, payload: 0.02}, p30: {begins: static, payload: 0.03}}"
+    with pytest.raises(InputError, match=r"rigid_bodies\.plate: its mounting on the body is unknown, as no trial"):
+        imported(tmp_path, loaded, "laboratory.train=[p20]", "laboratory.test=[p30]")
+
+
+def test_a_table_with_quaternions_is_imported_like_the_recordings_of_the_laboratory(tmp_path):
+    """One of its files has other names, which the trial's labels replace."""
+    expected = imported(tmp_path / "played", "laboratory.train=[p0]", "laboratory.test=[p30]")
+    bases = ["Base - 1", "Base - 2", "Base - 3"]
+    for name, labels in (("p0", ["plate", *bases]), ("p30", ["body", "a", "b", "c"])):
+        recording = read_recording(tmp_path / "played" / "recordings" / f"{name}.h5")
+        places = recording.select(["plate", "plate +x", "plate +y", "plate +z"]).positions
+        axes = np.swapaxes(places[:, 1:] - places[:, :1], 1, 2) / ARM
+        rows = [1e3 * places[:, 0], *1e3 * recording.select(bases).positions.swapaxes(0, 1)]
+        quaternions = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
+        heads = ["time [s]", *(f"{label}.{axis} [mm]" for label in labels for axis in "xyz")]
+        heads += [f"{labels[0]}.q{axis}" for axis in "wxyz"]
+        content = np.concatenate([recording.time[:, None], *rows, quaternions], axis=1)
+        np.savetxt(tmp_path / f"{name}.csv", content, "%.12g", ",", header=",".join(heads), comments="")
+    named = f"file: p30.csv, begins: static, payload: 0.03, labels: [plate, {', '.join(bases)}]"
+    run = settings(
+        *HANGS,
+        f"data.folder={tmp_path}",
+        f"data.trials={{p0: {{file: p0.csv, begins: static}}, p30: {{{named}}}}}",
+        "~data.folds",
+        "data.train=[p0]",
+        "data.test=[p30]",
+    )
+    run_stages(acquisition_stages(run), tmp_path)
+    results = read_dataset(tmp_path / DATASET)
+    assert results.labels == expected.labels
+    np.testing.assert_allclose(results.bound, expected.bound, atol=1e-9)
+    np.testing.assert_allclose(results.observed, expected.observed, atol=1e-9)

@@ -17,6 +17,7 @@ EXPERIMENT = SimpleNamespace(
     dataset=SimpleNamespace(
         inputs={"pressure": np.ones((1, 3, 1)), "payload": np.ones((1, 1))},
         session=lambda name: name.partition("_")[0],
+        labels=("A", "B"),
     )
 )
 ROUNDING = 1e-9  # mm

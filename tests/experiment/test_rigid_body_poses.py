@@ -1,10 +1,13 @@
 """A rigid body on a hanging cap: its mounting follows from the pose of its part, and is refused where none shows it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from support.configured import settings
+from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import ARM
 from warp_resphys.data.rigid_bodies import angles, motion_between
@@ -52,6 +55,27 @@ def test_a_mounting_that_no_trial_shows_is_refused(tmp_path):
     loaded = "laboratory.trials={p20: {begins: static, payload: 0.02}, p30: {begins: static, payload: 0.03}}"
     with pytest.raises(InputError, match=r"rigid_bodies\.plate: its mounting on the body is unknown, as no trial"):
         imported(tmp_path, loaded, "laboratory.train=[p20]", "laboratory.test=[p30]")
+
+
+def test_a_rigid_body_that_was_mounted_anew_is_refused(tmp_path):
+    imported(tmp_path / "played", "laboratory.train=[p0]", "laboratory.test=[p30]")
+    recording = read_recording(tmp_path / "played" / "recordings" / "p0.h5")
+    positions = recording.positions.copy()
+    arms = [recording.labels.index(f"plate +{axis}") for axis in "xyz"]
+    place = positions[:, [recording.labels.index("plate")]]
+    positions[:, arms] = place + (positions[:, arms] - place)[:, [1, 2, 0]]  # A turn by 120 degrees.
+    write_recording(tmp_path / "p0.h5", recording)
+    write_recording(tmp_path / "anew.h5", replace(recording, positions=positions))
+    run = settings(
+        *HANGS,
+        f"data.folder={tmp_path}",
+        "data.trials={p0: {file: p0.h5, begins: static}, anew: {file: anew.h5, begins: static}}",
+        "~data.folds",
+        "data.train=[p0]",
+        "data.test=[anew]",
+    )
+    with pytest.raises(InputError, match=r"anew\.h5: 'plate' is 0\.0 mm and 120\.0 degrees from its mounting"):
+        run_stages(acquisition_stages(run), tmp_path)
 
 
 def test_a_table_with_quaternions_is_imported_like_the_recordings_of_the_laboratory(tmp_path):

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..data.rigid_bodies import independent
 from ..dynamics.simulator import Simulator
 from ..energies.law_files import LAW_FORMAT, read_law, unit_of
 from ..io.files import write_json
@@ -285,7 +286,9 @@ class _LawSearch:
             None if whole or given else self.trials.early,
         )
         seconds = min((limit for limit in limits if limit is not None), default=None)
-        identifier = Identifier(self.trials.replays(simulator, self._names(whole or given)), bounds, seconds)
+        shares = independent(self.experiment.dataset.labels)
+        replays = self.trials.replays(simulator, self._names(whole or given))
+        identifier = Identifier(replays, bounds, seconds, shares=shares)
         most = wanted.max_evaluations or _EVALUATIONS
         with Progress(self.context.name, most, "evaluations at most") as progress:
 

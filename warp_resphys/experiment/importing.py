@@ -18,6 +18,7 @@ from ..data.base_motion import at_times, check_steps
 from ..data.recordings.processing import smooth
 from ..data.recordings.quality import quality
 from ..data.registration import Registration
+from ..data.rigid import root_mean_square
 from ..data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ..io.errors import DataFileError, InputError
 from ..io.files import write_json
@@ -143,13 +144,26 @@ def _mounted(observer: Observer, observed: Sequence[Observed], bound: FloatArray
 def _mountings(
     observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray
 ) -> dict[str, dict[str, Any]]:
-    """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial."""
+    """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
+
+    Raises:
+        InputError: a rigid body was mounted anew between two trials.
+    """
     mountings: dict[str, dict[str, Any]] = {x.settings.name: {} for x in observed}
     for name, own in corners_of(observer.tracked).items():
         shown = [row for row, x in enumerate(observed) if x.shows_places and x.settings.has(name)]
         places = observer.nominal[own] + offsets[shown][:, own]
         away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[own].mean(axis=0), axis=-1)
         turned = np.degrees(angles(bound[own], places))
+        apart = [root_mean_square(corners - bound[own]) for corners in places]
+        if max(apart) > observer.markers.largest_residual:
+            worst = int(np.argmax(apart))
+            source = observed[shown[worst]].raw.source
+            raise InputError(
+                f"{source}: {name!r} is {away[worst]:.1f} mm and {turned[worst]:.1f} degrees from its "
+                "mounting in the other trials: where it was mounted anew, give it another name in "
+                "data.trials.NAME.labels and in markers.rigid_bodies."
+            )
         for row, distance, angle in zip(shown, away, turned, strict=True):
             mountings[observed[row].settings.name][name] = {"distance_mm": distance, "angle_deg": angle}
         log.info(

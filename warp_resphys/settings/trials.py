@@ -328,9 +328,9 @@ CORNERS = ("+++", "+--", "-+-", "--+")  # of the tetrahedron that stands for a p
 
 
 class RigidBodySettings(Settings):
-    """A recorded pose, which is mounted on the body in an unknown way that its frames at rest show.
+    """Recorded pose of a rigid body, whose mounting on the body is estimated from the frames at rest.
 
-    An error of ``position_deviation`` counts as much as one of ``orientation_deviation``.
+    An error of `position_deviation` counts as much as one of `orientation_deviation`.
     """
 
     part: Word | None = setting(None, "rigid part that it is mounted on")

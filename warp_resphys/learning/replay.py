@@ -216,9 +216,14 @@ class Replay:
             series.append(self.observe(state.q))
         return torch.stack(series, 1)
 
-    @torch.no_grad()
     def varied(self, start: Start, parameters: Parameters) -> torch.Tensor:
-        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first.
+        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first."""
+        series = self.varied_series(start, parameters)
+        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
+
+    @torch.no_grad()
+    def varied_series(self, start: Start, parameters: Parameters) -> torch.Tensor:
+        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first.
 
         The first set is simulated. In each of its steps, with the solution x, the residual g(x) and its derivative H,
         the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from there: differences
@@ -251,7 +256,7 @@ class Replay:
             moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
             state, varied = solved, there.finish(at - moved.permute(3, 0, 1, 2).flatten(0, 1))
             series.append(self.observe(torch.cat([state.q, varied.q])))
-        return self.at_frames(torch.stack(series, 1), start).unflatten(0, (sets, -1))
+        return torch.stack(series, 1)
 
     @cached_property
     def _beside(self) -> tuple[Simulator, Simulator]:

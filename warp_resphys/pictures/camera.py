@@ -104,15 +104,15 @@ class PlacedCamera:
             corrections: (9,).
             tangents: (K, P, 3) motions of the points by K parameters [m].
         """
-        by_points, by_corrections = _jacobians(self.pixels, points, corrections.expand(len(points), -1))
+        by_points, by_corrections = jacobians(self.pixels, points, corrections.expand(len(points), -1))
         return torch.cat([torch.einsum("pij,kpj->kpi", by_points, tangents), by_corrections.permute(2, 0, 1)])
 
     def located_by(self, measured: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns derivatives (9, P, 3) of located points (P, 3) by the corrections (9,) [m]."""
-        return _jacobians(self.located, measured, corrections.expand(len(measured), -1))[1].permute(2, 0, 1)
+        return jacobians(self.located, measured, corrections.expand(len(measured), -1))[1].permute(2, 0, 1)
 
 
-def _jacobians(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> list[torch.Tensor]:
+def jacobians(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> list[torch.Tensor]:
     """Jacobians (P, D, C) of a function (P, D) of P rows by each of its inputs (P, C)."""
     with torch.enable_grad():
         own = [values.detach().clone().requires_grad_() for values in inputs]

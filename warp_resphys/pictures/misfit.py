@@ -28,9 +28,11 @@ from ..learning.bounds import Bounds
 from ..learning.parameters import split_name
 from ..learning.uncertainty import Linearised
 from .camera import CORRECTIONS, PlacedCamera
+from .motion import RELEASE_DELAY, derivatives_at_own_times
 from .seen import Photo, SeenPose, Shape
 
 _DIFFERENCE: Final = 1e-4  # of a physical parameter, as a fraction of its range
+_DIFFERENCE_OF_MOTION: Final = 1e-5  # where differences of motions are exact to first order
 _ROBUST: Final = 4.0  # px, or multiples of the noise of a cloud, s
 
 
@@ -95,15 +97,15 @@ class PictureMisfit(BoundedMisfit):
         return owner in owners and parameter in pose.parameter_names
 
     def shape(self, number: int, own: Mapping[str, float]) -> torch.Tensor:
-        """Returns the vertices (N, 3) of a pose with values of its parameters [m], from the last ones.
+        """Returns the shape of a pose with values of its parameters, from the last one (`SeenPose.shape`) [m].
 
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        physical, last = {name: v for name, v in own.items() if name not in CORRECTIONS}, self._shapes[number]
+        physical, last = _physical(own), self._shapes[number]
         if last is not None and last[0] == physical:
             return last[1]
-        q = self.poses[number].shape(physical, last).double().cpu()
+        q = self.poses[number].shape(physical, last)
         self._shapes[number] = (physical, q)
         return q
 
@@ -115,10 +117,9 @@ class PictureMisfit(BoundedMisfit):
             known = {**self._known, **values}
             own = values_of(pose, known)
             try:
-                q = self.shape(number, own)
-                tangents = self._tangents(number, unit, own, q) if derivatives else {}
+                shapes, columns = self._shapes_by(number, unit, own, derivatives)
                 for photo in pose.photos:
-                    trials += self._of_photo(pose, photo, values_of(pose, known, photo.lens), q, tangents, share)
+                    trials += self._of_photo(pose, photo, values_of(pose, known, photo.lens), shapes, columns, share)
             except ConvergenceError:
                 return None
             except InputError:
@@ -136,27 +137,39 @@ class PictureMisfit(BoundedMisfit):
                 losses[number] = super().losses_or_infinite(point[None])[0]
         return losses
 
-    def _tangents(
-        self, number: int, unit: FloatArray, own: Mapping[str, float], q: torch.Tensor
-    ) -> dict[int, torch.Tensor]:
-        """Derivatives (N, 3) of a shape by its physical parameters, by their column; differences into the range."""
-        pose, tangents = self.poses[number], dict[int, torch.Tensor]()
+    def _shapes_by(
+        self, number: int, unit: FloatArray, own: Mapping[str, float], derivatives: bool
+    ) -> tuple[torch.Tensor, list[int]]:
+        """A pose's shape and its derivatives by K of the physical parameters, (1 + K, ...), and their K columns.
+
+        Derivatives are differences into the range.
+        """
+        pose, moved, columns, steps = self.poses[number], list[dict[str, float]](), list[int](), list[float]()
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter = split_name(name)[0]
-            if parameter in CORRECTIONS or not pose.deforms or not self._acts(name, pose):
+            fixed = parameter in (*CORRECTIONS, RELEASE_DELAY) or not pose.deforms
+            if not derivatives or fixed or not self._acts(name, pose):
                 continue
-            step = _DIFFERENCE if unit[column] < 0.5 else -_DIFFERENCE
-            moved = {**own, parameter: float(range_.from_unit(torch.tensor(unit[column] + step, dtype=torch.float64)))}
-            tangents[column] = (pose.shape(moved, (own, q)).double().cpu() - q) / step
-        return tangents
+            step = (1.0 if unit[column] < 0.5 else -1.0) * (_DIFFERENCE_OF_MOTION if pose.moves else _DIFFERENCE)
+            value = range_.from_unit(torch.tensor(unit[column] + step, dtype=torch.float64))
+            moved.append({**own, parameter: float(value)})
+            columns.append(column)
+            steps.append(step)
+        if not columns:
+            return self.shape(number, own)[None], columns
+        physical = _physical(own)
+        shapes = pose.shapes([own, *moved], self._shapes[number])
+        self._shapes[number] = (physical, shapes[0])
+        change = shapes[1:] - shapes[:1]
+        return torch.cat([shapes[:1], change / shapes.new_tensor(steps).view(-1, *[1] * (change.ndim - 1))]), columns
 
     def _of_photo(
         self,
         pose: SeenPose,
         photo: Photo,
         own: Mapping[str, float],
-        q: torch.Tensor,
-        tangents: Mapping[int, torch.Tensor],
+        shapes: torch.Tensor,
+        columns: Sequence[int],
         share: float,
     ) -> list[Linearised]:
         """Weighted residuals of a picture, and their derivatives: outlines both ways, tracked points, and a cloud.
@@ -165,13 +178,13 @@ class PictureMisfit(BoundedMisfit):
         0.997 between real pictures), so that they count as one set.
         """
         corrections, parts = PlacedCamera.corrections(own), list[Linearised]()
-        moved = torch.stack([*tangents.values()]) if tangents else q.new_zeros(0, *q.shape)
+        vertices, velocities = pose.seen(photo, shapes, own)
+        q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
         share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
         if photo.outline is not None:
             seen = pose.outlines(photo, q, corrections)
             rim = seen.silhouette
-            by = camera.derivative(rim.points(q), corrections, rim.points(moved)).numpy()
-            slopes = self._slopes(pose, photo, by, [*tangents])
+            slopes = self._pixel_slopes(pose, photo, rim.points(q), rim.points(moved), corrections, columns)
             distance, along = photo.outline.signed(rim.pixels)
             order = np.argsort(cKDTree(photo.outline.points).query(rim.pixels)[1], kind="stable")
             jacobian = np.einsum("kpi,pi->pk", slopes, along)[order, None]
@@ -183,7 +196,7 @@ class PictureMisfit(BoundedMisfit):
         if photo.tracked is not None and pose.points is not None:
             places = pose.points(q[None])[0]
             moves = (moved.flatten(1) @ pose.points.transposed_jacobian(q[None])[0]).unflatten(1, (-1, 3))
-            slopes = self._slopes(pose, photo, camera.derivative(places, corrections, moves).numpy(), [*tangents])
+            slopes = self._pixel_slopes(pose, photo, places, moves, corrections, columns)
             away = camera.pixels(places, corrections).numpy() - photo.tracked
             visible = np.asarray(np.isfinite(away).all(1))
             jacobian, away = slopes.transpose(1, 2, 0), np.where(visible[:, None], away, 0.0)
@@ -193,27 +206,47 @@ class PictureMisfit(BoundedMisfit):
             cloud, closest = photo.cloud, pose.cloud_distances(photo, q, corrections)
             placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
             by = np.concatenate([closest.moved(moved), np.einsum("cpi,pi->cp", placed, closest.directions)])
-            slopes = self._slopes(pose, photo, by, [*tangents]) * (np.abs(closest.distances) < cloud.reach)
+            slopes = self._slopes(pose, photo, by, columns) * (np.abs(closest.distances) < cloud.reach)
             distance = closest.distances.clip(-cloud.reach, cloud.reach)[:, None] / cloud.noise
             parts.append(_weighted(share, np.ones(len(distance)), distance, slopes.T[:, None] / cloud.noise, copies))
         return parts
 
+    def _pixel_slopes(
+        self,
+        pose: SeenPose,
+        photo: Photo,
+        points: torch.Tensor,
+        moved: torch.Tensor,
+        corrections: torch.Tensor,
+        columns: Sequence[int],
+    ) -> FloatArray:
+        """Derivatives (P, Q, 2) of the pixels of points (Q, 3), which move (K + 1, Q, 3) as `_slopes` has it."""
+        by = photo.camera.derivative(points, corrections, moved).numpy()
+        by = derivatives_at_own_times(by, by[len(columns)], photo.row_time)
+        return self._slopes(pose, photo, by, columns)
+
     def _slopes(self, pose: SeenPose, photo: Photo, by: FloatArray, columns: Sequence[int]) -> FloatArray:
-        """Derivatives (P, ...) by all P parameters, from those (K + 9, ...) by K physical ones and the corrections.
+        """Derivatives (P, ...) by all P parameters.
 
         Args:
             pose: of the picture.
             photo: the picture.
-            by: see above.
+            by: (K + 1 + 9, ...) derivatives by K physical parameters, the time and the corrections.
             columns: K numbers of the physical parameters.
         """
         slopes = np.zeros((len(self.bounds), *by.shape[1:]))
-        slopes[columns] = by[: len(columns)]
+        slopes[columns], late, placed = by[: len(columns)], -by[len(columns)], by[len(columns) + 1 :]
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter, owner = split_name(name)
-            if parameter in CORRECTIONS and owner in (*pose.owners, photo.lens):
-                slopes[column] = by[len(columns) + CORRECTIONS.index(parameter)] * range_.slope(0.5)
+            if owner in (*pose.owners, photo.lens) and parameter in (*CORRECTIONS, RELEASE_DELAY):
+                own = late if parameter == RELEASE_DELAY else placed[CORRECTIONS.index(parameter)]
+                slopes[column] = own * range_.slope(0.5)
         return slopes
+
+
+def _physical(values: Mapping[str, float]) -> dict[str, float]:
+    """Values of the parameters that are not of the camera."""
+    return {name: value for name, value in values.items() if name not in CORRECTIONS}
 
 
 def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: FloatArray, copies: int) -> Linearised:

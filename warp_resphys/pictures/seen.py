@@ -1,7 +1,7 @@
-"""Bodies at rest before a camera, and how far pictures of them are from simulated ones."""
+"""Bodies before a camera, at rest or released, and how far pictures of them are from simulated ones."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -17,11 +17,13 @@ from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
 from .camera import CORRECTIONS, PLACES, PlacedCamera
 from .clouds import Cloud, CloudDistances, distances_of
+from .motion import OF_RELEASE, ReleasedForce, at_own_times
 from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
 CLAMP_SHIFT: Final = "clamp_shift"  # m
-Shape = tuple[Mapping[str, float], torch.Tensor]  # values of parameters, and vertices (N, 3) at rest with them [m]
+# Values of parameters, and with them the vertices (N, 3) at rest, or (K + 1, N, 3) at the steps of a motion [m].
+Shape = tuple[Mapping[str, float], torch.Tensor]
 
 _TURNED: Final = 0.4  # rad, largest part of a clamp's turn from one equilibrium to the next
 _MARGIN: Final = 6.0  # px, around what a clamp hides
@@ -39,6 +41,8 @@ class Photo:
         tracked: (M, 2) pixels of the body's tracked points, NaN where one was not seen; None without tracked points.
         cloud: points of a scan or a depth image; None without.
         lens: name of the lens, whose values of parameters are those of this picture; empty for a single one.
+        time: at which its row 0 is exposed [s].
+        row_time: from the exposure of a row to that of the next [s].
     """
 
     name: str
@@ -47,6 +51,8 @@ class Photo:
     tracked: FloatArray | None = None
     cloud: Cloud | None = None
     lens: str = ""
+    time: float = 0.0
+    row_time: float = 0.0
 
     @property
     def kinds(self) -> int:
@@ -96,7 +102,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class SeenPose:
-    """A body at rest, and pictures of it.
+    """A body at rest, or held and released, and pictures of it.
 
     Attributes:
         name: of the pose.
@@ -107,9 +113,10 @@ class SeenPose:
         material: owner of the parameters that poses of the same material share.
         points: observation of the tracked points; None without.
         deforms: whether it is simulated; else the undeformed body is compared.
+        release: of a force, after which it moves; None for a body at rest.
 
     Raises:
-        InputError: there is no picture, or points were tracked that nothing observes.
+        InputError: there is no picture, points were tracked that nothing observes, or a body that moves was scanned.
     """
 
     name: str
@@ -120,6 +127,7 @@ class SeenPose:
     material: str = ""
     points: Observation | None = None
     deforms: bool = True
+    release: ReleasedForce | None = None
 
     def __post_init__(self) -> None:
         """Checks that there is something to compare."""
@@ -127,6 +135,13 @@ class SeenPose:
             raise InputError(f"{self.name} has no picture.")
         if self.points is None and any(photo.tracked is not None for photo in self.photos):
             raise InputError(f"{self.name}: points were tracked, but their places on the body are not known.")
+        if self.release is not None and any(photo.camera.lens is None for photo in self.photos):
+            raise InputError(f"{self.name} moves, and a scan shows no time: make a pose of its own for the scan.")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is simulated as a motion."""
+        return self.release is not None and self.deforms
 
     def before(self, cameras: Mapping[str, torch.Tensor]) -> Self:
         """Returns the pose with all pictures by a lens taken from one place, world_to_camera (4, 4) by its name."""
@@ -139,7 +154,9 @@ class SeenPose:
         return replace(self, photos=tuple(placed))
 
     def copies(self, photo: Photo) -> int:
-        """Number of pictures by the standing camera of one, which have nearly the same errors; one where it moves."""
+        """Number of pictures with nearly the same errors as one: those by its camera, where it and the body stand."""
+        if self.release is not None:
+            return 1
         lensless = photo.camera.lens is None
         mine = [own for own in self.photos if own.lens == photo.lens and (own.camera.lens is None) == lensless]
         return len(mine) if all(torch.equal(own.camera.pose, photo.camera.pose) for own in mine) else 1
@@ -158,19 +175,64 @@ class SeenPose:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters that shape and pictures depend on."""
         clamps = (CLAMP_TURN, CLAMP_SHIFT) if len(self.clamps) > 1 else ()
-        return (*identifiable_parameters(self.simulator), *clamps, *(CORRECTIONS if self.lenses else PLACES))
+        own = clamps if self.release is None else OF_RELEASE
+        return (*identifiable_parameters(self.simulator), *own, *(CORRECTIONS if self.lenses else PLACES))
 
     def shape(self, values: Mapping[str, float], near: Shape | None = None) -> torch.Tensor:
-        """Returns the vertices (N, 3) of the body at rest [m].
+        """Returns the vertices (N, 3) of the body at rest, or (K + 1, N, 3) of its motion from the release on [m]."""
+        return self.shapes([values], near)[0]
+
+    def shapes(self, values: Sequence[Mapping[str, float]], near: Shape | None = None) -> torch.Tensor:
+        """Returns shapes (E, N, 3) or (E, K + 1, N, 3) for E sets of parameters, which hardly differ [m].
 
         Args:
             values: of parameters by name; those of the camera are ignored.
-            near: values and the body at rest with them, from which the equilibrium is sought; the undeformed body, if
-                left out.
+            near: values and a shape with them, from which the equilibrium is sought; the undeformed body, if left out.
 
         Raises:
-            ConvergenceError: there is no equilibrium.
+            ConvergenceError: there is no equilibrium, or a step fails.
         """
+        if self.release is not None and self.deforms:
+            guess = self.simulator.rest_state(1).q if near is None else near[1].view(-1, *near[1].shape[-2:])
+            return self.release.motions(self.simulator, values, self._last, guess[0])
+        first = self._at_rest(values[0], near)
+        return torch.stack([first, *(self._at_rest(own, (values[0], first)) for own in values[1:])]).double().cpu()
+
+    @property
+    def _last(self) -> float:
+        """Time that is shown last [s]: of pictures twice as high as their principal points are low."""
+        rows = [(own, own.camera.lens) for own in self.photos]
+        return max(
+            own.time + max(own.row_time, 0.0) * 2.0 * (0.0 if lens is None else float(lens.matrix[1, 2]))
+            for own, lens in rows
+        )
+
+    def seen(
+        self, photo: Photo, shapes: torch.Tensor, values: Mapping[str, float]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the vertices (S, N, 3) that a picture shows of S shapes [m], at the times of the first one's rows.
+
+        Args:
+            photo: the picture.
+            shapes: (S, N, 3) at rest, or (S, K + 1, N, 3) in motion: one, and perhaps derivatives of it.
+            values: of parameters by name.
+
+        Returns:
+            The vertices, and velocities (N, 3) of the first shape [m/s].
+        """
+        if not self.moves:
+            return shapes, torch.zeros_like(shapes[0])
+        assert self.release is not None
+        corrections, step = PlacedCamera.corrections(values), self.simulator.time_step
+        begin = photo.time - self.release.at(values)
+        return at_own_times(shapes, begin, photo.row_time, step, lambda q: photo.camera.pixels(q, corrections))
+
+    def vertices(self, photo: Photo, shape: torch.Tensor, values: Mapping[str, float]) -> torch.Tensor:
+        """Returns the vertices (N, 3) that a picture shows of a shape; see `seen` [m]."""
+        return self.seen(photo, shape[None], values)[0][0]
+
+    def _at_rest(self, values: Mapping[str, float], near: Shape | None) -> torch.Tensor:
+        """Returns the vertices (N, 3) of the body at rest [m]."""
         sim = self.simulator
         if not self.deforms:
             return sim.rest_state(1).q[0]

@@ -1,0 +1,144 @@
+r"""A body that a force holds at rest and that is released, before a camera that exposes its rows one after another.
+
+Until its release the body rests under its weight and the force, and then moves without it (`learning.replay`). A
+picture whose row 0 is exposed at the time t shows at row y the body of the time t + y r, r being the time between two
+rows. A vertex on the path x(t) is seen at the pixel p with
+
+    p = pi(x(t + r p_2)),
+
+where pi is the camera. Vertices have the positions of their own times, and points between them are interpolated, as
+times are linear in the picture. By implicit differentiation, a derivative d of pi(x) at a constant time becomes
+
+    d + r v d_2 / (1 - r v_2), with the velocity v = (d pi / dx) dx/dt in the picture.
+
+`tests/pictures/test_released_motion.py` compares rows with closed forms, and derivatives with differences.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+
+from ..data.observation import WHOLE_STATE
+from ..data.trials import Trials
+from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
+from ..learning.parameters import MASS_FACTOR, identifiable_parameters
+from ..learning.replay import Replay, Start, sample
+from ..stepping.inputs import Inputs
+from .camera import jacobians
+from .outlines import FloatArray, IntArray
+
+RELEASE_DELAY: Final = "release_delay"  # s
+RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N
+OF_RELEASE: Final = (RELEASE_DELAY, *RELEASE_FORCES)
+
+_ROUNDS: Final = 6  # fixed-point iterations for a row, with an error that shrinks by r v_2 in each
+
+
+@dataclass(frozen=True)
+class ReleasedForce:
+    """A force that holds a body at rest until it is released.
+
+    Attributes:
+        vertices: (V,) that carry it, in equal shares.
+        force: (3,) in the axes of the scene, to which the parameters `RELEASE_FORCES` are added [N].
+        time: of the release on the clock of the pictures, to which the parameter `RELEASE_DELAY` is added [s].
+
+    Raises:
+        InputError: no vertex carries it, or a force or time that is not finite.
+    """
+
+    vertices: IntArray
+    force: tuple[float, float, float]
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not len(self.vertices):
+            raise InputError("no vertex carries the force that is released: name some.")
+        if np.shape(self.force) != (3,) or not np.isfinite([*self.force, self.time]).all():
+            raise InputError(f"a released force is {self.force} N at {self.time} s: give three numbers and a time.")
+
+    def at(self, values: Mapping[str, float]) -> float:
+        """Returns the time of the release with values of parameters [s]."""
+        return self.time + values.get(RELEASE_DELAY, 0.0)
+
+    @torch.no_grad()
+    def motions(
+        self, simulator: Simulator, values: Sequence[Mapping[str, float]], last: float, near: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns the vertices (E, K + 1, N, 3) at the steps after the release [m], for E sets of parameters.
+
+        The first set is simulated. The others should hardly differ from it (`learning.replay.Replay.varied_series`).
+
+        Args:
+            simulator: of the body.
+            values: of parameters by name; those of the camera are ignored.
+            last: time that is shown last, on the clock of the pictures [s].
+            near: (N, 3) first guess of the body at rest [m].
+
+        Raises:
+            ConvergenceError: there is no equilibrium, or a step fails.
+            InputError: the material remembers its motion.
+        """
+        names = identifiable_parameters(simulator)
+        # A factor without effect, so that there are as many sets where only the force differs.
+        parameters = {MASS_FACTOR: simulator.tensor([1.0] * len(values))}
+        parameters |= {name: simulator.tensor([own[name] for own in values]) for name in values[0] if name in names}
+        added = [[own.get(name, 0.0) for name in RELEASE_FORCES] for own in values]
+        held = simulator.tensor(np.zeros((len(values), len(near), 3)))
+        held[:, self.vertices] = (simulator.tensor(self.force) + simulator.tensor(added))[:, None] / len(self.vertices)
+        seconds = simulator.tensor([[max(last - self.at(values[0]), 0.0)]])
+        trials = Trials(("",), seconds, held.new_zeros(1, 1, 1, 1), held.new_zeros(1, 1, 1))
+        replay = Replay(simulator, WHOLE_STATE, trials)
+        constants = replay.prepare(parameters)[0]
+        state = simulator.static_equilibrium(Inputs(held), constants, start=near.to(held).expand_as(held))
+        if state.memory:
+            raise InputError("a material with friction remembers its motion: pictures identify none that moves.")
+        start = Start(state, held.new_zeros(1))
+        series = replay.varied_series(start, parameters) if len(values) > 1 else replay.series(start, parameters)
+        return series.double().cpu()
+
+
+def at_own_times(
+    series: torch.Tensor, begin: float, row_time: float, step: float, pixels: Callable[[torch.Tensor], torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the vertices of motions where a picture shows those of the first, and their velocities in that.
+
+    Args:
+        series: (S, K + 1, N, 3) vertices at the steps, the first of a motion, others perhaps its derivatives.
+        begin: time at which row 0 is exposed, after the release [s].
+        row_time: r, between two rows [s].
+        step: time step [s].
+        pixels: maps points (N, 3) to pixels (N, 2).
+
+    Returns:
+        (S, N, 3), and velocities (N, 3) [m/s].
+    """
+    paths = series[0].transpose(0, 1)
+    times = torch.full_like(paths[:, :1, 0], begin)
+
+    def places(times: torch.Tensor) -> torch.Tensor:
+        return sample(paths, times.clamp_min(0.0), step)[:, 0]
+
+    if row_time:
+        for _ in range(_ROUNDS):
+            times = begin + row_time * pixels(places(times))[:, 1:].nan_to_num()
+    velocities = jacobians(places, times)[0][..., 0]
+    others = sample(series.permute(2, 1, 0, 3), times.clamp_min(0.0), step)[:, 0]
+    return others.transpose(0, 1), velocities
+
+
+def derivatives_at_own_times(by: FloatArray, velocities: FloatArray, row_time: float) -> FloatArray:
+    """Returns derivatives (K, P, 2) of pixels where rows have times of their own, from those at constant times [px].
+
+    Args:
+        by: (K, P, 2) derivatives at constant times [px].
+        velocities: (P, 2) v in the picture [px/s].
+        row_time: r, between two rows [s].
+    """
+    late = row_time * velocities
+    return by + late / (1.0 - late[:, 1:]) * by[..., 1:]

@@ -67,6 +67,7 @@ from .mesh.tetrahedra import fill_surface as fill_surface
 from .pictures.camera import PlacedCamera as PlacedCamera
 from .pictures.clouds import Cloud as Cloud
 from .pictures.misfit import PictureMisfit as PictureMisfit
+from .pictures.motion import ReleasedForce as ReleasedForce
 from .pictures.outlines import ClosedSurface as ClosedSurface
 from .pictures.outlines import Outline as Outline
 from .pictures.scans import read_scan as read_scan

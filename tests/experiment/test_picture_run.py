@@ -80,7 +80,7 @@ def test_a_finished_run_is_not_repeated(played):
 
 def test_other_commands_say_what_pictures_are(played):
     folder, _ = played
-    assert "has pictures of bodies at rest, which have no motion" in refusal("view", f"run={folder}")
+    assert "has pictures, from which no robot is made" in refusal("view", f"run={folder}")
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ RECEDING: Final = "receding_"
 LINEAR: Final = "linear"
 FEEDBACK: Final = "feedback_"
 METRICS: Final = "metrics.json"
-COMPARE: Final = "compare"  # stage of runs with pictures of bodies at rest
+COMPARE: Final = "compare"  # stage of runs with pictures
 REPORT: Final = "report.html"
 
 GIVEN: Final = "given"  # beginning of simulated trials, whose initial state is known

@@ -1,4 +1,4 @@
-"""A simulated laboratory of pictures: masks and depths of a body of another material, before a camera elsewhere."""
+"""A simulated laboratory of pictures of a body of another material, before a camera elsewhere."""
 
 import numpy as np
 import scipy.ndimage
@@ -7,57 +7,80 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from ..data.markers import bind_markers
 from ..io.atomic import atomic_path
 from ..io.files import write_json
 from ..io.stages import StageContext
 from ..pictures.camera import PlacedCamera
 from ..pictures.outlines import ClosedSurface
-from ..settings.pictures import SimulatedCamera
+from ..pictures.seen import Photo, SeenPose
+from ..settings.pictures import PictureData, PoseSettings, SimulatedCamera
 from ..settings.stages import PictureStage
 from .build import build_body, build_simulator
-from .seen_poses import read_lenses, scene_file
+from .seen_poses import read_lenses, released_force, scene_file
 
 FloatArray = NDArray[np.float64]
 
-IMAGE, MASK, DEPTH = "00.png", "00_mask.png", "00_depth.png"
 _BODY, _BEHIND = (46, 96, 140), (24, 24, 26)  # red, green and blue of the pictures
 _THIN = 1e-9  # px^2, of a triangle that is seen from the side
 _CORRELATED = 2.0  # px, along an outline, of its noise
 
 
+def frame_files(data: PictureData, pose: PoseSettings) -> list[dict[str, str]]:
+    """Returns the files of every frame of a simulated pose, by their keys in camera.json."""
+    assert data.simulated is not None
+    keys = ["mask", *["depth"] * (data.simulated.depth is not None)]
+    numbers = range(1 if pose.release is None else data.simulated.frames)
+    return [{"image": f"{n:02d}.png", **{key: f"{n:02d}_{key}.png" for key in keys}} for n in numbers]
+
+
 def play_camera(context: StageContext) -> None:
-    """Writes camera.json, a picture, a mask and perhaps a depth image of every pose."""
+    """Writes camera.json and of every frame of every pose a picture, a mask, and perhaps depths and tracked points."""
     settings: PictureStage = context.settings
     data, played = settings.data, settings.data.simulated
     assert played is not None
     material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})
     body = build_body(settings)
     surface = ClosedSurface.of_mesh(body.mesh)
+    centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))
+    corrections = PlacedCamera.corrections(played.corrections)
     for number, (name, pose) in enumerate(data.poses.items()):
         gravity = settings.gravity if pose.gravity is None else pose.gravity
-        simulator = build_simulator(settings.model_copy(update={"gravity": gravity}), material, body)
-        with torch.no_grad():
-            q = simulator.static_equilibrium().q[0].double().cpu()
-        looking = looks(played, gravity)
-        centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))
+        changed = {"gravity": gravity, "time_step": settings.time_step / played.substeps}
+        simulator = build_simulator(settings.model_copy(update=changed), material, body)
+        looking, files = looks(played, gravity), frame_files(data, pose)
         camera = PlacedCamera(read_lenses(data)[""], torch.as_tensor(looking), centre)
-        corrections = PlacedCamera.corrections(played.corrections)
-        pixels = camera.pixels(q, corrections).numpy()
+        row_time = data.lenses[""].row_time if played.row_time is None else played.row_time
+        times = [n / played.frame_rate for n in range(len(files))]
+        photos = tuple(Photo("", camera, time=time, row_time=row_time) for time in times)
+        seen = SeenPose(name, simulator, surface, (), photos, release=released_force(name, pose, body.mesh))
+        shape = seen.shape(played.corrections)
         random = np.random.default_rng([settings.seed, number])
-        mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
-        path = scene_file(data, pose, context.run_dir)
-        drawings = {IMAGE: np.where(mask[..., None], _BODY, _BEHIND).astype(np.uint8), MASK: mask}
-        frame = {"image": IMAGE, "mask": MASK, "world_to_camera": looking.tolist()}
-        if played.depth is not None:
-            deep = camera.seen_from(q, corrections)[:, 2].numpy()
-            depth = depth_image(pixels[surface.triangles], deep[surface.triangles], played.size)
-            noisy = np.where(depth > 0.0, depth + played.depth * random.normal(size=depth.shape), 0.0)
-            drawings[DEPTH] = np.rint(noisy / data.cloud.depth_unit).astype(np.uint16)
-            frame["depth"] = DEPTH
-        for file, drawn in drawings.items():
-            with atomic_path(path.parent / file) as partial:
-                Image.fromarray(drawn).save(partial, format="png")
-        write_json(path, {"name": name, "frames": [frame]})
+        path, tracks, frames = scene_file(data, pose, context.run_dir), list[FloatArray](), list[dict[str, object]]()
+        for photo, own in zip(photos, files, strict=True):
+            q = seen.vertices(photo, shape, played.corrections)
+            pixels = camera.pixels(q, corrections).numpy()
+            mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
+            drawings = {"image": np.where(mask[..., None], _BODY, _BEHIND).astype(np.uint8), "mask": mask}
+            if played.depth is not None:
+                deep = camera.seen_from(q, corrections)[:, 2].numpy()
+                depth = depth_image(pixels[surface.triangles], deep[surface.triangles], played.size)
+                noisy = np.where(depth > 0.0, depth + played.depth * random.normal(size=depth.shape), 0.0)
+                drawings["depth"] = np.rint(noisy / data.cloud.depth_unit).astype(np.uint16)
+            for key, drawn in drawings.items():
+                with atomic_path(path.parent / own[key]) as partial:
+                    Image.fromarray(drawn).save(partial, format="png")
+            frames.append({**own, "time": photo.time, "world_to_camera": looking.tolist()})
+            if pose.points is not None:
+                places = bind_markers(body.mesh, [*data.points.values()], [*data.points])(q[None])[0]
+                there = camera.pixels(places, corrections).numpy()
+                tracks.append(there + played.noise * random.normal(size=there.shape))
+        if pose.points is not None:
+            heads = ["frame", *(f"{name}.{axis}" for name in data.points for axis in "xy")]
+            table = np.column_stack([np.arange(len(tracks)), np.reshape(tracks, (len(tracks), -1))])
+            with atomic_path(path.parent / pose.points) as partial:
+                np.savetxt(partial, table, "%.10g", ",", header=",".join(heads), comments="")
+        write_json(path, {"name": name, "frames": frames})
 
 
 def looks(played: SimulatedCamera, gravity: tuple[float, float, float]) -> FloatArray:

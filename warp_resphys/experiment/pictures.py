@@ -1,8 +1,8 @@
-"""Identification of a material from pictures of bodies at rest: stages and results.
+"""Identification of a material from pictures of bodies at rest or released: stages and results.
 
 The material is identified from the poses of training, with the camera. Every pose is then predicted by three models:
 the identified simulator, the uncorrected one, and the undeformed body. In each, the place before the camera, the tilt
-of gravity and the clamps are fitted to the pose, as nothing else shows them.
+of gravity, the clamps and the release are fitted to the pose, as nothing else shows them.
 """
 
 import logging
@@ -28,6 +28,7 @@ from ..learning.identification import ParameterSearch
 from ..learning.parameters import TILTS, configured_parameters, own_name, split_name
 from ..pictures.camera import CORRECTIONS, PlacedCamera
 from ..pictures.misfit import PictureMisfit, values_of
+from ..pictures.motion import OF_RELEASE
 from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, SeenPose, Shape
 from ..report.identification_section import parameter_rows
 from ..report.page import NONE, number_text
@@ -35,11 +36,11 @@ from ..report.pictures_page import PictureResult, picture_verdict, write_picture
 from ..settings.pictures import PictureData, PoseSettings
 from ..settings.run import RunSettings
 from ..settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
-from .build import simulation_device
+from .build import build_mesh, simulation_device
 from .files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from .identify import Checkpoint, bounds_of, search_parameters
-from .picture_laboratory import DEPTH, IMAGE, MASK, play_camera
-from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lenses, scene_of
+from .picture_laboratory import frame_files, play_camera
+from .seen_poses import PICTURES, SCENE, SeenPoses, import_pictures, picture_files, read_lenses, released_force, scene_of
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ DIFFERENCES: Final = "pictures.json"
 OUTLINES: Final = "outlines.h5"
 MODELS: Final = ("undeformed", "simulation", "sysid")
 
-_PLACED: Final = (*CORRECTIONS, CLAMP_TURN, CLAMP_SHIFT, *TILTS)  # what is of a picture, not of a material
+_PLACED: Final = (*CORRECTIONS, CLAMP_TURN, CLAMP_SHIFT, *TILTS, *OF_RELEASE)  # what is of a picture, not of a material
 
 Values = dict[str, float]
 
@@ -65,12 +66,13 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     data = run.pictures
     assert data is not None
     stages, upstream = list[Stage](), tuple[str, ...]()
-    with_depth = data.simulated is not None and data.simulated.depth is not None
     common = {"files": {**files, **picture_files(data)}, "data": data}
     settings = PictureStage.of(run, **common)
     if data.folder is None:
-        files_of_pose = (SCENE, IMAGE, MASK, *[DEPTH] * with_depth)
-        written = tuple(f"recordings/{own.folder}/{file}" for own in data.poses.values() for file in files_of_pose)
+        of_poses = {own.folder: [SCENE, own.points] for own in data.poses.values()}
+        for own in data.poses.values():
+            of_poses[own.folder] += [file for files in frame_files(data, own) for file in files.values()]
+        written = tuple(f"recordings/{folder}/{file}" for folder, files in of_poses.items() for file in files if file)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
     identified = IdentifyPicturesStage.of(run, **common)
@@ -101,6 +103,8 @@ def check_pictures(run: RunSettings) -> None:
     for name, pose in data.poses.items():
         if not (pose.outline or pose.points or pose.cloud or (pose.depth and _has_depth(data, pose))):
             raise InputError(f"data.poses.{name} has no outline, no points, no scan and no depth image: give one.")
+        if pose.release is not None and pose.mesh is None:
+            released_force(name, pose, build_mesh(run.mesh))
     if not wanted.parameters:
         raise InputError("identify.parameters is empty: give a range for at least one parameter.")
     known = [*run.simulation.constants, *_PLACED]
@@ -164,7 +168,8 @@ class _Plan:
     def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:
         """First guesses: as given, the configured turn of a clamp, the mean of the prior, or as configured."""
         wanted, result = self.settings.identify, Values()
-        neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True)) | {CLAMP_SHIFT: 0.0}
+        neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True))
+        neutral |= dict.fromkeys((CLAMP_SHIFT, *OF_RELEASE), 0.0)
         for name in names:
             parameter, owner = split_name(name)
             pose = next(pose for pose in poses if owner in (*pose.owners, *pose.lenses))
@@ -206,17 +211,19 @@ class _Plan:
         if known and name in self._cameras:
             return pose.before(self._cameras[name])
         guess = {**self.guess(self.bounds([pose], lambda name, per: True), [pose]), **self.given([pose]), **known}
-        q = pose.shape(values_of(pose, guess), near)
-        return pose.before({lens: self._best_camera(pose, lens, q, guess) for lens in pose.lenses})
+        shape = pose.shape(values_of(pose, guess), near)
+        return pose.before({lens: self._best_camera(pose, lens, shape, guess) for lens in pose.lenses})
 
-    def _best_camera(self, pose: SeenPose, lens: str, q: torch.Tensor, values: Values) -> torch.Tensor:
-        """The camera (4, 4) of the frames by a lens from which a body (N, 3) is seen best."""
+    def _best_camera(self, pose: SeenPose, lens: str, shape: torch.Tensor, values: Values) -> torch.Tensor:
+        """The camera (4, 4) of the frames by a lens from which a shape is seen best."""
         seen, failure, own = list[tuple[float, torch.Tensor]](), None, values_of(pose, values, lens)
         for camera in self.poses.cameras_of(pose.name, lens):
             tried = pose.before({lens: camera})
             try:
                 photos = [photo for photo in tried.photos if photo.camera.lens is not None and photo.lens == lens]
-                seen.append((sum(tried.difference(photo, q, own).distance for photo in photos), camera))
+                bodies = [tried.vertices(photo, shape, own) for photo in photos]
+                distances = (tried.difference(*pair, own).distance for pair in zip(photos, bodies, strict=True))
+                seen.append((sum(distances), camera))
             except InputError as error:
                 failure = error
         if failure is not None and not seen:
@@ -303,18 +310,19 @@ def compare_pictures(context: StageContext) -> None:
                 for number, photo in enumerate(pose.photos):
                     own = values_of(pose, values, photo.lens)
                     row = {"pose": name, "picture": number, "model": model, "tested": name in settings.data.test}
-                    rows.append({**row, **asdict(pose.difference(photo, near[1], own)), "values": own})
+                    q = pose.vertices(photo, near[1], own)
+                    rows.append({**row, **asdict(pose.difference(photo, q, own)), "values": own})
                     corrections = PlacedCamera.corrections(own)
                     if photo.outline is not None:
-                        seen = pose.outlines(photo, near[1], corrections)
+                        seen = pose.outlines(photo, q, corrections)
                         create(file, f"{name}/{number}/{model}", seen.silhouette.pixels, "px")
                         create(file, f"{name}/{number}/{model}_weight", seen.of_simulated, "px")
                         if model == MODELS[0]:
                             create(file, f"{name}/{number}/measured", photo.outline.points, "px")
                     if photo.cloud is not None:
-                        closest = pose.cloud_distances(photo, near[1], corrections)
+                        closest = pose.cloud_distances(photo, q, corrections)
                         distances = np.abs(closest.distances)
-                        content = {"places": closest.places, "distances": distances, "surface": near[1].cpu().numpy()}
+                        content = {"places": closest.places, "distances": distances, "surface": q.numpy()}
                         for key, array in content.items():
                             create(file, f"{name}/{number}/{model}_{key}", array, "m")
                         if model == MODELS[0]:

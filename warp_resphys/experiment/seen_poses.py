@@ -1,4 +1,4 @@
-"""Bodies at rest before a camera: from settings and the files of pictures to `SeenPose`."""
+"""Bodies before a camera, at rest or released: from settings and the files of pictures to `SeenPose`."""
 
 import logging
 from collections.abc import Sequence
@@ -16,18 +16,20 @@ from ..data.camera import Lens
 from ..data.markers import bind_markers
 from ..fem.body import Body
 from ..io.atomic import atomic_path, digest
-from ..io.errors import DataFileError, InputError, listed
+from ..io.errors import DataFileError, InputError, MeshError, listed
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.stages import StageContext
 from ..mesh.mesh import Mesh, quadratic, select_vertices
 from ..mesh.readers import METRES, read_mesh
 from ..pictures.camera import PlacedCamera
 from ..pictures.clouds import Cloud
+from ..pictures.motion import ReleasedForce
 from ..pictures.outlines import ClosedSurface, Outline
 from ..pictures.reading import (
     Colours,
     Frame,
     SceneFile,
+    check_times,
     read_depth,
     read_mask,
     read_picture,
@@ -105,7 +107,25 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
                 f"{scene.path}: frame {frame.number} has the lens '{frame.lens}', and data.lens has the names {names}: "
                 "name the lens of a frame, as 'lens', where data.lens has several, and only there."
             )
-    return replace(scene, frames=frames)
+    scene = replace(scene, frames=frames)
+    if pose.release is not None:
+        check_times(scene, pose.release.time)
+    return scene
+
+
+def released_force(name: str, pose: PoseSettings, mesh: Mesh) -> ReleasedForce | None:
+    """Returns the force that holds the body of a pose until its release; None for one at rest.
+
+    Raises:
+        MeshError: no vertex carries it.
+    """
+    wanted = pose.release
+    if wanted is None:
+        return None
+    try:
+        return ReleasedForce(select_vertices(mesh, **wanted.at.arguments()), wanted.force, wanted.time)
+    except MeshError as error:
+        raise MeshError(f"data.poses.{name}.release.at: {error}") from None
 
 
 def import_pictures(context: StageContext) -> None:
@@ -120,6 +140,8 @@ def import_pictures(context: StageContext) -> None:
         for name, pose in data.poses.items():
             scene = scene_of(data, pose, context.run_dir)
             frames = _different(name, scene.frames)
+            if pose.release is not None:
+                check_times(replace(scene, frames=tuple(frames)), pose.release.time)
             colours = pose.mask or data.mask
             chosen = None if colours is None else Colours(**dict(colours))
             masks = dict[int, NDArray[np.bool_]]()
@@ -328,13 +350,16 @@ class SeenPoses:
             cloud, depth = None, loaded.depths.get(frame.number)
             if depth is not None:
                 cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, mesh, fixed)
-            photos.append(Photo(f"{own.folder}/{frame.image.name}", camera, outline, tracked, cloud, frame.lens))
+            row_time = self.data.lenses[frame.lens].row_time
+            title, time = f"{own.folder}/{frame.image.name}", frame.time or 0.0
+            photos.append(Photo(title, camera, outline, tracked, cloud, frame.lens, time, row_time))
         if loaded.scan is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
             outside = None if loaded.normals is None else loaded.scan + loaded.normals
             cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(loaded.scan, outside), camera, mesh, fixed)
             photos.append(Photo(f"{own.folder}/{own.cloud}", camera, cloud=cloud))
-        return SeenPose(name, simulator, surface, clamps, tuple(photos), own.material or "", points)
+        release, material_name = released_force(name, own, mesh), own.material or ""
+        return SeenPose(name, simulator, surface, clamps, tuple(photos), material_name, points, release=release)
 
     def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: NDArray[np.int64]) -> Cloud:
         """The points that may be of a body, as many as configured."""

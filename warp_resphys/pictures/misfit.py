@@ -118,8 +118,13 @@ class PictureMisfit(BoundedMisfit):
             own = values_of(pose, known)
             try:
                 shapes, columns = self._shapes_by(number, unit, own, derivatives)
+                series = dict[str, list[Linearised]]()  # of tracked points that move, by lens
                 for photo in pose.photos:
-                    trials += self._of_photo(pose, photo, values_of(pose, known, photo.lens), shapes, columns, share)
+                    own = values_of(pose, known, photo.lens)
+                    parts, points = self._of_photo(pose, photo, own, shapes, columns, share)
+                    trials += parts
+                    (series.setdefault(photo.lens, []) if pose.moves else trials).extend(points)
+                trials += [_joined(frames) for frames in series.values() if frames]
             except ConvergenceError:
                 return None
             except InputError:
@@ -171,13 +176,13 @@ class PictureMisfit(BoundedMisfit):
         shapes: torch.Tensor,
         columns: Sequence[int],
         share: float,
-    ) -> list[Linearised]:
-        """Weighted residuals of a picture, and their derivatives: outlines both ways, tracked points, and a cloud.
+    ) -> tuple[list[Linearised], list[Linearised]]:
+        """Weighted residuals of a picture, and their derivatives: outlines both ways and a cloud, and tracked points.
 
         The outlines of all pictures by a standing camera, both ways, have nearly the same errors (correlated by 0.87 to
         0.997 between real pictures), so that they count as one set.
         """
-        corrections, parts = PlacedCamera.corrections(own), list[Linearised]()
+        corrections, parts, points = PlacedCamera.corrections(own), list[Linearised](), list[Linearised]()
         vertices, velocities = pose.seen(photo, shapes, own)
         q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
         share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
@@ -201,7 +206,7 @@ class PictureMisfit(BoundedMisfit):
             visible = np.asarray(np.isfinite(away).all(1))
             jacobian, away = slopes.transpose(1, 2, 0), np.where(visible[:, None], away, 0.0)
             if visible.any():
-                parts.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
+                points.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
         if photo.cloud is not None:
             cloud, closest = photo.cloud, pose.cloud_distances(photo, q, corrections)
             placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
@@ -209,7 +214,7 @@ class PictureMisfit(BoundedMisfit):
             slopes = self._slopes(pose, photo, by, columns) * (np.abs(closest.distances) < cloud.reach)
             distance = closest.distances.clip(-cloud.reach, cloud.reach)[:, None] / cloud.noise
             parts.append(_weighted(share, np.ones(len(distance)), distance, slopes.T[:, None] / cloud.noise, copies))
-        return parts
+        return parts, points
 
     def _pixel_slopes(
         self,
@@ -269,6 +274,12 @@ def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: 
     rows = scale * distance
     count = max(round(int((weight > 0.0).sum()) * distance.shape[1] / copies), 1)
     return rows, (scale[..., None] * slopes).reshape(rows.size, -1), count
+
+
+def _joined(frames: Sequence[Linearised]) -> Linearised:
+    """Residuals (T, C) of T frames with the same points, whose errors may be correlated in time."""
+    rows = np.stack([own.ravel() for own, _, _ in frames])
+    return rows, np.concatenate([jacobian for _, jacobian, _ in frames]), sum(count for *_, count in frames)
 
 
 def values_of(pose: SeenPose, values: Mapping[str, float], lens: str = "") -> dict[str, float]:

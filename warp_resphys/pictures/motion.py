@@ -14,6 +14,7 @@ times are linear in the picture. By implicit differentiation, a derivative d of 
 `tests/pictures/test_released_motion.py` compares rows with closed forms, and derivatives with differences.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -35,7 +36,10 @@ RELEASE_DELAY: Final = "release_delay"  # s
 RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N
 OF_RELEASE: Final = (RELEASE_DELAY, *RELEASE_FORCES)
 
-_ROUNDS: Final = 6  # fixed-point iterations for a row, with an error that shrinks by r v_2 in each
+_MARGIN: Final = 4  # steps before and after those that a picture shows
+_LEAST: Final = 3  # steps
+_MOST_ROUNDS: Final = 30  # fixed-point iterations for a row, with an error that shrinks by r v_2 in each
+_ON_TIME: Final = 1e-9  # s, of their change
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,12 @@ class ReleasedForce:
 
 
 def at_own_times(
-    series: torch.Tensor, begin: float, row_time: float, step: float, pixels: Callable[[torch.Tensor], torch.Tensor]
+    series: torch.Tensor,
+    begin: float,
+    row_time: float,
+    rows: float,
+    step: float,
+    pixels: Callable[[torch.Tensor], torch.Tensor],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the vertices of motions where a picture shows those of the first, and their velocities in that.
 
@@ -112,21 +121,27 @@ def at_own_times(
         series: (S, K + 1, N, 3) vertices at the steps, the first of a motion, others perhaps its derivatives.
         begin: time at which row 0 is exposed, after the release [s].
         row_time: r, between two rows [s].
+        rows: number of rows of the picture.
         step: time step [s].
         pixels: maps points (N, 3) to pixels (N, 2).
 
     Returns:
         (S, N, 3), and velocities (N, 3) [m/s].
     """
+    low, high = sorted((begin, begin + row_time * rows))
+    first = min(max(math.floor(low / step) - _MARGIN, 0), series.shape[1] - _LEAST)
+    series = series[:, first : max(math.ceil(high / step) + _MARGIN, first + _LEAST)]
+    begin -= first * step
     paths = series[0].transpose(0, 1)
     times = torch.full_like(paths[:, :1, 0], begin)
 
     def places(times: torch.Tensor) -> torch.Tensor:
         return sample(paths, times.clamp_min(0.0), step)[:, 0]
 
-    if row_time:
-        for _ in range(_ROUNDS):
-            times = begin + row_time * pixels(places(times))[:, 1:].nan_to_num()
+    for _ in range(_MOST_ROUNDS if row_time else 0):
+        before, times = times, begin + row_time * pixels(places(times))[:, 1:].nan_to_num()
+        if float((times - before).abs().max()) < _ON_TIME:
+            break
     velocities = jacobians(places, times)[0][..., 0]
     others = sample(series.permute(2, 1, 0, 3), times.clamp_min(0.0), step)[:, 0]
     return others.transpose(0, 1), velocities

@@ -2,14 +2,16 @@
 
 A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4 x 4, row-major,
 metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is,
-a `depth` image and the name of its `lens`; perhaps `fixed`, a list of clamps with the numbers of their `vertices`; and
-perhaps `world_to_cloud`, the same matrix for the axes of a scan. docs/pictures.md has an example. Tracked points are
+a `depth` image, the name of its `lens` and its `time` [s]; perhaps `frame_rate` [Hz], which gives the times of frames
+by their number; perhaps `fixed`, a list of clamps with the numbers of their `vertices`; and perhaps `world_to_cloud`,
+the same matrix for the axes of a scan. docs/pictures.md has an example. Tracked points are
 tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or files of NumPy with the arrays `tracks`
 (T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
 """
 
 import csv
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ Mask = NDArray[np.bool_]
 _SPECKS = 2  # px, of an opening that removes them
 _HEADS = ("scorer", "individuals", "bodyparts", "coords")
 _RIGID = 1e-3  # of a rotation
+_LEAST_MOVING = 3  # frames of a motion
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ class Frame:
     mask: Path | None = None
     depth: Path | None = None
     lens: str = ""  # name of the lens; empty for a single one
+    time: float | None = None  # at which row 0 is exposed [s]
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -117,17 +121,54 @@ def read_scene(path: Path, scanned: bool = False) -> SceneFile:
     if not all(len(clamp) for clamp in clamps):
         raise DataFileError(f"{path}: a clamp of 'fixed' has no 'vertices': leave it out.")
     scan_pose = _pose(f"{path}", "world_to_cloud", content)
-    shown = tuple(_frame(path, number, entry) for number, entry in enumerate(frames))
+    rate = content.get("frame_rate")
+    if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0.0):
+        raise DataFileError(f"{path}: 'frame_rate' is {rate!r}: give a positive number, in Hz.")
+    shown = tuple(_frame(path, number, entry, rate) for number, entry in enumerate(frames))
     return SceneFile(path, shown, clamps, np.eye(4) if scan_pose is None else scan_pose)
 
 
-def _frame(path: Path, number: int, entry: Any) -> Frame:
+def _frame(path: Path, number: int, entry: Any, rate: float | None) -> Frame:
     image = entry.get("image", entry.get("depth")) if isinstance(entry, dict) else None
     if not isinstance(image, str):
         raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
     mask, depth = (None if entry.get(key) is None else path.parent / str(entry[key]) for key in ("mask", "depth"))
     pose = _pose(f"{path}: frame {number}", "world_to_camera", entry)
-    return Frame(number, path.parent / image, pose, mask, depth, str(entry.get("lens", "")))
+    time = entry.get("time", None if rate is None else number / rate)
+    if time is not None and not (isinstance(time, int | float) and math.isfinite(time)):
+        raise DataFileError(f"{path}: frame {number} has the 'time' {time!r}: give a number, in s.")
+    return Frame(number, path.parent / image, pose, mask, depth, str(entry.get("lens", "")), time)
+
+
+def check_times(scene: SceneFile, release: float) -> None:
+    """Checks the times of frames of a body that is released.
+
+    Args:
+        scene: with the frames that are used.
+        release: time of the release [s].
+
+    Raises:
+        DataFileError: frames have no times, these do not increase, or no two are after the release.
+    """
+    last: dict[str, tuple[int, float]] = {}
+    for frame in scene.frames:
+        if frame.time is None:
+            raise DataFileError(
+                f"{scene.path}: frame {frame.number} has no 'time', and its body is released: give it in s, or the "
+                "'frame_rate' of all frames in Hz."
+            )
+        before = last.get(frame.lens)
+        if before is not None and not frame.time > before[1]:
+            raise DataFileError(
+                f"{scene.path}: frame {frame.number} has the time {frame.time:g} s, and frame {before[0]} before it "
+                f"{before[1]:g} s: the times of a camera must increase."
+            )
+        last[frame.lens] = (frame.number, frame.time)
+    if sum(frame.time is not None and frame.time > release for frame in scene.frames) < _LEAST_MOVING:
+        raise DataFileError(
+            f"{scene.path} has fewer than {_LEAST_MOVING} different frames after the release at {release:g} s: check "
+            "the times, the release (data.poses) and the chosen frames, or leave the release out of a body at rest."
+        )
 
 
 def _pose(where: str, key: str, entry: Mapping[str, Any]) -> FloatArray | None:

@@ -59,6 +59,11 @@ class Photo:
         """Number of kinds of measurements: outline, tracked points, cloud."""
         return sum(own is not None for own in (self.outline, self.tracked, self.cloud))
 
+    @property
+    def rows(self) -> float:
+        """Number of rows of a picture whose principal point is in the middle."""
+        return 0.0 if self.camera.lens is None else 2.0 * float(self.camera.lens.matrix[1, 2])
+
 
 @dataclass(frozen=True)
 class SeenOutline:
@@ -194,18 +199,10 @@ class SeenPose:
         """
         if self.release is not None and self.deforms:
             guess = self.simulator.rest_state(1).q if near is None else near[1].view(-1, *near[1].shape[-2:])
-            return self.release.motions(self.simulator, values, self._last, guess[0])
+            last = max(photo.time + max(photo.row_time * photo.rows, 0.0) for photo in self.photos)
+            return self.release.motions(self.simulator, values, last, guess[0])
         first = self._at_rest(values[0], near)
         return torch.stack([first, *(self._at_rest(own, (values[0], first)) for own in values[1:])]).double().cpu()
-
-    @property
-    def _last(self) -> float:
-        """Time that is shown last [s]: of pictures twice as high as their principal points are low."""
-        rows = [(own, own.camera.lens) for own in self.photos]
-        return max(
-            own.time + max(own.row_time, 0.0) * 2.0 * (0.0 if lens is None else float(lens.matrix[1, 2]))
-            for own, lens in rows
-        )
 
     def seen(
         self, photo: Photo, shapes: torch.Tensor, values: Mapping[str, float]
@@ -225,7 +222,11 @@ class SeenPose:
         assert self.release is not None
         corrections, step = PlacedCamera.corrections(values), self.simulator.time_step
         begin = photo.time - self.release.at(values)
-        return at_own_times(shapes, begin, photo.row_time, step, lambda q: photo.camera.pixels(q, corrections))
+
+        def pixels(q: torch.Tensor) -> torch.Tensor:
+            return photo.camera.pixels(q, corrections)
+
+        return at_own_times(shapes, begin, photo.row_time, photo.rows, step, pixels)
 
     def vertices(self, photo: Photo, shape: torch.Tensor, values: Mapping[str, float]) -> torch.Tensor:
         """Returns the vertices (N, 3) that a picture shows of a shape; see `seen` [m]."""

@@ -58,7 +58,7 @@ class PictureResult:
         pose: name.
         material: name; empty for one material.
         tested: whether it was kept back from the identification.
-        pictures: number of different pictures.
+        pictures: number of different pictures, of which the middle one is drawn.
         outline_mm: mean distance of the outlines, both ways, at the depth of the body.
         outline_px: the same in pixels.
         overlap: common area over the area of both.
@@ -81,6 +81,11 @@ class PictureResult:
         """Kind of distance by which models are compared: outlines, else clouds, else tracked points."""
         kinds = {"outlines": self.outline_mm, "clouds": self.cloud_mm}
         return next((kind for kind, values in kinds.items() if values["sysid"] is not None), "tracked points")
+
+    @property
+    def drawn(self) -> int:
+        """Number of the picture that is drawn; a scan is the last one."""
+        return (self.pictures - 1) // 2
 
     def distance(self, model: str) -> float:
         """Distance by which models are compared [mm]."""
@@ -157,10 +162,10 @@ def write_pictures_report(
     )
     with figures_beside(path) as folder:
         canvas, drawn = Canvas(folder), list[Block]()
-        panels = [(own, picture(own.pose, 0)) for own in results if own.outline_mm["sysid"] is not None]
+        panels = [(own, picture(own.pose, own.drawn)) for own in results if own.outline_mm["sysid"] is not None]
         clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
         # Pictures without outlines are shown as well, where there is nothing else to see.
-        panels = panels or [(own, picture(own.pose, 0)) for own in results if not clouds]
+        panels = panels or [(own, picture(own.pose, own.drawn)) for own in results if not clouds]
         if panels:
             drawn += canvas.attempt("outlines.png", partial(draw_outlines, panels, outlines))
         if clouds:
@@ -214,7 +219,7 @@ def _text(value: float | None) -> str:
 
 @in_style()
 def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], outlines: Path, path: Path) -> Drawn:
-    """Draws the outlines on the first picture of every pose into a PNG file.
+    """Draws the outlines on the middle picture of every pose into a PNG file.
 
     Args:
         panels: results with their pictures (H, W, 3).
@@ -232,7 +237,7 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
         axis.set_axis_off()
     with read_hdf5(outlines, "outlines") as file:
         for axis, (result, image) in zip(axes, panels, strict=False):
-            group = f"{result.pose}/0"
+            group = f"{result.pose}/{result.drawn}"
             axis.set_title(f"{result.pose}{' (kept back)' * result.tested}")
             axis.imshow(image)
             if group not in file:
@@ -254,7 +259,7 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
         legend.get_frame().set_facecolor("#8a929b")
     figure.savefig(path, dpi=170)
     caption = (
-        "The first picture of each pose: the measured outline (white), and those of the uncorrected simulator, which "
+        "The middle picture of each pose: the measured outline (white), and those of the uncorrected simulator, which "
         "has the parameters of the data sheet (orange), and of the identified one (blue), without what a clamp hides."
     )
     alt = "; ".join(

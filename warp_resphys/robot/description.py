@@ -191,7 +191,7 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
         DataFileError: the run is missing, unfinished or changed, or it is a cross-validation.
     """
     if (folder / "stages" / f"{COMPARE}.json").is_file():
-        raise DataFileError(f"{folder} has pictures of bodies at rest, which have no motion: name a run with trials.")
+        raise DataFileError(f"{folder} has pictures, from which no robot is made: name a run with trials.")
     if not (folder / "stages" / f"{_EVALUATE}.json").is_file():
         records = folder.glob(f"{fold_folder('*')}/stages/{_EVALUATE}.json")
         folds = sorted(str(record.parent.parent) for record in records)

@@ -1,4 +1,4 @@
-"""Settings of bodies at rest that are seen by cameras."""
+"""Settings of bodies that are seen by cameras, at rest or released."""
 
 from collections.abc import Mapping
 from itertools import combinations
@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
-from .mesh import LengthUnit
+from .mesh import LengthUnit, PlaceSettings
 from .trials import LimitSettings, different
 
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -27,6 +27,9 @@ class LensSettings(Settings):
 
     file: Word | None = setting(None, "calibration by OpenCV or ROS, in the folder of the pictures")
     matrix: _Rows | None = setting(None, "K, row by row", "px")
+    row_time: float = setting(
+        0.0, "of a rolling shutter, from the exposure of a row to that of the next below; 0: all at once", "s"
+    )
 
     @model_validator(mode="after")
     def _has_one(self) -> Self:
@@ -68,8 +71,16 @@ class TagSettings(Settings):
     up: Vector = setting((0.0, 1.0, 0.0), "direction of its left edge")
 
 
+class ReleasedForceSettings(Settings):
+    """A force that holds a body at rest and is then released."""
+
+    at: PlaceSettings = setting(description="vertices that carry it, in equal shares")
+    force: Vector = setting(description="in the axes of the scene", unit="N")
+    time: float = setting(0.0, "of the release, on the clock of the frames", "s")
+
+
 class PoseSettings(Settings):
-    """A body at rest, and the folder of its pictures."""
+    """A body at rest, or one that is released, and the folder of its pictures."""
 
     folder: Word = setting(description="with camera.json and the pictures, in the folder of the data")
     mesh: Word | None = setting(None, "file of its mesh, in its folder; null: the group mesh")
@@ -86,14 +97,23 @@ class PoseSettings(Settings):
     depth: bool = setting(True, "whether depth images of its frames are compared")
     gravity: Vector | None = setting(None, "in the axes of the scene; null: as configured", "m/s^2")
     clamp_turn: float = setting(0.0, "about which the second clamp is turned against the first", "degrees")
+    release: ReleasedForceSettings | None = setting(
+        None, "of a force, after which the body moves, in frames with times; null: it rests"
+    )
 
 
 class SimulatedCamera(Settings):
     """A simulated laboratory of pictures, on the body of the configuration."""
 
     material: dict[str, float] = setting({}, "constants of the true material that differ from the simulation")
-    corrections: dict[str, float] = setting({}, "true corrections of the camera, by parameter")
-    noise: NotNegative = setting(1.0, "standard deviation of an outline, across it", "px")
+    corrections: dict[str, float] = setting({}, "true corrections of the camera and of releases, by parameter")
+    noise: NotNegative = setting(
+        1.0, "standard deviation of an outline, across it, and of each coordinate of a tracked point", "px"
+    )
+    frames: Natural = setting(60, "of a body that is released")
+    frame_rate: Positive = setting(60.0, "of these frames", "Hz")
+    row_time: float | None = setting(None, "true time between two rows; null: that of the lens", "s")
+    substeps: Natural = setting(2, "of a time step, in true motions")
     depth: NotNegative | None = setting(None, "standard deviation of each pixel of depth images; null: no such", "m")
     size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
     place: Vector = setting(description="of the camera", unit="m")
@@ -101,7 +121,7 @@ class SimulatedCamera(Settings):
 
 
 class PictureData(Settings):
-    """Bodies at rest before a camera: outlines and tracked points in pictures."""
+    """Bodies before a camera, at rest or released: outlines and tracked points in pictures."""
 
     kind: Literal["pictures"]
     folder: Word | None = setting(None, "of the pictures")
@@ -125,7 +145,7 @@ class PictureData(Settings):
     train: Some[Word] = setting(description="poses that identify the material")
     test: Many[Word] = setting((), "poses that are predicted with it")
     limit: LimitSettings | None = setting(None, "fewer poses, the first of each split")
-    steps: None = setting(None, "null, as bodies rest")
+    steps: None = setting(None, "null, as frames have their own times")
     simulated: SimulatedCamera | None = setting(None, "plays the camera where there is no folder")
 
     @model_validator(mode="after")
@@ -139,6 +159,12 @@ class PictureData(Settings):
             raise ValueError(
                 f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
             )
+        for name, pose in self.poses.items():
+            if pose.release is not None and (pose.cloud is not None or pose.clamp_turn):
+                raise ValueError(
+                    f"poses.{name} has a release beside a scan, which shows no time, or a turned clamp: make another "
+                    "pose without a release."
+                )
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
@@ -156,11 +182,13 @@ class PictureData(Settings):
             raise ValueError("simulated is for pictures without a folder, and data.folder is set: set it to null.")
         if self.simulated is not None:
             for name, pose in self.poses.items():
-                if pose.mesh or pose.material or pose.points or pose.cloud or pose.clamp_turn:
+                if pose.mesh or pose.material or pose.cloud or pose.clamp_turn:
                     raise ValueError(
-                        f"poses.{name} has a mesh, a material, points, a scan or a turned clamp, which the simulated "
-                        "camera does not play: leave them out."
+                        f"poses.{name} has a mesh, a material, a scan or a turned clamp, which the simulated camera "
+                        "does not play: leave them out."
                     )
+                if pose.points is not None and not pose.points.endswith(".csv"):
+                    raise ValueError(f"poses.{name}.points is {pose.points}: the simulated camera writes a .csv table.")
             if [*self.lenses] != [""]:
                 raise ValueError("lens must be a single one for the simulated camera.")
             if len({pose.folder for pose in self.poses.values()}) < len(self.poses):

@@ -142,7 +142,7 @@ class RunSettings(SimulatorSettings):
 
     @property
     def pictures(self) -> PictureData | None:
-        """Data of bodies at rest that cameras see; None for others."""
+        """Data of bodies that cameras see in pictures; None for others."""
         return self.data.limited() if isinstance(self.data, PictureData) else None
 
     @property
@@ -150,10 +150,10 @@ class RunSettings(SimulatorSettings):
         """Data of trials.
 
         Raises:
-            InputError: the run has pictures of bodies at rest.
+            InputError: the run has pictures.
         """
         if isinstance(self.data, PictureData):
-            raise InputError("data.kind is pictures: bodies at rest have no trials to show, to track or to learn from.")
+            raise InputError("data.kind is pictures: they have no trials to show, to track or to learn from.")
         return self.data
 
     @property

@@ -88,7 +88,7 @@ class ImportStage(SimulationStage):
 
 
 class PictureStage(SimulatorSettings):
-    """Pictures of bodies at rest."""
+    """Pictures of bodies, at rest or released."""
 
     simulation: MaterialSettings
     data: PictureData

@@ -137,7 +137,7 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
 
 def search(pose, ranges):
     known = {name: value for name, value in TRUTH.items() if name not in ranges}
-    first = {name: FIRST[name] for name in ranges}
+    first = {name: {**FIRST, "youngs_modulus": 4e5}[name] for name in ranges}  # at first 1.8 times as fast
     return ParameterSearch(PictureMisfit([pose], ranges, known)).run([first], 25, tolerance=1e-6)
 
 

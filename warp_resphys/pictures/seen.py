@@ -197,7 +197,8 @@ class SeenPose:
         Raises:
             ConvergenceError: there is no equilibrium, or a step fails.
         """
-        if self.release is not None and self.deforms:
+        if self.moves:
+            assert self.release is not None
             guess = self.simulator.rest_state(1).q if near is None else near[1].view(-1, *near[1].shape[-2:])
             last = max(photo.time + max(photo.row_time * photo.rows, 0.0) for photo in self.photos)
             return self.release.motions(self.simulator, values, last, guess[0])

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..data.rigid_bodies import corners_of, independent
 from ..io.errors import ConvergenceError
@@ -73,9 +74,10 @@ def identify(context: StageContext) -> None:
                 found = search_parameters(wanted, settings.seed, identifier, values, kept[again], progress, 1)
                 if not changes(before, found["loss"]):
                     break
-            if (where := wanted.placement) is not None and (found["placement"] or {}).get("sessions"):
-                prior = [where.between_sessions * size for size in (where.markers, where.shift) if size is not None]
-                found = {**found, "placement": {**found["placement"], "prior": prior}}
+            if sessions := (found["placement"] or {}).get("sessions"):
+                like = torch.zeros(len(experiment.dataset.labels), 3, dtype=torch.float64)
+                expected = nuisances["accuracy"].of_new_session(like, len(sessions)).tolist()
+                found = {**found, "placement": {**found["placement"], "new_session": expected}}
             identified[model] = _separated(found, searches[model]) | {"first_guess": guess}
     if wanted.landscape and wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
@@ -137,6 +139,7 @@ def _separated(found: Mapping[str, Any], search: Mapping[str, RangeSettings]) ->
     poorest = {name: uncertainty["poorest"][name] for name in common} | dict.fromkeys(held, 0.0)
     ranges = {n: uncertainty["ranges"][n] for n in common} | {n: search[n].upper - search[n].lower for n in held}
     changed = {"deviation": deviation, "correlation": correlation.tolist(), "poorest": poorest, "ranges": ranges}
+    changed |= {"left_out": {}}  # A trial that is left out has no values of its own.
     return result | {
         "uncertainty": {**uncertainty, **changed},
         "own_deviation": {name: uncertainty["deviation"][name] for name in own},

@@ -20,7 +20,7 @@ from .files import ROLLOUTS, Dataset, read_dataset
 from .free_fits import free_fits
 from .models import SIMFREE
 from .sensitivity import Sensitivity, sensitivities
-from .spread import parameter_spread
+from .spread import left_out_changes, parameter_spread
 from .without_physics import without_physics
 
 FloatArray = NDArray[np.float64]
@@ -52,9 +52,11 @@ def linearised(
     return own
 
 
-def spreads_of(experiment: Experiment, names: Sequence[str], linear: Linear) -> dict[str, FloatArray]:
+def spreads_of(
+    experiment: Experiment, names: Sequence[str], linear: Linear, left_out: bool = False
+) -> dict[str, FloatArray]:
     """Variances (R, T, M) of markers due to the identified parameters [m^2], by model, see `parameter_spread`."""
-    spreads = {model: parameter_spread(experiment, model, names, own) for model, own in linear.items()}
+    spreads = {model: parameter_spread(experiment, model, names, own, left_out) for model, own in linear.items()}
     return {model: spread for model, spread in spreads.items() if spread is not None}
 
 
@@ -79,7 +81,8 @@ def intervals_of(
 ) -> dict[str, Any]:
     """Prediction intervals by model and their coverage of the test trials, see `learning.intervals`.
 
-    Those of a robot, which does not know the variance due to the parameters, are `without_spread`.
+    Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
+    intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
     """
     settings, bound = experiment.settings, experiment.dataset.bound
     assert isinstance(settings, EvaluateStage)
@@ -93,8 +96,10 @@ def intervals_of(
     observed[learned, experiment.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     models: dict[str, Any] = {}
     simulated, _ = without_physics(experiment, names, left_out=True)
-    simulated |= calibrating
-    calibrating_spreads = spreads_of(experiment, names, linearised(experiment, names, uncertain=True))
+    linear = linearised(experiment, names, uncertain=True)
+    changes = {model: left_out_changes(experiment, model, names, own) for model, own in linear.items()}
+    simulated |= {m: x if (change := changes.get(m)) is None else x + change for m, x in calibrating.items()}
+    calibrating_spreads = spreads_of(experiment, names, linear, left_out=True)
     for model in (model for model in simulated if model in tested):
         trials = predicted(names, [*simulated[model]], [*observed], calibrating_spreads.get(model))
         intervals = Intervals.calibrated(trials, rest)
@@ -105,7 +110,8 @@ def intervals_of(
         models[model] = {**intervals.plain(), **coverage(covered), "by_trial": _by_trial(test, covered)}
         alone = Intervals.calibrated([replace(trial, spread=None) for trial in trials], rest)
         models[model] |= {"without_spread": alone.plain()} if model in spreads and alone is not None else {}
-    split = "training" if learned else "validation"
+    without = any(change is not None for change in changes.values())
+    split = "left_out" if without else "training" if learned else "validation"
     return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
 
 

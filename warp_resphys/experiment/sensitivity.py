@@ -16,7 +16,7 @@ from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
 from ..learning.parameters import HUNG, configured_parameters, split_name
 from ..learning.placement import DisplacedMarkers, Placement, by_placement, placement_of
-from ..learning.replay import Replay
+from ..learning.replay import Replay, exact
 from .experiment import Experiment
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> d
         model: a model with markers and identified parameters.
         names: names of the trials; those that cannot be simulated are left out, which a warning says.
     """
-    simulator, found = experiment.model_simulator(model), dict[str, Sensitivity]()
+    simulator, found = exact(experiment.model_simulator(model)), dict[str, Sensitivity]()
     deviation = (experiment.identification(model).get("uncertainty") or {}).get("deviation", {})
     largest = {name: float(np.abs(values).max()) for name, values in experiment.dataset.inputs.items()}
     added = responses(experiment)
@@ -68,7 +68,7 @@ def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> d
     with Progress("evaluate: derivatives by the parameters", len(names), "trials") as progress, torch.no_grad():
         for batch in _batches(experiment, names):
             try:
-                found |= _of_batch(experiment, model, batch, values, moved)
+                found |= _of_batch(experiment, model, simulator, batch, values, moved)
             except ConvergenceError as error:
                 log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
             progress.advance(len(batch))
@@ -88,12 +88,13 @@ def _tensors(simulator: Simulator, values: Mapping[str, float]) -> dict[str, tor
 def _of_batch(
     experiment: Experiment,
     model: str,
+    simulator: Simulator,
     names: Sequence[str],
     values: Mapping[str, torch.Tensor],
     moved: Mapping[str, float],
 ) -> dict[str, Sensitivity]:
     """Derivatives of trials of one of `Experiment.batches`, from values (1,) of all parameters and steps of some."""
-    own = experiment.replay(experiment.model_simulator(model), names, model)
+    own = experiment.replay(simulator, names, model)
     replay, start, observe = own, experiment.start(own, model), experiment.observe
     placement = None
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):

@@ -1,4 +1,4 @@
-"""How uncertain predicted markers are because the identified parameters are."""
+"""How uncertain predicted markers are because the identified parameters are, and predictions without a trial."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,19 +13,20 @@ FloatArray = NDArray[np.float64]
 
 
 def parameter_spread(
-    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity]
+    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity], left_out: bool = False
 ) -> FloatArray | None:
     """Returns the variance of predicted markers under the posterior of a model's identified parameters.
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
     of these, so that it grows with the distance from the trials that determine them. In a session without identified
-    trials, the prior of the marker places adds its variance. The ranges of the parameters limit their covariance.
+    trials, the prior of its placement adds its variance. The ranges of the parameters limit their covariance.
 
     Args:
         experiment: the experiment.
         model: with identified parameters.
         names: names of the R trials; those without derivatives have no spread.
         linear: derivatives by trial, from `sensitivities`.
+        left_out: whether the posterior of a trial that was identified from is that without it.
 
     Returns:
         Means (R, T, M) over the coordinates [m^2]; None if the uncertainty of the parameters is not known.
@@ -39,8 +40,9 @@ def parameter_spread(
     spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
     for row, name in enumerate(names):
         if name in linear:
-            deviation = np.array([uncertainty["deviation"][parameter] for parameter in parameters])
-            correlation = np.array(uncertainty["correlation"])
+            posterior = uncertainty.get("left_out", {}).get(name, uncertainty) if left_out else uncertainty
+            deviation = np.array([posterior["deviation"][parameter] for parameter in parameters])
+            correlation = np.array(posterior["correlation"])
             session = experiment.dataset.session(name)
             for at, parameter in enumerate(parameters):
                 of_trial = (own.get(own_name(parameter, owner)) for owner in (name, session))
@@ -51,9 +53,38 @@ def parameter_spread(
             slopes = np.stack([linear[name].by_parameter[parameter] for parameter in parameters])
             moved = np.einsum("eTmc,ei->iTmc", slopes, root)
             spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
-        if "sessions" in placement and experiment.dataset.session(name) not in placement["sessions"]:
-            spread[row] += sum(size**2 for size in placement["prior"])
+            places = linear[name].by_placement
+            if "sessions" in placement and session not in placement["sessions"] and places is not None:
+                moved = places @ np.array(placement["new_session"])
+                spread[row, : len(moved)] += np.nan_to_num(np.square(moved).sum(-1).mean(-1))
     return spread
+
+
+def left_out_changes(
+    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity]
+) -> FloatArray | None:
+    """Returns by what predictions of trials change if a model's parameters are identified without them, to first order.
+
+    Args:
+        experiment: the experiment.
+        model: with identified parameters.
+        names: names of the R trials; those from which nothing was identified do not change.
+        linear: derivatives by trial, from `sensitivities`.
+
+    Returns:
+        (R, T, M, 3) [m]; None if no trial changes.
+    """
+    left_out = (experiment.identification(model).get("uncertainty") or {}).get("left_out", {})
+    changes = np.zeros((len(names), *experiment.dataset.observed.shape[1:]))
+    used = [
+        (row, linear[name], left_out[name]) for row, name in enumerate(names) if name in left_out and name in linear
+    ]
+    for row, slopes, without in used:
+        count = len(slopes.points)
+        changes[row, :count] = sum(slopes.by_parameter[name] * change for name, change in without["change"].items())
+        if without["placement"] is not None and slopes.by_placement is not None:
+            changes[row, :count] += slopes.by_placement @ np.array(without["placement"])
+    return changes if used else None
 
 
 def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ mean of the prior. A trial depends on its own value alone, so that one motion gi
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,11 +22,12 @@ from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from .bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
 from .bounds import Bounds
+from .left_out import LinearSystem, left_out
 from .nuisance import NuisanceFit
 from .parameters import check_names, split_name
 from .placement import Accuracy, DisplacedMarkers, Placed
-from .replay import Replay, Start
-from .uncertainty import Linearised
+from .replay import Replay, Start, exact
+from .uncertainty import Uncertainty, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
@@ -139,6 +141,25 @@ class Misfit(BoundedMisfit):
             unit: the parameters, as fractions of their ranges.
             derivatives: whether to compute derivatives; they are zero otherwise.
         """
+        system = self._system(unit, derivatives)
+        return None if system is None else system.misfit()
+
+    @override
+    def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
+        """Uncertainty of (P,) parameters, with derivatives of exact solutions, and without each of the trials."""
+        accurate = copy(self)
+        accurate.simulator = exact(self.simulator)
+        accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]
+        accurate.forget()
+        system = accurate._system(unit)
+        if system is None:
+            return None
+        linear = system.misfit()
+        whole = uncertainty_of(linear.trials, linear.prior_slopes, self.prior_weight, self.bounds, unit)
+        return replace(whole, left_out=left_out(system, self.bounds, unit))
+
+    def _system(self, unit: FloatArray, derivatives: bool = True) -> LinearSystem | None:
+        """All that is linear at (P,) parameters, see `linearise`."""
         steps = _DIFFERENCE * np.where(unit < 0.5, 1.0, -1.0)
         moves = self._moves if derivatives else []
         moved = np.array([np.isin(np.arange(len(unit)), columns) * steps for columns in moves]).reshape(-1, len(unit))
@@ -152,7 +173,7 @@ class Misfit(BoundedMisfit):
             return None
         self._keep_equilibria(points)
         fitted, nuisances = self._fit(series, self.prior_weight)
-        trials, columns = list[Linearised](), list[FloatArray]()
+        rows, columns, counts = list[FloatArray](), list[FloatArray](), list[list[int]]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
@@ -160,13 +181,11 @@ class Misfit(BoundedMisfit):
             slopes = self._slopes(flat[1:] - flat[:1], moves, steps, observed)  # (R, 3 T M, P)
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
-            seen = observed.observed.shape[-1] * shown.sum(1)
-            trials += zip(weighted[0].reshape(*weighted.shape[1:3], -1), slopes, seen.tolist(), strict=True)
+            rows.append(weighted[0].reshape(*weighted.shape[1:3], -1))
+            counts.append((observed.observed.shape[-1] * shown.sum(1)).tolist())
             columns.append(slopes)
-        jacobians, nuisance_slopes = nuisances.projected(columns, math.sqrt(self.prior_weight))
-        trials = [(rows, own, seen) for (rows, _, seen), own in zip(trials, jacobians, strict=True)]
-        prior, slopes = self.prior_rows(unit)
-        return LinearMisfit(trials, np.concatenate([prior, nuisances.rows]), np.concatenate([slopes, nuisance_slopes]))
+        groups = [replay.trials for replay, _ in self._replays]
+        return LinearSystem(groups, rows, columns, counts, nuisances, self.prior_rows(unit), self.prior_weight)
 
     def _slopes(
         self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials

@@ -57,6 +57,17 @@ class Nuisances:
         follows = np.linalg.solve(rows.T @ rows + weight**2 * np.eye(rows.shape[1]), rows.T @ slopes)
         return [own for a, j in pairs for own in j - a @ follows], -weight * follows
 
+    def change(self, residuals: Sequence[FloatArray], weight: float) -> FloatArray:
+        """(K,) change of places and delays, in standard deviations, by which residuals have their least squares.
+
+        Args:
+            residuals: (R, D) of each group, to first order with the places and delays as they are.
+            weight: root of the weight of the prior.
+        """
+        columns = np.concatenate([own.reshape(-1, own.shape[-1]) for own in self.columns])
+        right = columns.T @ np.concatenate([own.ravel() for own in residuals]) + weight * self.rows
+        return np.asarray(-np.linalg.solve(columns.T @ columns + weight**2 * np.eye(len(right)), right))
+
 
 class NuisanceFit:
     """Fits places and delays to simulated points.

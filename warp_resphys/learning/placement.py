@@ -10,6 +10,7 @@ values with the least sum of squares, prior included (variable projection, Golub
 (1973) 413).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -68,6 +69,22 @@ class Accuracy:
             directions[rows, 3 * first + 3 : 3 * first + 6] = (self.mounting or 0.0) * turned.flatten(0, 1)
             kept[3 * first + 6 : 3 * first + 12] = False
         return directions[:, kept.to(like.device)]
+
+    def of_new_session(self, like: torch.Tensor, sessions: int) -> torch.Tensor:
+        """Standard deviations of a new session's placement from the common one of n sessions.
+
+        The session's own deviation has the variance b^2 s^2, with b of `between_sessions` and s of all. That of the
+        common placement, of which every exactly known session is one draw, is s^2 / (1 + n / b^2).
+
+        Args:
+            like: (..., M, 3) like the markers.
+            sessions: n, of which the placements were identified.
+
+        Returns:
+            (3 M + 6, K), as `directions`.
+        """
+        variance = self.between_sessions**2 + 1.0 / (1.0 + sessions / self.between_sessions**2)
+        return math.sqrt(variance) * self.directions(like)
 
 
 @dataclass(frozen=True)
@@ -184,13 +201,24 @@ class Placed:
         sessions: placement of each session.
         deviations: (K,) the common placement and what those of the sessions differ from it by, in standard deviations;
             the former alone for one session.
+        directions: (3 M + 6, k) offsets, shift and turn by a standard deviation of the common placement.
+        between: those of a session's deviation from it, over these.
         columns: (R, T, M, 3, K) derivatives of the weighted residuals by these, by group of trials.
     """
 
     common: Placement
     sessions: dict[str, Placement]
     deviations: torch.Tensor
+    directions: torch.Tensor
+    between: float
     columns: list[torch.Tensor]
+
+    def change(self, session: str, deviations: torch.Tensor) -> torch.Tensor:
+        """(3 M + 6,) change of the offsets, the shift and the turn of a session by changes (K,) of `deviations`."""
+        moved, *own = deviations.split(self.directions.shape[1])
+        if own:
+            moved = moved + self.between * own[[*self.sessions].index(session)]
+        return self.directions @ moved
 
     def plain(self, labels: Sequence[str]) -> dict[str, Any]:
         """Returns the placements as JSON data: the common one, and those of the named `sessions`."""
@@ -263,7 +291,8 @@ def estimate_placement(
             right = right - jacobian.T @ (residual.flatten() - jacobian @ solution)
         solution = torch.linalg.solve(normal, right)
     placements = at(solution)
-    return Placed(placement(solution[:size]), placements, solution, [c for _, c in columns(placements)])
+    own_columns = [c for _, c in columns(placements)]
+    return Placed(placement(solution[:size]), placements, solution, common, accuracy.between_sessions, own_columns)
 
 
 def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ are as large as its residuals and as correlated in time, up to the first zero of
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import takewhile
 
 import numpy as np
@@ -21,6 +21,16 @@ Linearised = tuple[FloatArray, FloatArray, float]
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """What the identification would have been without a trial, to first order."""
+
+    change: dict[str, float]  # of the parameters, in their units
+    placement: list[float] | None  # (3 M + 6,) change of the trial's marker offsets [m], shift [m] and turn [rad]
+    deviation: dict[str, float]  # see `Uncertainty`
+    correlation: list[list[float]]
+
+
+@dataclass(frozen=True)
 class Uncertainty:
     """Uncertainty of the parameters near the minimum (Gauss-Newton approximation)."""
 
@@ -30,6 +40,7 @@ class Uncertainty:
     poorest: dict[str, float]
     poorest_deviation: float  # standard deviation along it, as a fraction of the ranges
     ranges: dict[str, float]  # derivative of each parameter by its fraction of its range, in its unit
+    left_out: dict[str, LeftOut] = field(default_factory=dict)  # by trial; empty with less than two
 
 
 def uncertainty_of(

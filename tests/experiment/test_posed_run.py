@@ -188,14 +188,15 @@ def test_a_law_is_identified_from_poses(poses, tmp_path):
 
 
 def test_refinement_knows_no_sessions():
-    session = "+data.trials.m1_u01.session=monday"
     with pytest.raises(InputError, match=r"refinement knows one placement .* set refinement=none"):
-        check(composed("experiment=tentacle", "data.folder=recordings", session, "refinement=solver_in_the_loop"))
+        check(composed("experiment=tentacle", "data.folder=recordings", "refinement=solver_in_the_loop"))
     with pytest.raises(InputError, match=r"per is session, but no trial names one: set data\.trials\.NAME\.session"):
         check(
             composed(
                 "experiment=tentacle",
                 "data.folder=recordings",
+                "data.trials=null",
+                "+data.trials={one: {file: one.csv, inputs: [1.0, 0.0]}, other: {file: other.csv, inputs: [0.0, 1.0]}}",
                 "+identify.parameters.tendon_tension_factor={lower: 0.8, upper: 1.2, per: session, "
                 "prior: {mean: 1.0, deviation: 0.1}}",
             )

@@ -391,3 +391,66 @@ def test_a_value_of_a_trial_needs_a_common_one():
     expected = replay.trials.inputs.attached_mass.clone()
     expected[1] *= 1.5
     torch.testing.assert_close(inputs.attached_mass, expected)
+
+
+def test_a_trial_is_left_out_as_if_the_others_were_identified():
+    """The others are identified with the same priors, whose weights a search would compute again."""
+    replay, start = posed(bind(), noise=2e-4)
+    count = len(replay.trials.names)
+
+    def best(rows, weight):
+        pair = Replay(SIM, bind(), replay.trials.select(rows)), start.select(rows)
+        misfit = Misfit([pair], RANGES, accuracy=ACCURACY, centre=CENTRE.tolist())
+        misfit.prior_weight, unit = weight, misfit.to_unit(TRUTH)
+        for _ in range(5):
+            linear = misfit.linearise(unit)
+            unit = unit - np.linalg.solve(linear.gauss_newton, linear.gradient)
+        placed = misfit.placed(unit).common
+        return misfit, unit, np.concatenate([placed.offsets.ravel(), placed.shift, placed.turn])
+
+    whole, unit, placement = best([*range(count)], 1e-5)
+    left_out = whole.uncertainty(unit).left_out
+    assert [*left_out] == [*replay.trials.names]
+    changes, expected, moved, moves = [], [], [], []
+    for row, name in enumerate(left_out):  # Every trial has its share of the loss, so that fewer weigh more.
+        misfit, other, places = best([k for k in range(count) if k != row], 1e-5 * count / (count - 1))
+        changes.append(left_out[name].change["youngs_modulus"])
+        expected.append(misfit.from_unit(other)["youngs_modulus"] - whole.from_unit(unit)["youngs_modulus"])
+        moved.append(left_out[name].placement)
+        moves.append(places - placement)
+        assert left_out[name].deviation["youngs_modulus"] == pytest.approx(
+            misfit.uncertainty(other).deviation["youngs_modulus"], rel=0.3
+        )  # The others fit better without the one that is left out.
+    assert np.linalg.norm(np.subtract(changes, expected)) < 0.05 * np.linalg.norm(expected)
+    assert np.linalg.norm(np.subtract(moved, moves)) < 0.05 * np.linalg.norm(moves)
+
+
+def test_one_trial_cannot_be_left_out():
+    replay, start = posed(bind(), noise=2e-4)
+    single = Replay(SIM, bind(), replay.trials.select([1])), start.select([1])
+    assert identifier(single).run([TRUTH], 5).uncertainty.left_out == {}
+
+
+def test_uncertainty_does_not_depend_on_the_tolerance_of_the_solver():
+    """A density that changes by 1e-5 of its range moves no solution of a loose tolerance."""
+    ranges = {**RANGES, "density": Bounds(1e3, 2e3, prior=Prior(1.3e3, 150.0))}
+    replay, start = posed(bind(), noise=2e-4)
+    deviations = []
+    for tolerance in (1e-4, 1e-12):
+        simulator = replace(SIM, solver=replace(SIM.settings, relative_tolerance=tolerance))
+        misfit = Misfit([(Replay(simulator, bind(), replay.trials), start)], ranges)
+        unit = misfit.to_unit({"youngs_modulus": 215e3, "density": 1070.0})
+        misfit.prior_weight = 1e-4
+        deviations.append([*misfit.uncertainty(unit).deviation.values()])
+    np.testing.assert_allclose(*deviations, rtol=1e-3)
+
+
+@pytest.mark.parametrize("known", [1, 3])
+def test_a_new_session_has_the_variance_of_the_joint_prior(known):
+    """Placements are c + d_k of every session, with normal c and d_k; those of some sessions are known."""
+    accuracy = Accuracy(2e-3, 1e-3, 0.1, between_sessions=0.4)
+    joint = np.ones((known + 1, known + 1)) + accuracy.between_sessions**2 * np.eye(known + 1)
+    inside, across = joint[:-1, :-1], joint[:-1, -1]
+    expected = np.sqrt(joint[-1, -1] - across @ np.linalg.solve(inside, across))
+    scale = accuracy.deviations(torch.zeros(4, 3).double())
+    np.testing.assert_allclose(accuracy.of_new_session(4, known), expected * scale, rtol=1e-12)

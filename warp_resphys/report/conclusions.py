@@ -33,7 +33,7 @@ INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
 _CALIBRATED: Final[Mapping[str, str]] = {  # Source of prediction intervals.
     "validation": "its errors on the validation trials",
     "training": "its errors on the training trials, which tend to be too small",
-    "left_out": "its errors on the training trials, with parameters as identified without each of them",
+    "left_out": "its errors on the training trials, with the parameters identified without each of them",
     "folds": "the errors of the other folds",
 }
 

@@ -302,3 +302,23 @@ def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path
     write(Path("recordings"), poses)
     with pytest.raises(InputError, match=said):
         check(composed(*TINY, *TRIALS, *overrides))
+
+
+def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(poses, tmp_path):
+    """Without validation poses, and with markers that may sit 3.4 mm elsewhere in the session of the test pose."""
+    write(tmp_path / "recordings", poses)
+    sessions = dict.fromkeys(POSES, "monday") | {"both": "friday"}
+    table = ",".join(
+        f"{name}: {{file: {name}.csv, session: {sessions[name]}, inputs: {list(POSES[name])}}}" for name in POSES
+    )
+    training = ["data.train=[weak,strong,second,other]", "data.validation=[]", "in_the_loop.hold_out=false"]
+    quick = ["mesh_check=null", "in_the_loop.epochs=1", "trainer.epochs=1"]
+    folder = run_without_report(tmp_path, *TINY, "data.trials=null", f"+data.trials={{{table}}}", *training, *quick)
+    intervals = json.loads((folder / "errors.json").read_text())["intervals"]
+    assert intervals["calibrated_on"] == "left_out"
+    found = json.loads((folder / "identification.json").read_text())["sysid"]
+    assert [*found["uncertainty"]["left_out"]] == ["weak", "strong", "second", "other"]
+    assert found["placement"]["new_session"][0] == pytest.approx(0.005 * np.sqrt(0.25 + 1.0 / 5.0))
+    own = intervals["models"]["sysid"]
+    assert own["coverage"] == 1.0  # The markers have not moved.
+    assert own["half_width_mm"] > 1e3 * found["placement"]["new_session"][0]

@@ -102,7 +102,7 @@ def left_out(system: LinearSystem, bounds: Mapping[str, Bounds], unit: FloatArra
         kept = linear.trials[:number] + linear.trials[number + 1 :]
         variance = sum(float(np.square(rows).sum()) for rows, _, _ in kept) / sum(seen for _, _, seen in kept)
         curvature = 0.5 * linear.gauss_newton + _UNIFORM * variance * np.eye(len(unit))
-        step: FloatArray = -0.5 * np.linalg.lstsq(curvature, linear.gradient)[0]
+        step = np.asarray(-0.5 * np.linalg.lstsq(curvature, linear.gradient)[0], dtype=np.float64)
         uncertainty = uncertainty_of(kept, linear.prior_slopes, system.weight, bounds, unit)
         result[trials.names[row]] = LeftOut(
             change=dict(zip(bounds, (slopes * step).tolist(), strict=True)),

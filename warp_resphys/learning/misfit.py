@@ -146,12 +146,12 @@ class Misfit(BoundedMisfit):
 
     @override
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
-        """Uncertainty of (P,) parameters, with derivatives of exact solutions, and without each of the trials."""
+        """Uncertainty of (P,) parameters, with derivatives of exact solutions if these converge; see `left_out`."""
         accurate = copy(self)
         accurate.simulator = exact(self.simulator)
         accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]
         accurate.forget()
-        system = accurate._system(unit)
+        system = accurate._system(unit) or self._system(unit)
         if system is None:
             return None
         linear = system.misfit()

@@ -318,7 +318,7 @@ def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(p
     assert intervals["calibrated_on"] == "left_out"
     found = json.loads((folder / "identification.json").read_text())["sysid"]
     assert [*found["uncertainty"]["left_out"]] == ["weak", "strong", "second", "other"]
-    assert found["placement"]["new_session"][0] == pytest.approx(0.005 * np.sqrt(0.25 + 1.0 / 5.0))
+    assert found["placement"]["new_session"][0][0] == pytest.approx(0.005 * np.sqrt(0.25 + 1.0 / 5.0))
     own = intervals["models"]["sysid"]
     assert own["coverage"] == 1.0  # The markers have not moved.
-    assert own["half_width_mm"] > 1e3 * found["placement"]["new_session"][0]
+    assert own["half_width_mm"] > 1e3 * found["placement"]["new_session"][0][0]

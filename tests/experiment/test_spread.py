@@ -24,7 +24,7 @@ IDENTIFIED = {
         "correlation": [[1.0, 0.5], [0.5, 1.0]],
         "left_out": {"a": WITHOUT},
     },
-    "placement": {"sessions": {"monday": {}}, "new_session": NEW_SESSION.tolist()},
+    "placement": {"sessions": {"monday": {}}, "new_session": np.diag(NEW_SESSION).tolist()},
 }
 EXPERIMENT = SimpleNamespace(
     dataset=SimpleNamespace(observed=np.zeros((2, 1, MARKERS, 3)), session={"a": "monday", "b": "friday"}.get),

@@ -452,5 +452,5 @@ def test_a_new_session_has_the_variance_of_the_joint_prior(known):
     joint = np.ones((known + 1, known + 1)) + accuracy.between_sessions**2 * np.eye(known + 1)
     inside, across = joint[:-1, :-1], joint[:-1, -1]
     expected = np.sqrt(joint[-1, -1] - across @ np.linalg.solve(inside, across))
-    scale = accuracy.deviations(torch.zeros(4, 3).double())
-    np.testing.assert_allclose(accuracy.of_new_session(4, known), expected * scale, rtol=1e-12)
+    like = torch.zeros(4, 3).double()
+    np.testing.assert_allclose(accuracy.of_new_session(like, known), expected * accuracy.directions(like), rtol=1e-12)

@@ -46,7 +46,7 @@ class LinearSystem:
     groups: Sequence[Trials]
     rows: list[FloatArray]
     slopes: list[FloatArray]
-    seen: list[list[int]]
+    seen: list[list[float]]
     nuisances: Nuisances
     prior: tuple[FloatArray, FloatArray]
     weight: float

@@ -15,7 +15,7 @@ from warp_resphys.robot.twin.stream import Packet
 from warp_resphys.studies.live_twin import LiveTwin, TwinSettings, planned_packets
 from warp_resphys.studies.view import Page, _summary
 
-SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False)
+SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False, engine="full")
 
 
 @pytest.fixture

@@ -173,7 +173,7 @@ class Misfit(BoundedMisfit):
             return None
         self._keep_equilibria(points)
         fitted, nuisances = self._fit(series, self.prior_weight)
-        rows, columns, counts = list[FloatArray](), list[FloatArray](), list[list[int]]()
+        rows, columns, counts = list[FloatArray](), list[FloatArray](), list[list[float]]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -14,7 +15,8 @@ from support.configured import check, composed
 from support.main_job import IN_RUN, run, run_without_report
 from support.sentences import offending
 from warp_resphys import pipeline
-from warp_resphys.control import reduction
+from warp_resphys.control import reduced_twin as reduced_twin_module
+from warp_resphys.control import reduction, sampling
 from warp_resphys.control.controllers import LinearRecedingHorizon, OpenLoop, RecedingHorizon
 from warp_resphys.control.estimate import Estimator, Noise
 from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
@@ -22,7 +24,7 @@ from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Horizon, Limits, Planner
 from warp_resphys.control.polynomials import SquaredPolynomial
-from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_twin
+from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_of, reduced_twin
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
 from warp_resphys.control.sampling import Sampling, check_plannable
@@ -200,6 +202,17 @@ class TestReducedModel:
         with pytest.raises(InputError, match="midpoint"):
             replace(model, integrator="midpoint")
 
+    def test_friction_and_a_medium_are_refused(self, robot, monkeypatch):
+        sampling.check_reducible(robot)
+        monkeypatch.setattr(sampling, "_OF_MEDIUM", ("density",))
+        with pytest.raises(InputError, match="density is no stiffness"):
+            sampling.check_reducible(robot)
+        monkeypatch.setattr(sampling, "_OF_MEDIUM", ())
+        body = robot.simulator.body
+        monkeypatch.setitem(vars(body), "energies", [*body.energies, SimpleNamespace(memory=("slide",))])
+        with pytest.raises(InputError, match="with memory"):
+            sampling.check_reducible(robot)
+
     def test_a_data_driven_robot_is_refused(self, folder):
         with pytest.raises(InputError, match="no stiffness"):
             reduce(warp_resphys.load(folder, "simfree"), Sampling())
@@ -213,6 +226,16 @@ class TestReducedModel:
         task = Task(far, robot.labels, robot.time_step, 3)
         with pytest.raises(InputError, match=r"path circle: .*-350.0\) mm is .* mm away"):
             task.check_reach(model, 1e-3)
+
+
+class Failing:
+    """Cannot write a file."""
+
+    called = False
+
+    def __call__(self, path, model):
+        self.called = True
+        raise DataFileError("cannot write")
 
 
 class TestReducedTwin:
@@ -248,8 +271,12 @@ class TestReducedTwin:
         assert off.predictions == 40
         assert off.twin < 0.3 * off.held
         assert off.twin < 0.5 * off.simulator
-        seen = corrected.observe(now.state)[0].numpy()
+        seen, last = corrected.observe(now.state)[0].numpy(), len(swing) * corrected.time_step
         assert np.abs(seen - now.markers).max() < 1e-3
+        stepped = corrected.observe(corrected.step(now.state, tendon_tension=self.commands))[0].numpy()
+        twin.take(last, tendon_tension=self.commands)
+        moved = np.abs(twin.now.markers - now.markers).max()
+        assert np.abs(stepped - seen - (twin.now.markers - now.markers)).max() < 0.6 * moved
 
     def test_packets_that_come_late_change_nothing(self, corrected, swing):
         both = [self.twin(corrected) for _ in range(2)]
@@ -264,11 +291,44 @@ class TestReducedTwin:
     def test_other_inputs_are_refused(self, corrected, swing):
         twin = self.twin(corrected)
         with pytest.raises(InputError, match="no input but tendon_tension, and base is given"):
-            twin.take(0.0, swing[0], base=[1e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
-        twin.take(0.0, swing[0], base=np.zeros(6))
-        twin.take(0.05, swing[5], base=[1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
-        twin.take(0.10, swing[10])
-        assert [count for why, count in twin.counts.items() if "and base is given" in why] == [1]
+            twin.take(0.0, swing[0], base=[1e-3, 0.0, 0.0, 0.0, 0.0, 0.0], tendon_tension=self.commands)
+        assert not twin.has_begun
+        twin.take(0.0, swing[0], base=np.zeros(6), tendon_tension=self.commands)
+        assert twin.counts == {}
+
+    def test_commands_beyond_those_of_the_trials_are_held_and_counted(self, corrected, swing):
+        largest = np.array(corrected.inputs["tendon_tension"].high)
+        both = [self.twin(corrected) for _ in range(2)]
+        for twin, factor in zip(both, (1.0, 50.0), strict=True):
+            twin.take(0.0, swing[0], tendon_tension=factor * largest)
+            twin.take(0.2)
+        np.testing.assert_array_equal(both[0].now.markers, both[1].now.markers)
+        assert both[1].counts == {"tendon_tension beyond that of the trials, and held at their limit": 1}
+
+    def test_a_model_that_diverges_is_counted(self, corrected, swing):
+        twin = self.twin(corrected)
+        twin.take(0.0, swing[0])
+        belief = twin._belief_at(twin._update())
+        state = replace(belief.state, z=belief.state.z + 1e3)
+        with pytest.raises(ConvergenceError, match="diverged"):
+            twin.estimator.advance(replace(belief, state=state), {})
+
+    def test_it_is_of_the_robot_as_it_is(self, folder, corrected, monkeypatch, caplog):
+        """A robot with other parameters has a model of its own, which does not replace that of the run."""
+        few = Sampling((4,), equilibria=16, tangents=8, motions=2, seconds=0.4)
+        monkeypatch.setattr(reduced_twin_module, "Sampling", lambda: few)
+        file, known = folder / reduced_file("resphys"), reduced_of(corrected)
+        before = file.read_bytes()
+        softer = corrected.with_parameters(youngs_modulus=0.5 * corrected.parameters["youngs_modulus"])
+        still = np.zeros((1, 3))
+        assert reduced_of(softer).stiffness(still)[0, 0, 0] < 0.8 * known.stiffness(still)[0, 0, 0]
+        assert file.read_bytes() == before
+        assert "mm off in motions of" in caplog.text
+        monkeypatch.setattr(reduced_twin_module, "fingerprint", lambda robot: "another")
+        monkeypatch.setattr(reduced_twin_module, "write_reduced", fails := Failing())
+        assert reduced_of(corrected).modes == 4
+        assert fails.called
+        assert "not kept" in caplog.text
 
     def test_it_is_a_setting(self, folder):
         settings = TwinSettings(

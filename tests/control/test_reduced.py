@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, powers
+from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, best_order, powers
 from warp_resphys.control.reduced import ReducedModel
 from warp_resphys.control.reduced_force import ReducedForce
 from warp_resphys.learning.networks import build_model
@@ -56,6 +56,7 @@ def model(request):
         ("a", "b"),
         "pressure",
         np.full(PARTS, 5.0),
+        np.array([[0.0], [5.0]]) * np.ones(PARTS),
         acts,
         FILTERS,
         times,
@@ -138,6 +139,27 @@ def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(mod
             return float(weights @ np.concatenate([state.z[0], state.v[0]]))
 
         assert_slope(after, weights @ slope @ way[number, 0])
+
+
+def test_a_command_that_never_varies_changes_nothing(model):
+    random = np.random.default_rng(8)
+    more = replace(model, scale=np.full(PARTS + 1, 5.0), range=np.array([[0.0, 0.7, 0.0], [5.0, 0.7, 5.0]]))
+    inputs, basis = 5.0 * random.random((6, PARTS)), random.standard_normal((6, PARTS, 2))
+    whole = np.insert(inputs, 1, 0.7, axis=1)
+    one = model.respond(model.rest(inputs[0]), inputs, basis)
+    other = more.respond(more.rest(whole[0]), whole, np.insert(basis, 1, 3.0, axis=1))
+    np.testing.assert_allclose(other.y, one.y, atol=1e-12)
+    np.testing.assert_allclose(other.slopes, one.slopes, atol=1e-12)
+    slopes = more.rest_observed(whole[0])[1]
+    np.testing.assert_allclose(slopes, np.insert(model.rest_observed(inputs[0])[1], 1, 0.0, axis=1), atol=1e-9)
+
+
+@pytest.mark.parametrize(("true", "least", "best"), [(5, 3, 5), (2, 3, 3)])
+def test_the_order_is_the_one_that_predicts_other_samples(true, least, best):
+    random = np.random.default_rng(9)
+    points, coefficients = random.uniform(-1.0, 1.0, (200, 2)), random.standard_normal((len(powers(2, true)), 4))
+    values = Polynomial(coefficients, true)(points) + 1e-3 * random.standard_normal((200, 4))
+    assert best_order(points, values, least) == best
 
 
 def test_a_branch_relaxes_as_a_maxwell_element(model):

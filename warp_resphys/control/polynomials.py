@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from .world import FloatArray
 
 _SHARE_OF_POINTS: Final = 0.5  # largest number of coefficients, relative to the number of samples
+_HELD_OUT: Final = 5  # one of so many samples, for the choice of the order
+_MOST: Final = 8  # order
 _RIDGE: Final = 1e-9  # relative to the mean square of the features
 
 
@@ -65,6 +67,24 @@ class Polynomial:
         if self._sloped is None:
             self._sloped = (derivatives(n, self.order) @ self._flat).swapaxes(0, 1).reshape(len(self._flat), -1)
         return np.asarray((at.values(self.order) @ self._sloped).reshape(len(at.points), n, *self._shape))
+
+
+def best_order(points: FloatArray, values: FloatArray, least: int) -> int:
+    """Returns the order of a polynomial, from ``least`` on, whose fit to most samples is best on the others.
+
+    Args:
+        points: (S, n).
+        values: (S, ...).
+        least: that is taken where samples are too few to tell.
+    """
+    held = np.arange(len(points)) % _HELD_OUT == _HELD_OUT - 1
+    errors, count = dict[int, float](), np.count_nonzero(~held)
+    for order in range(least, _MOST + 1):
+        if len(powers(points.shape[1], order)) > _SHARE_OF_POINTS * count:
+            break
+        fitted = Polynomial.fitted(points[~held], values[~held], order)
+        errors[order] = float(np.square(fitted(points[held]) - values[held]).sum())
+    return min(errors, key=lambda order: errors[order], default=least)
 
 
 class SquaredPolynomial(Polynomial):
@@ -123,13 +143,13 @@ def _products(variables: int, order: int) -> tuple[list[int], list[int]]:
     return factors, [place[tuple(row)] for row in lower.tolist()]
 
 
-def solve_ridge(features: FloatArray, values: FloatArray, alike: bool = False) -> FloatArray:
+def solve_ridge(features: FloatArray, values: FloatArray, common_scale: bool = False) -> FloatArray:
     """Solves least squares of values (S, V) on features (S, F), which may be collinear; returns (F, V).
 
-    Features that are alike have one unit and size, so that those that hardly occur have no part in the solution.
+    With a common scale, all features are scaled by the largest, so that rarely excited ones are regularised away.
     """
     scale = np.sqrt(np.mean(features**2, axis=0))
-    scale = np.full_like(scale, scale.max()) if alike else scale
+    scale = np.full_like(scale, scale.max()) if common_scale else scale
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = features / scale
     normal = scaled.T @ scaled / len(features) + _RIDGE * np.eye(features.shape[1])

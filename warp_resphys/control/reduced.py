@@ -8,7 +8,7 @@ with u the inputs after their response to the commands, y_k what has not relaxed
 outputs of the learned force's network, evaluated on the body that z and z' describe (hyper-reduction: no degree of
 freedom of the full model is left). z_0(u) is the equilibrium under u and a force of fixed outputs c_0(u), affine in u:
 a fit of the network's outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T
-the orthogonal matrix next to Psi^T M Phi,
+the orthogonal matrix closest to Psi^T M Phi,
 
     A = T (omega^2 - Phi^T dF/dx Phi) T^T,   D = T Phi^T V Phi T^T,   B_k = T Phi^T V_k Phi T^T,   G = T Phi^T dF/dc,
 
@@ -44,14 +44,17 @@ from ..io.errors import ConvergenceError, InputError
 from .plan import Response
 from .polynomials import Monomials, Polynomial, SquaredPolynomial
 from .reduced_force import ForceAlong, ReducedForce
+from .sampling import check_integrator
 from .world import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
 
 _REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50
 _HALVINGS: Final = 8
 _POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown", "branches", "shape")
 _FORCE_POLYNOMIALS: Final = ("places", "seen", "usual", "push")
-_PLAIN: Final = ("time_step", "integrator", "labels", "name", "acts", "filters", "times", "quality")
+_PLAIN: Final = ("time_step", "integrator", "labels", "name", "acts", "filters", "times", "quality", "robot")
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class ReducedState:
         z: (B, r) coordinates.
         v: (B, r) their rates [1/s].
         strains: (K, B, r) y_k of the Prony branches.
-        acting: (B, n) inputs after their response to the commands, in units of the model's scale.
+        acting: (B, n') moving inputs after their response to the commands, in units of the model's scale.
         memory: of the inputs' response, entries (..., B, n).
         previous: (2, B, r) coordinates and rates one step earlier.
         looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
@@ -109,6 +112,7 @@ class ReducedModel:
         labels: of the M observed points.
         name: of the input.
         scale: (n,) of the inputs.
+        range: (2, n) least and largest commands of the trials; the model depends on the n' that differ.
         acts: arguments of `InputResponse`, from the commands to the inputs.
         filters: F time constants of the filtered inputs that the network takes [s].
         times: K relaxation times tau_k of the Prony branches [s].
@@ -123,6 +127,7 @@ class ReducedModel:
         curved: H, (r, r, 3 M), symmetric [m].
         force: the learned force; None for a simulator alone.
         quality: errors, and counts of the samples that the model was fitted to.
+        robot: `reduction.fingerprint` of its robot.
 
     Raises:
         InputError: an integrator that cannot be reduced.
@@ -133,6 +138,7 @@ class ReducedModel:
     labels: tuple[str, ...]
     name: str
     scale: FloatArray
+    range: FloatArray
     acts: Mapping[str, Any]
     filters: tuple[float, ...]
     times: tuple[float, ...]
@@ -147,13 +153,10 @@ class ReducedModel:
     curved: FloatArray
     force: ReducedForce | None = None
     quality: Mapping[str, Any] = field(default_factory=dict)
+    robot: str = ""
 
     def __post_init__(self) -> None:
-        if self.integrator not in ("implicit_euler", "bdf2"):
-            raise InputError(
-                f"a robot that is stepped by {self.integrator} cannot be reduced: set identify.integrator to "
-                "implicit_euler or bdf2."
-            )
+        check_integrator(self.integrator)
 
     @property
     def modes(self) -> int:
@@ -164,6 +167,15 @@ class ReducedModel:
     def parts(self) -> int:
         """The number n of inputs."""
         return len(self.scale)
+
+    @cached_property
+    def moving(self) -> IntArray:
+        """Numbers (n',) of the inputs that the model depends on."""
+        return np.flatnonzero(self.range[1] > self.range[0])
+
+    def _moving(self, acting: FloatArray) -> FloatArray:
+        """Moving inputs (..., n') of inputs (..., n), in units of the scale."""
+        return np.asarray((acting / self.scale)[..., self.moving])
 
     @cached_property
     def response(self) -> InputResponse:
@@ -183,7 +195,7 @@ class ReducedModel:
             ConvergenceError: there is no equilibrium, because the learned force is too large.
         """
         commands = np.zeros((count, self.parts)) if inputs is None else np.tile(inputs, (count, 1))
-        u = self.response.scaled(commands) / self.scale
+        u = self._moving(self.response.scaled(commands))
         z = np.repeat(self._equilibrium(Monomials(u[:1]))[0], count, axis=0)
         still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
         memory, begins = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
@@ -224,7 +236,7 @@ class ReducedModel:
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        u = Monomials((self.response.scaled(inputs) / self.scale)[None])
+        u = Monomials(self._moving(self.response.scaled(inputs))[None])
         z, force = self._equilibrium(u)
         a, slope = self.stiffness(u)[0], self.static.slopes(u)[0].T
         by_u = a @ slope - np.einsum("nrs,s->rn", self.stiffness.slopes(u)[0], (z - self.static(u))[0])
@@ -234,8 +246,9 @@ class ReducedModel:
             by_state, more, by_means = (slopes[0] for slopes in force.slopes())
             a, by_u = a - by_state[:, : self.modes], by_u + more + by_means.sum(1)
         by_z, direct = (slopes[0] for slopes in self.point_slopes(z, u))
-        by_commands = self.acts.get("factor", 1.0) / self.scale
-        return self.points(z, u)[0], (direct + by_z @ np.linalg.solve(a, by_u)) * by_commands
+        by_commands = np.zeros((len(by_z), self.parts))
+        by_commands[:, self.moving] = direct + by_z @ np.linalg.solve(a, by_u)
+        return self.points(z, u)[0], by_commands * self.acts.get("factor", 1.0) / self.scale
 
     def observe(self, state: ReducedState) -> FloatArray:
         """Observed points (B, 3 M) in a state [m]."""
@@ -271,7 +284,7 @@ class ReducedModel:
             bias: (r,) or (B, r), added to the equilibria z_0; (B, r) for T = 1.
         """
         acting, means, memory = self.response(start.memory, inputs)
-        acting, means = acting / self.scale, means / self.scale
+        acting, means = self._moving(acting), self._moving(means)
         steps, batch, n = acting.shape
         u, r, h = Monomials(acting.reshape(-1, n)), self.modes, self.time_step
         back = np.repeat(start.looks_back[None] & (self.integrator == "bdf2"), steps, axis=0)
@@ -332,10 +345,10 @@ class ReducedModel:
     def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         """Returns arrays and plain data for `restored`, without the network."""
         polynomials = {name: getattr(self, name) for name in _POLYNOMIALS}
-        arrays = {"scale": self.scale, "curved": self.curved, "basis": self.basis}
+        arrays = {"scale": self.scale, "range": self.range, "curved": self.curved, "basis": self.basis}
         if self.force is not None:
             polynomials |= {name: getattr(self.force, name) for name in _FORCE_POLYNOMIALS}
-            arrays |= {"told": self.force.conditions, "told_by": self.force.conditions_by}
+            arrays |= {"conditions": self.force.conditions, "conditions_by": self.force.conditions_by}
         plain = {key: getattr(self, key) for key in _PLAIN}
         plain["orders"] = {name: polynomial.order for name, polynomial in polynomials.items()}
         return arrays | {name: polynomial.coefficients for name, polynomial in polynomials.items()}, plain
@@ -364,9 +377,9 @@ class ReducedModel:
         if polynomials and learned is None:
             raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
         if polynomials and learned is not None:
-            conditions: dict[str, Any] = {"conditions": arrays["told"], "conditions_by": arrays["told_by"]}
+            conditions: dict[str, Any] = {name: arrays[name] for name in ("conditions", "conditions_by")}
             force = ReducedForce(learned.network, learned.range_, **conditions | polynomials)
-        own |= {name: arrays[name] for name in ("scale", "curved", "basis")}
+        own |= {name: arrays[name] for name in ("scale", "range", "curved", "basis")}
         return cls(**own, force=force)
 
 
@@ -417,6 +430,11 @@ class ReducedMotion:
         return np.concatenate([self.inverse, self.inverse / self.step[..., None]], axis=1)
 
     @property
+    def left(self) -> BoolArray:
+        """(S,) whether the learned force was evaluated outside its training range."""
+        return np.zeros(len(self.z), dtype=np.bool_) if self.force is None else self.force.left
+
+    @property
     def by_bias(self) -> FloatArray:
         """Derivatives (S, 2 r, r) of the state after a step with respect to the bias in it."""
         return self.impulse @ self.model.stiffness(self.u)
@@ -453,7 +471,9 @@ class ReducedMotion:
     def slopes(self, basis: FloatArray) -> FloatArray:
         """Derivatives (T, 3 M, P) of `y` of one model by parameters, from those of the commands (T, n, P)."""
         model, u = self.model, self.u
-        by_parameters, by_means = (x / model.scale[:, None] for x in model.response.from_rest(basis))
+        by_parameters, by_means = (
+            (x / model.scale[:, None])[..., model.moving, :] for x in model.response.from_rest(basis)
+        )
         base = model.static(u)
         off = self.z - (base if self.bias is None else base + self.bias)
         by_u = model.stiffness(u) @ model.static.slopes(u).swapaxes(1, 2)

@@ -169,6 +169,15 @@ class ForceAlong:
         self._outputs.append(outputs)
         return np.asarray((self._push[rows] @ (outputs - self._usual[rows])[..., None])[..., 0])
 
+    @property
+    def left(self) -> NDArray[np.bool_]:
+        """(S,) whether the network was evaluated outside its training range."""
+        inputs, range_ = np.concatenate(self._inputs), self._force.range_
+        if range_ is None:
+            return np.zeros(len(inputs), dtype=np.bool_)
+        low, high = (edge.numpy(force=True) for edge in range_.edges)
+        return np.asarray(((inputs < low) | (inputs > high)).any(1))
+
     def last_slope(self) -> FloatArray:
         """Derivative (r, r) of the last force with respect to the coordinates, for S = 1."""
         slopes = self._force.output_slopes(self._inputs[-1], self._push)[0]

@@ -1,47 +1,64 @@
 """The state of a robot, estimated from its markers on its reduced model: a twin of a few milliseconds a frame."""
 
+import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from typing_extensions import override
 
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError, DataFileError, InputError
 from ..io.progress import Progress
+from ..learning.rollout import DIVERGENCE_DISTANCE
 from ..robot.inputs import Given, InputReader
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..robot.twin.estimator import Belief, TwinEstimator, TwinNoise
 from ..robot.twin.kalman import Gate
 from ..robot.twin.twin import Twin
-from ..stepping.state import State
 from .files import read_reduced, reduced_file, write_reduced
 from .polynomials import Monomials
 from .reduced import ReducedModel, ReducedState
-from .reduction import reduce
+from .reduction import fingerprint, reduce
 from .sampling import Sampling
 from .world import FloatArray
 
+log = logging.getLogger(__name__)
+_MUCH = 0.1  # error of the reduced model over the motion, above which it warns
 _SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [rad/s]
 
 
 def reduced_of(robot: Robot) -> ReducedModel:
     """Returns the reduced model of a robot, from its run's folder; it is computed and kept there the first time.
 
+    That of a robot with other parameters than its run has identified is not kept.
+
     Raises:
         InputError: the robot cannot be reduced.
         ConvergenceError: it has no equilibrium for inputs in the range of its trials.
-        DataFileError: the file is damaged.
     """
+    own = fingerprint(robot)
     path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
     if path is not None and path.exists():
-        return read_reduced(path, robot.description.learned)
+        with suppress(DataFileError):
+            model = read_reduced(path, robot.description.learned)
+            if model.robot == own:
+                return model
     sampling = Sampling()
     with Progress("reduced model", sampling.total, "samples") as progress:
         model = reduce(robot, sampling, progress.advance)
-    if path is not None:
-        write_reduced(path, model)
+    off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
+    if off > _MUCH * moved:
+        log.warning(
+            "The reduced model is %.2g mm off in motions of %.2g mm: compare it with twin.engine=full.", off, moved
+        )
+    if path is not None and own == fingerprint(robot.with_parameters(**robot.description.parameters)):
+        try:
+            write_reduced(path, model)
+        except DataFileError as error:
+            log.warning("The reduced model is not kept for the next time: %s", error)
     return model
 
 
@@ -67,6 +84,7 @@ def reduced_twin(
         InputError: the robot cannot be reduced; an unknown input, or one that the reduced model does not have.
         ConvergenceError: there is no equilibrium.
     """
+    robot = robot.without_midpoint()
     return Twin(ReducedEstimator(robot, reduced_of(robot), inputs, noise, gate), horizon, patience)
 
 
@@ -76,9 +94,11 @@ class ReducedBelief(Belief):
 
     Attributes:
         state: of two models: the estimate, and the one without markers.
+        outside: whether the learned force was ever evaluated outside its training range.
     """
 
     state: ReducedState
+    outside: bool = False
 
 
 class ReducedEstimator(TwinEstimator[ReducedBelief]):
@@ -104,11 +124,17 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         noise: TwinNoise | None = None,
         gate: Gate | None = None,
     ) -> None:
-        self.model, self._reader = model, InputReader(robot.inputs, robot.simulator)
+        self.model, self._robot, self._reader = model, robot, InputReader(robot.inputs, robot.simulator)
         stiffness = model.stiffness(model.rest(self._commands(inputs)).acting)[0]
         frequencies = np.sqrt(np.abs(np.diag(stiffness))).clip(_SLOWEST)
         reach = float(np.sqrt((model.basis**2).sum() / (len(model.basis) / 3) / model.modes))
         super().__init__(robot, inputs, {}, frequencies, reach, noise, gate)
+
+    @override
+    def faults(self, inputs: Mapping[str, Given]) -> list[str]:
+        values = self._commands(inputs)
+        beyond = (values < self.model.range[0]) | (values > self.model.range[1])
+        return [f"{self.model.name} beyond that of the trials, and held at their limit"] if beyond.any() else []
 
     def _commands(self, inputs: Mapping[str, Given]) -> FloatArray:
         """Values (n,) of the model's input."""
@@ -116,27 +142,46 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         values = given.pop(self.model.name, torch.zeros(self.model.parts))
         for name, value in given.items():
             if bool((value != 0.0).any()):
-                raise InputError(f"the reduced model has no input but {self.model.name}, and {name} is given.")
+                raise InputError(
+                    f"the reduced model has no input but {self.model.name}, and {name} is given: leave it out, or use "
+                    "the full simulator (twin.engine=full)."
+                )
         return np.asarray(values.double().cpu().numpy())
+
+    def _held(self, inputs: Mapping[str, Given]) -> FloatArray:
+        """Commands (n,) within those of the trials, as polynomials beyond them mean nothing."""
+        return np.clip(self._commands(inputs), *self.model.range)
 
     @override
     def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> ReducedBelief:
-        return ReducedBelief(**vars(self._first(np.zeros(0))), state=self.model.rest(self._commands(inputs), 2))
+        commands = self._held(inputs)
+        try:
+            state = self.model.rest(commands, 2)
+        except ConvergenceError:  # As a full twin, it then begins without the learned force.
+            state = replace(self.model, force=None).rest(commands, 2)
+        return ReducedBelief(**vars(self._first(np.zeros(0))), state=state)
 
     @override
     def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
-        commands = np.tile(self._commands(inputs), (1, 2, 1))
+        commands = np.tile(self._held(inputs), (1, 2, 1))
         motion = self.model.move(belief.state, commands, np.stack([belief.bias, np.zeros_like(belief.bias)]))
-        if not np.isfinite(motion.z).all():
-            raise ConvergenceError("the reduced model diverged.", motion.z, None)
+        off = motion.z - self.model.static(motion.u)
+        far = np.linalg.norm((off @ self.model.basis.T).reshape(2, -1, 3), axis=2).max()
+        if not far < DIVERGENCE_DISTANCE * self.size:
+            raise ConvergenceError("the reduced model has diverged.", motion.z, None)
         transition = np.concatenate([motion.by_moved, motion.by_bias], axis=2)[0]
-        return replace(self._propagated(belief, transition), state=motion.end)
+        outside = belief.outside or bool(motion.left[0])
+        return replace(self._propagated(belief, transition), state=motion.end, outside=outside)
 
     @override
     def robot_state(self, belief: ReducedBelief) -> RobotState:
+        """Returns the estimated state of the robot, in which the material has relaxed."""
         simulator, (rate, *_) = self.robot.simulator, belief.state.v
         moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
-        return RobotState(State(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster)))
+        state = self._robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
+        known = {f"{self.model.name}.{key}": np.array(value[..., :1, :]) for key, value in belief.state.memory.items()}
+        memory = {**state.memory, **{key: simulator.tensor(value) for key, value in known.items()}}
+        return replace(state, memory=memory, left=torch.full_like(state.left, belief.outside))
 
     @override
     def _seen(self, belief: ReducedBelief, ago: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -1,5 +1,7 @@
 """Fits a reduced model to a robot: to equilibria, vibrations about them, and motions, sampled in its input range."""
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -7,20 +9,22 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import scipy.linalg
 import torch
+from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
 from ..io.errors import ConvergenceError
+from ..io.files import to_plain
 from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.state import State
-from .polynomials import Polynomial, SquaredPolynomial, solve_ridge
+from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
 from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
 from .world import FloatArray
 
-STATIC_ORDER: Final = 3
+STATIC_ORDER: Final = 3  # at least, as are those of the tangents
 TANGENT_ORDER: Final = 2
 USUAL_ORDER: Final = 1
 _LEAST_SETTLED: Final = 0.9  # share of the sampled inputs that must have an equilibrium
@@ -70,8 +74,24 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     if not models:
         raise failures[-1]
     best = min(models, key=lambda model: model.quality["window_error_mm"])
+    best = replace(best, robot=fingerprint(robot))
     tried = {str(model.modes): model.quality["window_relative"] for model in models}
     return replace(best, quality={**best.quality, **counts, "motions": sampling.motions, "tried": tried})
+
+
+def fingerprint(robot: Robot) -> str:
+    """Returns a digest of everything that a robot's reduced model depends on, except the amount of samples."""
+    about, learned = robot.description, robot.description.learned
+    arrays: dict[str, ArrayLike] = {name: value.numpy(force=True) for name, value in robot.parameters.items()}
+    arrays |= {"mesh": about.mesh.vertices, "cells": about.mesh.cells}
+    arrays |= {} if about.bound is None else {"bound": about.bound.numpy(force=True)}
+    if learned is not None:
+        arrays |= {name: value.numpy(force=True) for name, value in learned.network.state_dict().items()}
+    plain = [about.settings.plain(), about.material.plain(), about.seen, about.placement, robot.labels]
+    made = hashlib.sha256(json.dumps(to_plain([*plain, robot.simulator.integrator, robot.time_step])).encode())
+    for name, array in sorted(arrays.items()):
+        made.update(name.encode() + np.ascontiguousarray(array, dtype=np.float32).tobytes())
+    return made.hexdigest()
 
 
 def _fitted(
@@ -88,7 +108,7 @@ def _fitted(
         (z_statics, statics.u, statics.y),
         (
             z[1:, :first].reshape(-1, model.modes),
-            motions.acting[:, :first].reshape(-1, source.parts),
+            motions.acting[:, :first].reshape(-1, len(source.moving)),
             motions.y[1:, :first].reshape(-1, motions.y.shape[2]),
         ),
     )
@@ -152,15 +172,21 @@ def _assembled(
         for field in (motions.q - source.rest.float(), motions.v)
     )
 
-    def fitted(values: FloatArray) -> Polynomial:
-        return Polynomial.fitted(unit[: len(tangents)], values, TANGENT_ORDER)
+    stiff = turned @ np.stack([tangent.stiffness for tangent in tangents]) @ back
+    order = best_order(unit, statics.y, STATIC_ORDER)
+    tangent_order = best_order(unit[: len(tangents)], stiff, TANGENT_ORDER)
 
-    stiffness = fitted(turned @ np.stack([tangent.stiffness for tangent in tangents]) @ back)
+    def fitted(values: FloatArray) -> Polynomial:
+        return Polynomial.fitted(unit[: len(tangents)], values, tangent_order)
+
+    stiffness = fitted(stiff)
 
     def squared(values: FloatArray) -> SquaredPolynomial:
         """Fits matrices (S, ..., r, r) of the vibrations."""
         turn = turned.reshape(len(tangents), *np.ones(values.ndim - 3, dtype=int), *turned.shape[1:])
-        return SquaredPolynomial.fitted(unit[: len(tangents)], turn @ values @ turn.mT, STATIC_ORDER)
+        return SquaredPolynomial.fitted(
+            unit[: len(tangents)], turn @ values @ turn.mT, max(tangent_order, STATIC_ORDER)
+        )
 
     z_usual, force = z_statics, None
     if statics.outputs is not None and source.learned is not None:
@@ -174,10 +200,10 @@ def _assembled(
         places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
         places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
         places = places - (seen(unit)[..., : shapes.shape[2]] @ moved[..., None])[..., 0]
-        at_rest = Polynomial.fitted(unit, places, STATIC_ORDER)
+        at_rest = Polynomial.fitted(unit, places, order)
         force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push)
     modes, labels = shapes.shape[2], source.robot.labels
-    static, psi = Polynomial.fitted(unit, z_usual, STATIC_ORDER), basis.cpu().numpy()
+    static, psi = Polynomial.fitted(unit, z_usual, order), basis.cpu().numpy()
     shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (z_statics - static(unit)) @ psi.T
     model = ReducedModel(
         source.robot.time_step,
@@ -185,6 +211,7 @@ def _assembled(
         labels,
         source.input.name,
         source.scale,
+        source.range,
         source.acts,
         source.filters,
         source.times,
@@ -194,7 +221,7 @@ def _assembled(
         squared(np.stack([tangent.damping for tangent in tangents])),
         fitted(np.stack([tangent.shown for tangent in tangents]) @ back),
         squared(np.stack([tangent.branches for tangent in tangents])),
-        Polynomial.fitted(unit, shape, STATIC_ORDER),
+        Polynomial.fitted(unit, shape, order),
         psi,
         np.zeros((modes, modes, 3 * len(labels))),
         force,
@@ -213,7 +240,7 @@ def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatAr
 def _common(shapes: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
     """Basis Psi (3 N, r), orthonormal in the mass, of the best common subspace of vibrations (S, 3 N, r).
 
-    In that subspace it is next to the first of them, so that A is nearly diagonal there.
+    In that subspace it is closest to the first of them, so that A is nearly diagonal there.
     """
     root = mass.sqrt()[:, None]
     columns = (root * shapes).permute(1, 0, 2).flatten(1)
@@ -238,7 +265,7 @@ def _with_output(model: ReducedModel, rests: tuple[FloatArray, ...], motions: tu
     first, second = np.triu_indices(model.modes)
     curved = np.zeros((model.modes, model.modes, remainder.shape[1]))
     curved[first, second] = 0.5 * solve_ridge(
-        off[:, first] * off[:, second], remainder - observed(motions[1]), alike=True
+        off[:, first] * off[:, second], remainder - observed(motions[1]), common_scale=True
     )
     return replace(model, observed=observed, curved=curved + curved.swapaxes(0, 1))
 

@@ -23,6 +23,7 @@ from .world import FloatArray
 
 OnProgress = Callable[[int], None]
 
+_OF_MEDIUM: Final = ("added_layer", "drag_linear", "drag_normal", "drag_tangential")
 _MORE_MODES: Final = 1.5  # computed vibrations per kept one, so that the slowest are accurate
 _MEAN, _DEVIATION = 0.4, 0.45  # of sampled inputs, as shares of their range
 # Correlation times of the inputs [s]: the shortest in motions for fitting, the shortest in those for the error, and the
@@ -72,7 +73,7 @@ class Motions:
         v: (T + 1, B, N, 3) [m/s].
         y: (T + 1, B, 3 M) observed points [m].
         commands: (T, B, n) in the unit of the input.
-        acting: (T, B, n) inputs after their response to the commands, in units of the scale.
+        acting: (T, B, n') moving inputs after their response to the commands, in units of the scale.
     """
 
     q: torch.Tensor
@@ -133,8 +134,8 @@ def check_reducible(robot: Robot) -> None:
     """Refuses a robot that cannot be reduced.
 
     Raises:
-        InputError: a data-driven robot, one without markers, with a moving base or hysteresis in a material, or whose
-            network is recurrent or nodal.
+        InputError: a data-driven robot, one without markers, with a moving base, friction or a medium, that is stepped
+            by the midpoint rule, or whose network is recurrent or nodal.
     """
     description = robot.description
     if robot.is_data_driven:
@@ -145,11 +146,36 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"the base of {description.name} moves: reduced models have a fixed base.")
     if any(material.hysteresis for material in robot.simulator.materials.values()):
         raise InputError("a material with hysteresis cannot be reduced: remove its sliders (material.hysteresis).")
+    check_integrator(robot.simulator.integrator)
+    if any(getattr(energy, "memory", ()) for energy in robot.simulator.body.energies):
+        raise InputError("an energy with memory, such as friction, cannot be reduced: use the full simulator.")
+    for name in (*_OF_MEDIUM, "tendon_friction"):
+        if name in robot.simulator.parameters and bool((_value(robot, name) != 0.0).any()):
+            raise InputError(f"{name} is no stiffness, so that this robot cannot be reduced: use the full simulator.")
     network = None if description.learned is None else description.learned.network
     if network is not None and network.recurrent is not None:
         raise InputError("a recurrent network cannot be reduced: train one without a recurrent state.")
     if network is not None and any(coder.basis is None for coder in (network.position, *network.coders)):
         raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced.")
+
+
+def check_integrator(integrator: str) -> None:
+    """Refuses an integrator that cannot be reduced.
+
+    Raises:
+        InputError: such an integrator.
+    """
+    if integrator not in ("implicit_euler", "bdf2"):
+        raise InputError(
+            f"a robot that is stepped by {integrator} cannot be reduced: set identify.integrator to implicit_euler or "
+            "bdf2."
+        )
+
+
+def _value(robot: Robot, name: str) -> torch.Tensor:
+    """Values of a parameter."""
+    known = robot.parameters.get(name, robot.simulator.constants.get(name, 0.0))
+    return torch.as_tensor(known, dtype=torch.float64)
 
 
 def check_plannable(robot: Robot) -> None:
@@ -186,6 +212,7 @@ class Source:
         values = {name: float(value[0]) for name, value in robot.parameters.items()}
         names = "factor", "delay", "rise", "slew", "curve", "dead_band", "zero", "backlash", "lower"
         acts = zip(names, response_of(driven.quantity, values), strict=True)
+        self.range, self.moving = np.stack([self._low, self._high]), np.flatnonzero(self._high > self._low)
         self.acts: dict[str, Any] = {name: value for name, value in acts if value is not None}
         self.response = InputResponse(robot.time_step, **self.acts)
         reach = np.abs(self.response.scaled(np.stack([self._low, self._high]))).max(0)
@@ -199,9 +226,7 @@ class Source:
             others = {other: 0.0 for other in ratios if other != name}
             self._branches.append(robot.with_parameters(**damping, **others))
             name = name.replace(word, PRONY_TIME)
-            times.append(
-                float(torch.as_tensor(robot.parameters.get(name, simulator.constants.get(name)), dtype=torch.float64))
-            )
+            times.append(float(_value(robot, name)))
         self.times = tuple(times)
         free = np.ones(simulator.body.n_vertices)
         free[simulator.body.fixed_vertices] = 0.0
@@ -213,8 +238,8 @@ class Source:
         return self._low + shares * (self._high - self._low)
 
     def acting(self, commands: FloatArray) -> FloatArray:
-        """Inputs (..., n) under constant commands, in units of the scale."""
-        return np.asarray(self.response.scaled(commands) / self.scale)
+        """Moving inputs (..., n') under constant commands (..., n), in units of the scale."""
+        return np.asarray((self.response.scaled(commands) / self.scale)[..., self.moving])
 
     def given(self, commands: FloatArray) -> dict[str, Any]:
         """Keyword argument of the robot's methods for commands (B, n) in the unit of the input."""
@@ -223,7 +248,7 @@ class Source:
     def conditions(self) -> tuple[FloatArray, FloatArray]:
         """Standardised inputs (k,) of the network beside the state, at zero inputs, and their derivatives.
 
-        The derivatives (k, n (1 + F)) are by the inputs and the filtered inputs; both are empty where the network
+        The derivatives (k, n' (1 + F)) are by the moving inputs and the filtered ones; both are empty where the network
         takes no inputs.
         """
         network = None if self.learned is None else self.learned.network
@@ -240,6 +265,7 @@ class Source:
         changes = np.pad(changes, ((0, 0), (conditions.shape[1] - len(changes), 0)))
         encode = network.actuation.encode
         base = encode(conditions)
+        changes = changes.reshape(blocks, -1, changes.shape[1])[:, self.moving].reshape(-1, changes.shape[1])
         by = encode(conditions + torch.as_tensor(changes).to(conditions)) - base
         return base[0].cpu().numpy(), by.mT.cpu().numpy()
 
@@ -265,7 +291,11 @@ class Source:
         on_progress(max(sampling.tenths - steps // every, 0))
         y = motion.markers.flatten(2).double().cpu().numpy()
         return Motions(
-            motion.q.float(), motion.v.float(), y, commands, self.response.from_rest(commands)[0] / self.scale
+            motion.q.float(),
+            motion.v.float(),
+            y,
+            commands,
+            (self.response.from_rest(commands)[0] / self.scale)[..., self.moving],
         )
 
     def _outputs(self, state: RobotState, given: dict[str, torch.Tensor]) -> FloatArray:

@@ -391,8 +391,13 @@ class Robot:
         """
         if noise is not None and not isinstance(noise, TwinNoise):
             raise InputError(f"noise is {noise!r}: give warp_resphys.TwinNoise(markers={noise!r}).")
-        robot = self if self.simulator.integrator != "midpoint" else self._integrated_by("bdf2")
-        return Twin(FullEstimator(robot, inputs, refine, modes, noise, gate, start), horizon, patience)
+        return Twin(
+            FullEstimator(self.without_midpoint(), inputs, refine, modes, noise, gate, start), horizon, patience
+        )
+
+    def without_midpoint(self) -> "Robot":
+        """Returns the robot, stepped by BDF2 where it is by the midpoint rule, which keeps vibrations."""
+        return self._integrated_by("bdf2") if self.simulator.integrator == "midpoint" else self
 
     def _integrated_by(self, integrator: str) -> "Robot":
         other = object.__new__(Robot)

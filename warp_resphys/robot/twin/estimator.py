@@ -99,7 +99,7 @@ class TwinEstimator(ABC, Generic[B]):
         robot: with a simulator.
         inputs: constant commands under which it rests at first.
         prior: standard deviations of the refined parameters, by name.
-        frequencies: (r,) of the shapes, the slowest first [rad/s].
+        frequencies: (r,) of the shapes [rad/s].
         reach: root mean square displacement of the body per unit of a coordinate [m].
         noise: of markers and simulator.
         gate: for markers that jump.
@@ -136,9 +136,9 @@ class TwinEstimator(ABC, Generic[B]):
         noise, h = self.noise, self.time_step
         known = self.robot.description.errors_mm.get("mean")
         error = noise.simulator or (_SIMULATOR * self.size if known is None else 1e-3 * float(known))
-        less = (frequencies[0] / frequencies) ** 2
+        less = (frequencies.min() / frequencies) ** 2
         shape, force = _UNKNOWN * self.size / reach * less, error / reach * less
-        shaken = force * frequencies * np.sqrt(frequencies[0] * h / (2.0 * np.pi))
+        shaken = force * frequencies * np.sqrt(frequencies.min() * h / (2.0 * np.pi))
         self._modes, places = len(frequencies), np.full(3 * len(self.labels), noise.placement)
         self._unknown = np.concatenate([shape, shape * frequencies, force]) ** 2
         self._simulated = np.concatenate([force, force * frequencies, force]) ** 2
@@ -174,12 +174,20 @@ class TwinEstimator(ABC, Generic[B]):
         Args:
             belief: before it.
             inputs: commands by name.
-            renew: whether derivatives that are renewed by and by may be.
+            renew: whether derivatives that are not exact may be computed again in this step.
 
         Raises:
             InputError: an invalid command.
             ConvergenceError: the step failed.
         """
+
+    def faults(self, inputs: Mapping[str, Given]) -> list[str]:
+        """Returns what is wrong with commands by name that are simulated all the same.
+
+        Raises:
+            InputError: commands that cannot be simulated.
+        """
+        return []
 
     @abstractmethod
     def robot_state(self, belief: B) -> RobotState:

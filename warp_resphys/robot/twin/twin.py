@@ -126,6 +126,8 @@ class Twin:
             InputError: no time, or an unknown input or values that it cannot have; the packet is left out.
         """
         commands = self._read(time, inputs)
+        for fault in self.estimator.faults(commands):
+            self._counts.add(fault)
         self._packets += 1
         frame = None if markers is None else self._frame(markers)
         if self._origin is None or self._is_other_clock(time):

@@ -7,19 +7,19 @@ In coordinates z = Psi^T M x of r modes,
 with u the inputs after their response to the commands, y_k what has not relaxed yet in a Prony branch, and c the
 outputs of the learned force's network, evaluated on the body that z and z' describe (hyper-reduction: no degree of
 freedom of the full model is left). z_0(u) is the equilibrium under u and a force of fixed outputs c_0(u), affine in u:
-a fit of the network's outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T
-the orthogonal matrix closest to Psi^T M Phi,
+a fit of the network's outputs. With Phi(u) the vibrations about it, K phi = omega^2 M phi, and T the orthogonal matrix
+closest to Psi^T M Phi,
 
     A = T (omega^2 - Phi^T dF/dx Phi) T^T,   D = T Phi^T V Phi T^T,   B_k = T Phi^T V_k Phi T^T,   G = T Phi^T dF/dc,
 
 where F is the learned force of fixed outputs, which turns with the body, and V and V_k are the damping of the full
 model and the stiffness of a branch. Observed points are y = y_0(u) + C(u) dz + H dz dz with dz = z - z_0(u); C is exact
-for small dz. The vertices are at x_0(u) + Psi dz. z_0, y_0 and x_0 are cubic polynomials of the inputs, A, G and C are
-quadratic, and D and B_k are squares of cubic ones, so that no motion gains energy by them, fitted to equilibria and the
-vibrations about them (interpolation of reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share
-one basis Psi). H is constant, fitted to motions. As in the robot,
-the network is evaluated at the state before a step, so a step is linear in z. With s = (z, z'), and the integrator's g
-(1/3 where BDF2 has a previous state, else 0) and step length h',
+for small dz. The vertices are at x_0(u) + Psi dz. All are polynomials of those inputs that vary in the trials, of the
+order that is best on samples that were left out, fitted to equilibria and the vibrations about them (interpolation of
+reduced operators: Amsallem and Farhat, AIAA J. 46 (2008) 1803; here all share one basis Psi); D and B_k are squares of
+polynomials, so that no motion gains energy by them. H is constant, fitted to motions. As in the robot, the network is
+evaluated at the state before a step, so a step is linear in z. With s = (z, z'), and the integrator's g (1/3 where BDF2
+has a previous state, else 0) and step length h',
 
     s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + P z_k - sum B e y + force(s_k)),     J = [N; N / h'],
     N = (1 / h'^2 + D / h' + A + P)^-1,   P = sum B gamma,   y_{k+1} = e y_k + gamma (z_{k+1} - z_k),
@@ -313,10 +313,8 @@ class ReducedModel:
             states.append(now)
             strains.append(strain)
         end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
-        series, past = (
-            np.stack(states, axis=1).reshape(2, -1, r),
-            np.stack(strains, axis=1).reshape(-1, len(u.points), r),
-        )
+        series = np.stack(states, axis=1).reshape(2, -1, r)
+        past = np.stack(strains, axis=1).reshape(-1, len(u.points), r)
         matrices = inertia, inverse, held, carried.sum(1)
         return ReducedMotion(self, u, bias, share, step, *matrices, force, series[0], series[1], past, end)
 

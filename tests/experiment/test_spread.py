@@ -5,8 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from warp_resphys.data.rigid_bodies import arms
 from warp_resphys.experiment.sensitivity import Sensitivity
 from warp_resphys.experiment.spread import left_out_changes, parameter_spread
+from warp_resphys.settings.trials import CORNERS
 
 RANDOM = np.random.default_rng(0)
 MARKERS = 2
@@ -27,7 +29,9 @@ IDENTIFIED = {
     "placement": {"sessions": {"monday": {}}, "new_session": np.diag(NEW_SESSION).tolist()},
 }
 EXPERIMENT = SimpleNamespace(
-    dataset=SimpleNamespace(observed=np.zeros((2, 1, MARKERS, 3)), session={"a": "monday", "b": "friday"}.get),
+    dataset=SimpleNamespace(
+        observed=np.zeros((2, 1, MARKERS, 3)), labels=("A", "B"), session={"a": "monday", "b": "friday"}.get
+    ),
     identification=lambda model: IDENTIFIED,
 )
 
@@ -55,6 +59,24 @@ def test_a_new_session_adds_the_prior_of_its_placement():
     np.testing.assert_allclose(spread[0], of_parameters[0])
     added = np.einsum("tmck,k->tmc", LINEAR["b"].by_placement ** 2, NEW_SESSION**2).mean(-1)
     np.testing.assert_allclose(spread[1], of_parameters[1] + added)
+
+
+def test_the_position_of_a_rigid_body_does_not_vary_with_its_orientation():
+    """0.1 mm along x and 0.5 degrees about z, of a parameter, and again of the placement in a new session."""
+    corners = arms(0.0573)
+    turning = np.radians(0.5) * np.cross([0.0, 0.0, 1.0], corners)
+    moved = np.stack([np.tile([1e-4, 0.0, 0.0], (4, 1)), turning], -1)  # (4, 3, 2)
+    slopes = {"density": moved[None, ..., 0], "youngs_modulus": moved[None, ..., 1]}
+    identified = {
+        "uncertainty": {"deviation": dict.fromkeys(slopes, 1.0), "correlation": np.eye(2).tolist()},
+        "placement": {"sessions": {"monday": {}}, "new_session": np.eye(2).tolist()},
+    }
+    labels = tuple(f"plate {corner}" for corner in CORNERS)
+    dataset = SimpleNamespace(observed=np.zeros((2, 1, 4, 3)), labels=labels, session=EXPERIMENT.dataset.session)
+    experiment = SimpleNamespace(dataset=dataset, identification=lambda model: identified)
+    linear = dict.fromkeys(NAMES, Sensitivity(corners[None], np.zeros(1), slopes, moved[None]))
+    spread = parameter_spread(experiment, "sysid", NAMES, linear)
+    np.testing.assert_allclose(spread, np.array([[[1e-8 / 3.0]], [[2e-8 / 3.0]]]))
 
 
 def test_a_trial_is_predicted_without_itself():

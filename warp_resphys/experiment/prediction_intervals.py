@@ -55,7 +55,7 @@ def linearised(
 def spreads_of(
     experiment: Experiment, names: Sequence[str], linear: Linear, left_out: bool = False
 ) -> dict[str, FloatArray]:
-    """Variances (R, T, M) of markers due to the identified parameters [m^2], by model, see `parameter_spread`."""
+    """Variances (R, T, M) of markers and rigid bodies due to the identified parameters [m^2], by model, see `parameter_spread`."""
     spreads = {model: parameter_spread(experiment, model, names, own, left_out) for model, own in linear.items()}
     return {model: spread for model, spread in spreads.items() if spread is not None}
 
@@ -164,7 +164,7 @@ def _predicted(
     """Trials as they were predicted and observed; rigid bodies count as one marker."""
     labels = dataset.labels
     rows = zip(simulated[: len(names)], observed, since_change(dataset, names), strict=True)
-    known = [None] * len(names) if spreads is None else [as_markers(x, labels, -1) for x in spreads]
+    known = [None] * len(names) if spreads is None else spreads
     return [
         Predicted(as_markers(x, labels), as_markers(y, labels), since, spread)
         for (x, y, since), spread in zip(rows, known, strict=True)

@@ -226,7 +226,8 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
             raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
         shape = (len(rolled), *dataset.observed.shape[1:])
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
-        spreads = {m: read_array(file, f"{m}_spread", shape[:-1])[: len(test)] for m in models if f"{m}_spread" in file}
+        spread = (*shape[:2], len(owners(dataset.labels)))
+        spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in models if f"{m}_spread" in file}
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
     begins = tuple(dataset.begins[row] for row in rows)
@@ -247,7 +248,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         gravity=dataset.gravity,
         time_step=dataset.time_step,
         since=since_change(dataset, test)[:, :length],
-        spreads={model: as_markers(values[:, :length], dataset.labels, -1) for model, values in spreads.items()},
+        spreads={model: values[:, :length] for model, values in spreads.items()},
         **_seen(run, dataset),
     )
 

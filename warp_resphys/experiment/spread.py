@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import as_markers, owners
 from ..learning.parameters import own_name
 from .experiment import Experiment
 from .sensitivity import Sensitivity
@@ -29,7 +30,7 @@ def parameter_spread(
         left_out: whether the posterior of a trial that was identified from is that without it.
 
     Returns:
-        Means (R, T, M) over the coordinates [m^2]; None if the uncertainty of the parameters is not known.
+        Means (R, T, M) over the coordinates, those of a rigid body at its position [m^2]; None if the uncertainty of the parameters is not known.
     """
     identified = experiment.identification(model)
     uncertainty, placement = identified.get("uncertainty"), identified.get("placement") or {}
@@ -37,7 +38,8 @@ def parameter_spread(
         return None
     parameters, own = [*uncertainty["deviation"]], identified.get("own_deviation", {})
     ranges = [uncertainty.get("ranges", {}).get(name, np.inf) for name in parameters]
-    spread = np.zeros((len(names), *experiment.dataset.observed.shape[1:3]))
+    labels = experiment.dataset.labels
+    spread = np.zeros((len(names), experiment.dataset.observed.shape[1], len(owners(labels))))
     for row, name in enumerate(names):
         if name in linear:
             posterior = uncertainty.get("left_out", {}).get(name, uncertainty) if left_out else uncertainty
@@ -51,11 +53,11 @@ def parameter_spread(
                     correlation[at, at] = 1.0
             root = deviation[:, None] * _root(correlation, deviation / ranges)
             slopes = np.stack([linear[name].by_parameter[parameter] for parameter in parameters])
-            moved = np.einsum("eTmc,ei->iTmc", slopes, root)
+            moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), labels)
             spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
             places = linear[name].by_placement
             if "sessions" in placement and session not in placement["sessions"] and places is not None:
-                moved = places @ np.array(placement["new_session"])
+                moved = as_markers(places @ np.array(placement["new_session"]), labels, -3)
                 spread[row, : len(moved)] += np.nan_to_num(np.square(moved).sum(-1).mean(-1))
     return spread
 

@@ -89,7 +89,7 @@ def test_rows_are_exposed_at_their_own_times():
     def pixels(points):
         return CAMERA.pixels(points, neutral)
 
-    places, velocities = at_own_times(series, begin, ROW_TIME, 240.0, step, pixels)
+    places, velocities = at_own_times(series, begin, ROW_TIME, step, pixels)
     rows = pixels(places[0])[:, 1].numpy()
     r = ROW_TIME
     for row, velocity, z0, v in zip(rows, velocities.numpy(), heights, speeds, strict=True):
@@ -98,11 +98,37 @@ def test_rows_are_exposed_at_their_own_times():
         exact = min(np.roots(equation), key=lambda root: abs(root - row))
         assert row == pytest.approx(exact, abs=1e-4)
         assert velocity == pytest.approx([0.0, 0.0, v + fall * (begin + r * exact)], abs=1e-6)
-    at_once = pixels(at_own_times(series, begin, 0.0, 240.0, step, pixels)[0][0])[:, 1].numpy()
+    at_once = pixels(at_own_times(series, begin, 0.0, step, pixels)[0][0])[:, 1].numpy()
     assert (np.abs(at_once - rows) > 3.0).all()
-    resting, still = at_own_times(series, -0.05, ROW_TIME, 240.0, step, pixels)  # before the release
+    resting, still = at_own_times(series, -0.05, ROW_TIME, step, pixels)  # before the release
     assert torch.equal(resting[0], series[0, 0])
     assert not still.any()
+
+
+def test_rows_below_twice_the_principal_point_have_their_own_times():
+    """A point that moves down the picture, in closed form: y = y0 + w t at t = begin + r y; and the end of a motion."""
+    matrix = torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 100.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    camera, row_time, step = replace(CAMERA, lens=Lens(matrix)), 1e-4, 0.005
+    z = 0.01 - 0.3 / 700.0 * (700.0 + 2000.0 * step * torch.arange(60.0, dtype=torch.float64))  # row 800 + 2000 t
+    series = torch.stack([torch.full_like(z, 0.05), 0.0 * z, z], -1)[None, :, None]
+
+    def pixels(points):
+        return camera.pixels(points, PlacedCamera.corrections({}))
+
+    assert float(pixels(series[0])[0, 0, 1]) == pytest.approx(800.0 - 0.01 * 700.0 / 0.3)
+    places, velocities = at_own_times(series, 0.01, row_time, step, pixels)
+    exact = (800.0 - 0.01 * 700.0 / 0.3 + 2000.0 * 0.01) / (1.0 - 2000.0 * row_time)
+    assert float(pixels(places[0])[0, 1]) == pytest.approx(exact, abs=1e-6)
+    assert float(velocities[0, 2]) == pytest.approx(-2000.0 * 0.3 / 700.0)
+    photo = Photo("0", camera, time=0.1, row_time=row_time)
+    assert photo.last == pytest.approx(0.12)
+    seen = (
+        {"rows": 1080.0},
+        {"tracked": np.array([[5.0, 1080.0], [np.nan, np.nan]])},
+        {"outline": Outline.of_mask(np.pad(np.ones((40, 20), bool), ((1000, 40), (9, 9))))},
+        {"cloud": Cloud(np.array([[5.0, 1080.0, 0.3]]))},
+    )
+    assert [replace(photo, **own).last for own in seen] == pytest.approx([0.208] * 4)
 
 
 def with_depths(pose):

@@ -52,7 +52,7 @@ def play_camera(context: StageContext) -> None:
         camera = PlacedCamera(read_lenses(data)[""], torch.as_tensor(looking), centre)
         row_time = data.lenses[""].row_time if played.row_time is None else played.row_time
         times = [n / played.frame_rate for n in range(len(files))]
-        photos = tuple(Photo("", camera, time=time, row_time=row_time) for time in times)
+        photos = tuple(Photo("", camera, time=time, row_time=row_time, rows=played.size[1]) for time in times)
         seen = SeenPose(name, simulator, surface, (), photos, release=released_force(name, pose, body.mesh))
         shape = seen.shape(played.corrections)
         random = np.random.default_rng([settings.seed, number])

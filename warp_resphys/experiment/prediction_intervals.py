@@ -55,7 +55,7 @@ def linearised(
 def spreads_of(
     experiment: Experiment, names: Sequence[str], linear: Linear, left_out: bool = False
 ) -> dict[str, FloatArray]:
-    """Variances (R, T, M) of markers and rigid bodies due to the identified parameters [m^2], by model, see `parameter_spread`."""
+    """Variances (R, T, M) of markers and rigid bodies due to the parameters [m^2], by model, see `parameter_spread`."""
     spreads = {model: parameter_spread(experiment, model, names, own, left_out) for model, own in linear.items()}
     return {model: spread for model, spread in spreads.items() if spread is not None}
 

@@ -30,7 +30,8 @@ def parameter_spread(
         left_out: whether the posterior of a trial that was identified from is that without it.
 
     Returns:
-        Means (R, T, M) over the coordinates, those of a rigid body at its position [m^2]; None if the uncertainty of the parameters is not known.
+        Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2]; None if the
+        uncertainty of the parameters is not known.
     """
     identified = experiment.identification(model)
     uncertainty, placement = identified.get("uncertainty"), identified.get("placement") or {}

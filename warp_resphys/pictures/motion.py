@@ -111,7 +111,6 @@ def at_own_times(
     series: torch.Tensor,
     begin: float,
     row_time: float,
-    rows: float,
     step: float,
     pixels: Callable[[torch.Tensor], torch.Tensor],
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -121,16 +120,16 @@ def at_own_times(
         series: (S, K + 1, N, 3) vertices at the steps, the first of a motion, others perhaps its derivatives.
         begin: time at which row 0 is exposed, after the release [s].
         row_time: r, between two rows [s].
-        rows: number of rows of the picture.
         step: time step [s].
-        pixels: maps points (N, 3) to pixels (N, 2).
+        pixels: maps points (..., 3) to pixels (..., 2).
 
     Returns:
         (S, N, 3), and velocities (N, 3) [m/s].
     """
-    low, high = sorted((begin, begin + row_time * rows))
-    first = min(max(math.floor(low / step) - _MARGIN, 0), series.shape[1] - _LEAST)
-    series = series[:, first : max(math.ceil(high / step) + _MARGIN, first + _LEAST)]
+    shown = begin + row_time * pixels(series[0])[..., 1].nan_to_num()
+    low, high = (float(end / step) for end in torch.aminmax(shown.clamp(0.0, step * series.shape[1])))
+    first = min(max(math.floor(low) - _MARGIN, 0), series.shape[1] - _LEAST)
+    series = series[:, first : max(math.ceil(high) + _MARGIN, first + _LEAST)]
     begin -= first * step
     paths = series[0].transpose(0, 1)
     times = torch.full_like(paths[:, :1, 0], begin)

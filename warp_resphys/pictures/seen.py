@@ -43,6 +43,7 @@ class Photo:
         lens: name of the lens, whose values of parameters are those of this picture; empty for a single one.
         time: at which its row 0 is exposed [s].
         row_time: from the exposure of a row to that of the next [s].
+        rows: of the picture; zero where its measurements, or a principal point in the middle, show them.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Photo:
     lens: str = ""
     time: float = 0.0
     row_time: float = 0.0
+    rows: float = 0.0
 
     @property
     def kinds(self) -> int:
@@ -60,9 +62,13 @@ class Photo:
         return sum(own is not None for own in (self.outline, self.tracked, self.cloud))
 
     @property
-    def rows(self) -> float:
-        """Number of rows of a picture whose principal point is in the middle."""
-        return 0.0 if self.camera.lens is None else 2.0 * float(self.camera.lens.matrix[1, 2])
+    def last(self) -> float:
+        """Time at which the last row is exposed that may show the body [s]."""
+        rows = [self.rows] if self.camera.lens is None else [self.rows, 2.0 * float(self.camera.lens.matrix[1, 2])]
+        rows += [] if self.outline is None else [self.outline.size[1]]
+        measured = (self.tracked, None if self.cloud is None else self.cloud.measured)
+        rows += [float(np.nanmax(own[:, 1], initial=0.0)) for own in measured if own is not None]
+        return self.time + max(self.row_time * max(rows), 0.0)
 
 
 @dataclass(frozen=True)
@@ -200,7 +206,7 @@ class SeenPose:
         if self.moves:
             assert self.release is not None
             guess = self.simulator.rest_state(1).q if near is None else near[1].view(-1, *near[1].shape[-2:])
-            last = max(photo.time + max(photo.row_time * photo.rows, 0.0) for photo in self.photos)
+            last = max(photo.last for photo in self.photos)
             return self.release.motions(self.simulator, values, last, guess[0])
         first = self._at_rest(values[0], near)
         return torch.stack([first, *(self._at_rest(own, (values[0], first)) for own in values[1:])]).double().cpu()
@@ -227,7 +233,7 @@ class SeenPose:
         def pixels(q: torch.Tensor) -> torch.Tensor:
             return photo.camera.pixels(q, corrections)
 
-        return at_own_times(shapes, begin, photo.row_time, photo.rows, step, pixels)
+        return at_own_times(shapes, begin, photo.row_time, step, pixels)
 
     def vertices(self, photo: Photo, shape: torch.Tensor, values: Mapping[str, float]) -> torch.Tensor:
         """Returns the vertices (N, 3) that a picture shows of a shape; see `seen` [m]."""

@@ -1,5 +1,6 @@
 """A rigid body on a hanging cap: its mounting follows from the pose of its part, and is refused where none shows it."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,10 @@ from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import ARM
 from warp_resphys.data.rigid_bodies import angles, motion_between
+from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
-from warp_resphys.io.errors import InputError
+from warp_resphys.experiment.reading import Reader
+from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.io.stages import run_stages
 from warp_resphys.pipeline import acquisition_stages
@@ -34,6 +37,9 @@ HANGS = [
     "laboratory.trials={p0: {begins: static}, p30: {begins: static, payload: 0.03}}",
     "laboratory.validation=[]",
 ]
+
+
+BASES = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
 
 
 def imported(folder, *overrides):
@@ -75,6 +81,60 @@ def test_a_rigid_body_that_was_mounted_anew_is_refused(tmp_path):
         "data.test=[anew]",
     )
     with pytest.raises(InputError, match=r"anew\.h5: 'plate' is 0\.0 mm and 120\.0 degrees from its mounting"):
+        run_stages(acquisition_stages(run), tmp_path)
+
+
+def standing(path, places, frames=20, **arrays):
+    """Writes arrays of markers that stand still, of which 'plate' is a rigid body."""
+    turns = np.where(np.array([*places])[:, None] == "plate", [1.0, 0.0, 0.0, 0.0], np.nan)
+    repeated = (np.repeat(np.array(x)[None], frames, 0) for x in ([*places.values()], turns))
+    named = dict(zip(("positions", "quaternions"), repeated, strict=True))
+    np.savez(path, labels=[*places], rate_hz=100.0, **named, **arrays)
+
+
+def test_a_trial_without_a_rigid_body_is_named(tmp_path, caplog):
+    """A trial has all points of the rigid bodies among its labels, and none of others."""
+    places = {"plate": [0.095, 0.015, 0.015], "tip": [0.1, 0.015, 0.03], **BASES}
+    trials = []
+    for name, absent in (("a", "tip"), ("b", "plate")):
+        kept = {label: place for label, place in places.items() if label != absent}
+        standing(tmp_path / f"{name}.npz", kept)
+        trials.append(f"{name}: {{file: {name}.npz, begins: static, labels: [{', '.join(kept)}]}}")
+    run = settings(
+        *HANGS,
+        "+markers.tracked={tip: [0.1, 0.015, 0.03]}",
+        f"data.folder={tmp_path}",
+        f"data.trials={{{', '.join(trials)}}}",
+        "~data.folds",
+        "data.train=[a]",
+        "data.test=[b]",
+    )
+    imported = acquisition_stages(run)[0].settings
+    reader = Reader(imported, tmp_path, build_simulator(imported, imported.simulation), None)
+    with caplog.at_level(logging.INFO):
+        reader.read(imported.trials)
+    told = [record.getMessage() for record in caplog.records if record.name.endswith("reading")]
+    assert told == [
+        "import: a has no 'tip', by data.trials.a.labels",
+        "import: b has no 'plate', by data.trials.b.labels",
+    ]
+
+
+def test_a_rest_without_an_orientation_is_refused(tmp_path):
+    places = {"plate": [0.095, 0.015, 0.015], **BASES}
+    for name in "ab":
+        standing(tmp_path / f"{name}.npz", places, rest=[*places.values()])
+    run = settings(
+        *HANGS,
+        f"data.folder={tmp_path}",
+        "data.trials={a: {file: a.npz, begins: released}, b: {file: b.npz, begins: released}}",
+        "data.rest=file",
+        "data.seconds=0.1",
+        "~data.folds",
+        "data.train=[a]",
+        "data.test=[b]",
+    )
+    with pytest.raises(DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"):
         run_stages(acquisition_stages(run), tmp_path)
 
 

@@ -4,6 +4,7 @@ import json
 import socket
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.robot.twin.kalman import Gate, conditioned, distances
 from warp_resphys.robot.twin.stream import Listener, recorded_packets
 from warp_resphys.robot.twin.tangent import StepTangent, shifted
+from warp_resphys.settings.trials import CORNERS
 
 NOISE = 1e-4
 
@@ -330,6 +332,17 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     read = list(recorded_packets(robot, "swing.csv"))
     assert [packet.time for packet in read] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.04])
     np.testing.assert_allclose(read[2].markers["vertex_7"], motion.q[2, 0, 7].numpy(), atol=1e-9)
+
+
+def test_a_recording_may_lack_a_rigid_body(folder):
+    """Its markers are those of a packet, as where a marker is absent."""
+    bodies = {name: SimpleNamespace(length=0.05) for name in ("plate", "ring")}
+    described = SimpleNamespace(markers=SimpleNamespace(rigid_bodies=bodies), seen=())
+    axes = {"plate": [0.0, 0.0, 0.3], **{f"plate +{axis}": 0.05 * np.eye(3)[n] for n, axis in enumerate("xyz")}}
+    np.savez("absent.npz", positions=np.repeat([[*axes.values()]], 3, 0), labels=[*axes], rate_hz=100.0)
+    read = [*recorded_packets(SimpleNamespace(description=described, inputs={}), "absent.npz")]
+    assert len(read) == 3
+    assert {*read[0].markers} == {*axes, *(f"plate {corner}" for corner in CORNERS)}
 
 
 def test_a_command_that_cannot_be_done_is_left_out(robot, swing):

@@ -17,7 +17,7 @@ from ..data.recordings.recording import Recording
 from ..data.recordings.release import Release, valve_opening
 from ..data.registration import Registration, register_markers
 from ..data.rigid import RigidTransform
-from ..data.rigid_bodies import owners
+from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, listed
 from ..io.stages import StageContext
@@ -356,9 +356,13 @@ def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:
             "(docs/recordings.md), or set data.rest to held if the body is held undeformed."
         )
     lost = [label for label in tracked if not np.isfinite(recording.rest[recording.labels.index(label)]).all()]
+    if turned := [name for name, own in corners_of(tracked).items() if tracked[own][0] in lost]:
+        raise DataFileError(
+            f"{recording.source}: 'rest' has no orientation of {listed(turned)}: set data.rest to held, with frames in "
+            "which the body is held undeformed."
+        )
     if lost:
         raise DataFileError(
-            f"{recording.source}: 'rest' has no place of {listed(owners(lost))}; leave it out of the configured "
-            "markers."
+            f"{recording.source}: 'rest' has no place of {listed(lost)}; leave it out of the configured markers."
         )
     return recording.rest

@@ -17,7 +17,7 @@ from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
 from ..data.recordings.text import Table
 from ..data.registration import axes_rotation
-from ..data.rigid_bodies import corners_of, motion_between, with_corners
+from ..data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ..dynamics.simulator import Simulator
 from ..io.errors import DataFileError, InputError, listed
 from ..settings.stages import ImportStage
@@ -118,11 +118,11 @@ class Reader:
             recordings = self._assigned(trials, recordings)
         for trial in trials:
             if absent := [label for label in self.tracked if label not in self.labels(trial)]:
-                others = [label for label in trial.labels or () if label not in self.labels(trial)]
+                others = [label for label in trial.labels or () if label not in owners(self.labels(trial))]
                 log.log(
                     logging.WARNING if others else logging.INFO,
                     "import: %s has no %s, by data.trials.%s.labels%s",
-                    *(trial.name, listed(absent), trial.name),
+                    *(trial.name, listed(owners(absent)), trial.name),
                     f", and {listed(others)} of it are not configured" if others else "",
                 )
         pairs = zip(trials, recordings, strict=True)

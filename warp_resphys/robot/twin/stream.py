@@ -108,7 +108,8 @@ def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
     """
     markers, recording = robot.description.markers, read_recording(Path(path).expanduser())
     if markers is not None:
-        recording = with_corners(recording, {name: body.length for name, body in markers.rigid_bodies.items()})
+        bodies = markers.rigid_bodies.items()
+        recording = with_corners(recording, {name: own.length for name, own in bodies if name in recording.labels})
     driven = [name for name in robot.inputs if name in robot.description.seen]
     commands: Iterator[Mapping[str, Any]] = iter([{}] * len(recording.positions))
     if recording.actuation is not None and driven:

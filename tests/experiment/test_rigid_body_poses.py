@@ -63,24 +63,30 @@ def test_a_mounting_that_no_trial_shows_is_refused(tmp_path):
         imported(tmp_path, loaded, "laboratory.train=[p20]", "laboratory.test=[p30]")
 
 
-def test_a_rigid_body_that_was_mounted_anew_is_refused(tmp_path):
+@pytest.mark.parametrize(("angle", "train", "test"), [(120.0, "p0", "other"), (5.0, "p0, other", "p30")])
+def test_a_rigid_body_that_was_remounted_is_refused(tmp_path, angle, train, test):
+    """By 120 degrees in a test trial; by 5 degrees, 5 mm at its points, between two trials of the training."""
     imported(tmp_path / "played", "laboratory.train=[p0]", "laboratory.test=[p30]")
     recording = read_recording(tmp_path / "played" / "recordings" / "p0.h5")
     positions = recording.positions.copy()
     arms = [recording.labels.index(f"plate +{axis}") for axis in "xyz"]
     place = positions[:, [recording.labels.index("plate")]]
-    positions[:, arms] = place + (positions[:, arms] - place)[:, [1, 2, 0]]  # A turn by 120 degrees.
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(angle)]).as_matrix()
+    positions[:, arms] = place + (positions[:, arms] - place) @ turn.T
     write_recording(tmp_path / "p0.h5", recording)
-    write_recording(tmp_path / "anew.h5", replace(recording, positions=positions))
+    write_recording(tmp_path / "other.h5", replace(recording, positions=positions))
+    write_recording(tmp_path / "p30.h5", read_recording(tmp_path / "played" / "recordings" / "p30.h5"))
+    trials = "p0: {file: p0.h5, begins: static}, other: {file: other.h5, begins: static}"
     run = settings(
         *HANGS,
         f"data.folder={tmp_path}",
-        "data.trials={p0: {file: p0.h5, begins: static}, anew: {file: anew.h5, begins: static}}",
+        f"data.trials={{{trials}, p30: {{file: p30.h5, begins: static, payload: 0.03}}}}",
         "~data.folds",
-        "data.train=[p0]",
-        "data.test=[anew]",
+        f"data.train=[{train}]",
+        f"data.test=[{test}]",
     )
-    with pytest.raises(InputError, match=r"anew\.h5: 'plate' is 0\.0 mm and 120\.0 degrees from its mounting"):
+    message = rf"other\.h5: 'plate' is 0\.0 mm and {angle} degrees from its mounting in p0\.h5: where it was remounted"
+    with pytest.raises(InputError, match=message):
         run_stages(acquisition_stages(run), tmp_path)
 
 

@@ -60,7 +60,7 @@ def import_recordings(context: StageContext) -> None:
     bound = _mounted(observer, observed, observer.nominal + _mean_offset(offsets, observed, training))
     bound_markers(settings.markers, observer.simulator.body.mesh, bound, tracked)  # Refuses a marker that is far off.
     shifts = _shifts(observer, observed, bound, offsets)
-    mountings = _mountings(observer, observed, bound, offsets)
+    mountings = _mountings(observer, observed, bound, offsets, training)
     verticals = _verticals(observed, settings)
     gravity = _gravity(verticals, settings)
     _dataset(observer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
@@ -142,12 +142,16 @@ def _mounted(observer: Observer, observed: Sequence[Observed], bound: FloatArray
 
 
 def _mountings(
-    observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray
+    observer: Observer,
+    observed: Sequence[Observed],
+    bound: FloatArray,
+    offsets: FloatArray,
+    training: Container[str],
 ) -> dict[str, dict[str, Any]]:
     """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
 
     Raises:
-        InputError: a rigid body was mounted anew between two trials.
+        InputError: a rigid body was remounted between two trials.
     """
     mountings: dict[str, dict[str, Any]] = {x.settings.name: {} for x in observed}
     for name, own in corners_of(observer.tracked).items():
@@ -155,13 +159,15 @@ def _mountings(
         places = observer.nominal[own] + offsets[shown][:, own]
         away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[own].mean(axis=0), axis=-1)
         turned = np.degrees(angles(bound[own], places))
-        apart = [root_mean_square(corners - bound[own]) for corners in places]
+        first = next((at for at, row in enumerate(shown) if observed[row].settings.name in training), 0)
+        apart = [root_mean_square(corners - places[first]) for corners in places]
         if max(apart) > observer.markers.largest_residual:
             worst = int(np.argmax(apart))
-            source = observed[shown[worst]].raw.source
+            source, other = (observed[shown[at]].raw.source for at in (worst, first))
+            moved = _MILLI * np.linalg.norm((places[worst] - places[first]).mean(axis=0))
             raise InputError(
-                f"{source}: {name!r} is {away[worst]:.1f} mm and {turned[worst]:.1f} degrees from its "
-                "mounting in the other trials: where it was mounted anew, give it another name in "
+                f"{source}: {name!r} is {moved:.1f} mm and {np.degrees(angles(places[first], places[worst])):.1f} "
+                f"degrees from its mounting in {other.name}: where it was remounted, give it another name in "
                 "data.trials.NAME.labels and in markers.rigid_bodies."
             )
         for row, distance, angle in zip(shown, away, turned, strict=True):

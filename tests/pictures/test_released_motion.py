@@ -50,7 +50,7 @@ FIRST = {**TRUTH, "youngs_modulus": 1.5e5, "density": 1000.0, "stiffness_damping
 
 
 def released(frames=18, row_time=ROW_TIME, outlines=False):
-    """A beam that is let go at 0.05 s, with tracked points and perhaps outlines in every picture."""
+    """A beam that is released at 0.05 s, with tracked points and perhaps outlines in every picture."""
     body = wr.Body(MESH, fixed=CLAMP)
     simulator = wr.Simulator(
         body, wr.Corotated(2e5, 0.45), time_step=1.0 / 240.0, gravity=(0.0, 0.0, -9.81), integrator="bdf2"

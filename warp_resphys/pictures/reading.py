@@ -148,7 +148,7 @@ def check_times(scene: SceneFile, release: float) -> None:
         release: time of the release [s].
 
     Raises:
-        DataFileError: frames have no times, these do not increase, or no two are after the release.
+        DataFileError: frames have no times, these do not increase, or fewer than three are after the release.
     """
     last: dict[str, tuple[int, float]] = {}
     for frame in scene.frames:

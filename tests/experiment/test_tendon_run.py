@@ -13,6 +13,7 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
 
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
@@ -140,7 +141,7 @@ def check_sensitivities(experiment, names):
     found = sensitivities(experiment, "sysid", names)
     parameters, step = experiment.parameters("sysid"), 1e-4
     for name in names:
-        replay = experiment.replay(experiment.model_simulator("sysid"), [name], "sysid")
+        replay = experiment.replay(exact(experiment.model_simulator("sysid")), [name], "sysid")
         start = experiment.start(replay, "sysid")
         for key, moved in (
             ("tendon_tension_zero", f"tendon_tension_zero@{name}"),

@@ -112,8 +112,8 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
     everywhere = {number for trial in all_trials(run).values() for number in trial.tracked(tracked)}
     if nowhere := [label for number, label in enumerate(tracked) if number not in everywhere]:
         raise InputError(
-            f"markers names {listed(owners(nowhere))}, which no trial has in data.trials.NAME.labels: add it there, "
-            "or leave it out."
+            f"{listed(owners(nowhere))} of markers.tracked or rigid_bodies is in no data.trials.NAME.labels: add it "
+            "there, or leave it out."
         )
     if markers.frame == "own":
         _check_sets(trials, tracked)

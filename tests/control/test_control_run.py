@@ -24,6 +24,7 @@ from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Horizon, Limits, Planner
 from warp_resphys.control.polynomials import SquaredPolynomial
+from warp_resphys.control.reduced import ReducedModel
 from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_of, reduced_twin
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
@@ -312,6 +313,19 @@ class TestReducedTwin:
         state = replace(belief.state, z=belief.state.z + 1e3)
         with pytest.raises(ConvergenceError, match="diverged"):
             twin.estimator.advance(replace(belief, state=state), {})
+
+    def test_without_an_equilibrium_it_begins_without_the_learned_force(self, corrected, monkeypatch):
+        rest = ReducedModel.rest
+
+        def fails(model, *more):
+            if model.force is not None:
+                raise ConvergenceError("its learned force is too large", None, None)
+            return rest(model, *more)
+
+        monkeypatch.setattr(ReducedModel, "rest", fails)
+        twin = self.twin(corrected)
+        state, model = twin.estimator.begin({}).state, twin.estimator.model
+        np.testing.assert_allclose(state.z, np.repeat(model.static(state.acting[:1]), 2, axis=0))
 
     def test_it_is_of_the_robot_as_it_is(self, folder, corrected, monkeypatch, caplog):
         """A robot with other parameters has a model of its own, which does not replace that of the run."""

@@ -119,8 +119,8 @@ def test_a_trial_without_a_rigid_body_is_named(tmp_path, caplog):
     reader = Reader(imported, tmp_path, build_simulator(imported, imported.simulation), None)
     with caplog.at_level(logging.INFO):
         reader.read(imported.trials)
-    told = [record.getMessage() for record in caplog.records if record.name.endswith("reading")]
-    assert told == [
+    warned = [record.getMessage() for record in caplog.records if record.name.endswith("reading")]
+    assert warned == [
         "import: a has no 'tip', by data.trials.a.labels",
         "import: b has no 'plate', by data.trials.b.labels",
     ]

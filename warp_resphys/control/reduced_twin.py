@@ -42,7 +42,7 @@ def reduced_of(robot: Robot) -> ReducedModel:
     own = fingerprint(robot)
     path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
     if path is not None and path.exists():
-        with suppress(DataFileError):
+        with suppress(DataFileError):  # Damaged, or of an earlier version: it is computed again.
             model = read_reduced(path, robot.description.learned)
             if model.robot == own:
                 return model
@@ -124,8 +124,8 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         noise: TwinNoise | None = None,
         gate: Gate | None = None,
     ) -> None:
-        self.model, self._robot, self._reader = model, robot, InputReader(robot.inputs, robot.simulator)
-        stiffness = model.stiffness(model.rest(self._commands(inputs)).acting)[0]
+        self.model, self._reader = model, InputReader(robot.inputs, robot.simulator)
+        stiffness = model.stiffness(self._rest(inputs).acting)[0]
         frequencies = np.sqrt(np.abs(np.diag(stiffness))).clip(_SLOWEST)
         reach = float(np.sqrt((model.basis**2).sum() / (len(model.basis) / 3) / model.modes))
         super().__init__(robot, inputs, {}, frequencies, reach, noise, gate)
@@ -152,14 +152,17 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         """Commands (n,) within those of the trials, as polynomials beyond them mean nothing."""
         return np.clip(self._commands(inputs), *self.model.range)
 
-    @override
-    def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> ReducedBelief:
+    def _rest(self, inputs: Mapping[str, Given]) -> ReducedState:
+        """Two models at rest, as a full twin without the learned force where there is no equilibrium with it."""
         commands = self._held(inputs)
         try:
-            state = self.model.rest(commands, 2)
-        except ConvergenceError:  # As a full twin, it then begins without the learned force.
-            state = replace(self.model, force=None).rest(commands, 2)
-        return ReducedBelief(**vars(self._first(np.zeros(0))), state=state)
+            return self.model.rest(commands, 2)
+        except ConvergenceError:
+            return replace(self.model, force=None).rest(commands, 2)
+
+    @override
+    def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> ReducedBelief:
+        return ReducedBelief(**vars(self._first(np.zeros(0))), state=self._rest(inputs))
 
     @override
     def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
@@ -178,7 +181,7 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         """Returns the estimated state of the robot, in which the material has relaxed."""
         simulator, (rate, *_) = self.robot.simulator, belief.state.v
         moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
-        state = self._robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
+        state = self.robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
         known = {f"{self.model.name}.{key}": np.array(value[..., :1, :]) for key, value in belief.state.memory.items()}
         memory = {**state.memory, **{key: simulator.tensor(value) for key, value in known.items()}}
         return replace(state, memory=memory, left=torch.full_like(state.left, belief.outside))

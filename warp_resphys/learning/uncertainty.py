@@ -22,7 +22,7 @@ Linearised = tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What the identification would have been without a trial, to first order."""
+    """Identification without one of its trials, to first order."""
 
     change: dict[str, float]  # of the parameters, in their units
     placement: list[float] | None  # (3 M + 6,) change of the trial's marker offsets [m], shift [m] and turn [rad]

@@ -32,6 +32,9 @@ class Steppable(Protocol):
     def with_parameters(self, **parameters: torch.Tensor | float) -> "Steppable":
         """Returns the robot with other parameters."""
 
+    def state(self, q: torch.Tensor, v: torch.Tensor | None = None) -> RobotState:
+        """Returns a state of given positions, with a history of zero inputs."""
+
     def begin(self, batch: int = 1, **inputs: Any) -> RobotState:
         """Returns the equilibrium without the learned force."""
 

@@ -10,6 +10,7 @@ from .points import deformation_gradient, green_strain
 
 wp.set_module_options({"enable_backward": False})
 
+BOUNDS = (128, 4)  # of threads a block and blocks a multiprocessor: at most 128 registers a thread, of a GPU's 65,536
 ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.float64(4.0)
 
 
@@ -84,7 +85,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         t = volume * dilation
         return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, launch_bounds=BOUNDS)
     def local_step(
         active: wp.array[int],  # (B) zero: skip the environment
         nodes: wp.array2d[int],
@@ -125,7 +126,7 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         stress_out[b, p] = stress
         energy_out[b, p] = energy
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, launch_bounds=BOUNDS)
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero

@@ -52,6 +52,11 @@ class Learned:
     range_: Range | None = None
     force_frame: str = "world"
 
+    def to(self, device: torch.device) -> "Learned":
+        """Returns the model on a device; its network moves there."""
+        range_ = None if self.range_ is None else self.range_.to(device)
+        return Learned(self.network.to(device), range_, self.force_frame)
+
     def description(self) -> dict[str, Any]:
         """Metadata of a checkpoint that `load` needs besides the description of the network."""
         range_ = None if self.range_ is None else self.range_.description()

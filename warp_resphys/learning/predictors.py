@@ -78,6 +78,12 @@ class Range:
         margin = _MARGIN * (self.high - self.low)
         return self.low - margin, self.high + margin
 
+    def to(self, device: torch.device) -> "Range":
+        """Returns the range on a device."""
+        return Range(
+            self.low.to(device), self.high.to(device), None if self.missed is None else self.missed.to(device)
+        )
+
     def description(self) -> dict[str, list[float]]:
         """Returns plain data for a checkpoint's metadata."""
         missed = {} if self.missed is None else {"missed": self.missed.tolist()}

@@ -66,15 +66,17 @@ class Robot:
         parameters: Mapping[str, torch.Tensor | float] | None = None,
         folder: Path | None = None,
     ) -> None:
-        self.description, self.folder = description, folder
         self.simulator = description.simulator(torch.device(device), on_failure)
+        if description.learned is not None:
+            description = replace(description, learned=description.learned.to(self.simulator.device))
+        self.description, self.folder = description, folder
         self.time_step, self.labels = self.simulator.time_step, description.labels
         observe = description.observe()
         self._observe = None if observe is None else observe.to(self.simulator.rest_positions)
         self._learned = description.learned
         self.frames: VertexFrames | None = None
         if self._learned is not None:
-            self._learned.network.requires_grad_(False).to(self.simulator.device)
+            self._learned.network.requires_grad_(False)
             if self._learned.force_frame == COROTATED and not self.is_data_driven:
                 self.frames = VertexFrames(self.simulator.body, self.time_step, self.simulator.rest_positions)
         self.inputs = inputs_of(self.simulator, description)

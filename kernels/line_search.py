@@ -39,6 +39,8 @@ def decreases_enough(
     """
     if energy <= before + ARMIJO * step * slope:
         return True
+    if not wp.isfinite(energy):
+        return False
     return energy <= before + rounding and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from warp_resphys.data.camera import Lens
-from warp_resphys.dynamics.frames import rotations
 from warp_resphys.io.errors import InputError
 from warp_resphys.pictures.camera import CORRECTIONS, PlacedCamera
+from warp_resphys.stepping.rotations import rotations
 
 MATRIX = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENS = Lens(MATRIX, torch.tensor([-0.12, 0.05, 1e-3, -2e-3], dtype=torch.float64))

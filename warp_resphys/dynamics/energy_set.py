@@ -81,7 +81,7 @@ class EnergySet:
             for name in ("load", "begin_step", "at_pose")
         )
         self._remembering = [(i, pair) for i, pair in pairs if pair[1].memory]
-        self._rate_independent = [(i, pair) for i, pair in self._remembering if pair[1].rate_independent]
+        self._rate_independent = [(i, pair) for i, pair in pairs if pair[1].rate_independent]
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
         """Returns the values that follow from the parameters, by name, and the mass of the body."""

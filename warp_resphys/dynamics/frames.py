@@ -9,6 +9,7 @@ import torch
 
 from ..fem.body import Body
 from ..fem.elements import mean_gradients
+from ..stepping.rotations import rotations
 
 _ITERATIONS = 8  # of the polar decomposition; enough for stretches from 0.1 to 10
 _AT_ONCE = 100  # states processed together
@@ -111,13 +112,6 @@ class BaseFrame:
     def force_outside(self, force: torch.Tensor, step: int) -> torch.Tensor:
         """Inverse of `force_inside`."""
         return force @ self._at(step + 1)[0].mT
-
-
-def rotations(vectors: torch.Tensor) -> torch.Tensor:
-    """Returns rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad], differentiable also at zero."""
-    zero, (x, y, z) = torch.zeros_like(vectors[..., 0]), vectors.unbind(-1)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(skew)
 
 
 def base_movement(poses: torch.Tensor, time_step: float, gravity: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """State of a minimisation on its device, and the kernel launches that advance it (``kernels.minimisation``)."""
 
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,8 +9,8 @@ import warp as wp
 
 from ..energies.launcher import CapturedGraph, issue, warp_view
 from ..energies.potential import IncrementalPotential
+from ..kernels import feasibility, rounding
 from ..kernels import minimisation as kernels
-from ..kernels import rounding
 from ..kernels.lbfgs import lbfgs_kernels
 from ..kernels.line_search import accept_kernel
 from ..linalg.tiled import TiledSolver
@@ -113,18 +113,35 @@ class Minimiser:
         counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
         evaluate = [*p.evaluation, accept, summarise]
-        self._begin, self._evaluate = p.capture(begin, *evaluate), p.capture(*evaluate)
-        self._first_trial = p.capture(set_direction, *evaluate)
+        shorten_start, shorten_step = self._record_bounds(progress, search)
+        start, first_trial = [begin, *shorten_start], [set_direction, *shorten_step]
+        self._begin, self._evaluate = p.capture(*start, *evaluate), p.capture(*evaluate)
+        self._first_trial = p.capture(*first_trial, *evaluate)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
         kept, drawn = warp_view(p.zeros(n, 3), wp.vec3d), p.upload(signs, wp.vec3d)
         perturb = p.record_blocks(rounding.perturb, b, [progress, drawn, search.positions], [kept])
         compared = [progress, kept, evaluation.residual, search, history]
         check = p.record_blocks(rounding.check_rounding, b, compared, [])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
-        self._parts = SimpleNamespace(begin=begin, set_direction=set_direction, evaluate=evaluate)
+        self._parts = SimpleNamespace(begin=start, set_direction=first_trial, evaluate=evaluate)
         self._loop: CapturedGraph | None = None
         if self._runs_on_device:
             self._record_loop()
+
+    def _record_bounds(self, progress: Any, search: Any) -> tuple[list[Any], list[Any]]:
+        """Returns launches that shorten a start and a first trial to where the energy is finite."""
+        p, feasible = self._potential, self._potential.feasible
+        if feasible is None:
+            return [], []
+        share = warp_view(p.zeros(), wp.float64)
+        allow = p.record(feasibility.allow_all, (p.batch,), [], [share])
+        given, free = warp_view(feasible, wp.vec3d), warp_view(p.free_mask, wp.float64)
+        start = p.record(feasibility.shorten_start, (p.batch, p.n_vertices), [share, free, given, search], [])
+        step = p.record_blocks(feasibility.shorten_step, p.batch, [progress, share, search], [])
+        return (
+            [allow, *p.bounds(given, search.positions, share), start],
+            [allow, *p.bounds(search.origin, search.positions, share), step],
+        )
 
     @property
     def _runs_on_device(self) -> bool:
@@ -148,7 +165,7 @@ class Minimiser:
         def set_direction() -> None:
             issue(self._project)
             factors.solve()
-            issue(parts.set_direction)
+            issue(*parts.set_direction)
 
         def advance() -> None:
             wp.capture_if(requests, factorise)
@@ -157,10 +174,10 @@ class Minimiser:
             wp.capture_if(checks, lambda: issue(self._check_rounding))
 
         def solve() -> None:
-            issue(parts.begin, *parts.evaluate)
+            issue(*parts.begin, *parts.evaluate)
             wp.capture_while(active, advance)
 
-        commands = [parts.begin, *parts.evaluate, self._select, self._project, parts.set_direction]
+        commands = [*parts.begin, *parts.evaluate, self._select, self._project, *parts.set_direction]
         self._loop = p.capture_calls(solve, [*commands, self._check_rounding, *factors.commands])
 
     def minimise(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> None:

@@ -334,6 +334,19 @@ class Term(ABC):
         del values, positions
         return None
 
+    def feasible(self, values: Values) -> torch.Tensor | None:
+        """Returns positions (B, N, 3) of finite energy [m], if there are others; a solve does not pass by those."""
+        del values
+        return None
+
+    def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
+        """Returns launches that lower the share (B) of the way from one array of positions (B, N) to another.
+
+        Up to that share, which depends on no other term and no order, the energy is finite.
+        """
+        del values, origin, positions, share
+        return []
+
     @abstractmethod
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         """Returns the inputs that the kernels ``local_step`` and ``tangent`` have in common."""

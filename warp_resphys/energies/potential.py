@@ -227,6 +227,17 @@ class IncrementalPotential(Launcher):
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 
     @property
+    def feasible(self) -> torch.Tensor | None:
+        """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
+        pairs = zip(self.energies, self.own_values, strict=True)
+        return next((x for term, values in pairs if (x := term.feasible(values)) is not None), None)
+
+    def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
+        """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""
+        pairs = zip(self.energies, self.own_values, strict=True)
+        return [launch for term, values in pairs for launch in term.bounds(values, origin, positions, share)]
+
+    @property
     def couples_cells(self) -> bool:
         """Whether there may be `low_rank` columns."""
         return any(term.couples_cells for term in self.energies)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..data.base_motion import at_times
 from ..data.trials import Trials
-from ..dynamics.frames import rotations
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -19,6 +18,7 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..mesh.mesh import select_vertices
 from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import rotations
 from .actuators import DRIVING_QUANTITIES
 
 FloatArray = NDArray[np.float64]

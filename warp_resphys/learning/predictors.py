@@ -80,9 +80,7 @@ class Range:
 
     def to(self, device: torch.device) -> "Range":
         """Returns the range on a device."""
-        return Range(
-            self.low.to(device), self.high.to(device), None if self.missed is None else self.missed.to(device)
-        )
+        return Range(self.low.to(device), self.high.to(device), None if self.missed is None else self.missed.to(device))
 
     def description(self) -> dict[str, list[float]]:
         """Returns plain data for a checkpoint's metadata."""

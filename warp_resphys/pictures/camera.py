@@ -17,8 +17,8 @@ from typing import Final
 import torch
 
 from ..data.camera import Lens, projected
-from ..dynamics.frames import rotations
 from ..io.errors import InputError
+from ..stepping.rotations import rotations
 
 SHIFTS: Final = ("camera_shift_1", "camera_shift_2", "camera_shift_3")  # m
 TURNS: Final = ("camera_turn_1", "camera_turn_2", "camera_turn_3")  # rad

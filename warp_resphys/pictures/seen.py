@@ -10,11 +10,11 @@ import shapely
 import torch
 
 from ..data.observation import Observation
-from ..dynamics.frames import rotations
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import rotations
 from .camera import CORRECTIONS, PLACES, PlacedCamera
 from .clouds import Cloud, CloudDistances, distances_of
 from .motion import OF_RELEASE, ReleasedForce, at_own_times

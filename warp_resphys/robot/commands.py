@@ -9,13 +9,14 @@ import torch
 
 from ..data.base_motion import LARGEST_STEP
 from ..data.input_response import InputResponse, response_of, with_means
-from ..dynamics.frames import base_movement, rotations
+from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD, Strings
 from ..experiment.files import payload_inputs
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import rotations
 from ..stepping.state import State
 from .description import Description
 from .inputs import BASE, FORCE, RobotInput

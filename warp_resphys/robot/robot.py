@@ -68,7 +68,7 @@ class Robot:
     ) -> None:
         self.simulator = description.simulator(torch.device(device), on_failure)
         if description.learned is not None:
-            description = replace(description, learned=description.learned.to(self.simulator.device))
+            description = replace(description, learned=description.learned.to(torch.device(device)))
         self.description, self.folder = description, folder
         self.time_step, self.labels = self.simulator.time_step, description.labels
         observe = description.observe()

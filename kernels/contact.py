@@ -1,0 +1,209 @@
+"""Contact of points with obstacles: barrier and lagged, smoothed Coulomb friction (equations in ``energies.contact``).
+
+Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of its normal at the start of the step.
+"""
+
+import warp as wp
+
+from .obstacles import Obstacles, distance, turn_slope
+from .points import line_at
+
+wp.set_module_options({"enable_backward": False})
+
+ZERO, HALF, ONE, TWO, FOUR = (wp.float64(v) for v in (0.0, 0.5, 1.0, 2.0, 4.0))
+THIRD = wp.float64(1.0 / 3.0)
+INFINITE, UNDEFINED = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("nan")))
+KEPT = wp.constant(wp.float64(0.1))  # share of a gap that one iterate leaves at least
+
+
+@wp.struct
+class Friction:
+    """Friction of every point with every obstacle in a step; all but the first two (B, P, O)."""
+
+    coefficient: wp.array2d[wp.float64]  # (B, O) mu
+    slip: wp.array2d[wp.float64]  # (B, 1) slide at which friction is fully developed [m]
+    load: wp.array3d[wp.float64]  # normal force at the start [N]
+    normal: wp.array3d[wp.vec3d]  # normal at the start
+    reference: wp.array3d[wp.vec3d]  # position without slide [m]
+
+
+@wp.func
+def barrier(s: wp.float64) -> wp.vec3d:
+    """B = -(s - 1)^2 ln s, B' and B''; zero from s = 1 on."""
+    if s >= ONE:
+        return wp.vec3d(ZERO, ZERO, ZERO)
+    t, log = s - ONE, wp.log(s)
+    return wp.vec3d(-t * t * log, -TWO * t * log - t * t / s, -TWO * log - FOUR * t / s + t * t / (s * s))
+
+
+@wp.func
+def smoothed(y: wp.float64, slip: wp.float64) -> wp.vec3d:
+    """f(y), f'(y) / y and (f'(y) / y)' / y of the smoothed absolute value (Li et al. 2020), zero at zero."""
+    if y >= slip:
+        return wp.vec3d(y - THIRD * slip, ONE / y, -ONE / (y * y * y))
+    q = y / slip
+    last = ZERO
+    if y > ZERO:
+        last = -ONE / (slip * slip * y)
+    return wp.vec3d(slip * q * q * (ONE - THIRD * q), (TWO - q) / slip, last)
+
+
+@wp.func
+def slide(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.vec3d:
+    """u, the way of a point since the start of the step in the tangential plane of an obstacle."""
+    m, way = f.normal[b, p, k], x - f.reference[b, p, k]
+    return way - wp.dot(way, m) * m
+
+
+@wp.kernel
+def local_step(
+    active: wp.array[int],  # (B) zero: skip the environment
+    nodes: wp.array2d[int],
+    weights: wp.array2d[wp.float64],
+    area: wp.array[wp.float64],  # (P) [m^2]
+    o: Obstacles,
+    stiffness: wp.array2d[wp.float64],  # (B, O) kappa [Pa]
+    f: Friction,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    stress_out: wp.array2d[wp.vec3d],
+    energy_out: wp.array2d[wp.float64],
+):
+    """Force and energy of each point; not a number and infinite within an obstacle."""
+    b, p = wp.tid()
+    if active[b] == 0:
+        return
+    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    force, energy = wp.vec3d(), wp.float64(0.0)
+    for k in range(o.kind.shape[0]):
+        at = distance(o, b, k, x)
+        if at.d <= ZERO:
+            force, energy = wp.vec3d(UNDEFINED, UNDEFINED, UNDEFINED), wp.float64(INFINITE)
+        else:
+            e = barrier(at.d / o.reach)
+            factor = stiffness[b, k] * area[p]
+            force += (factor * e[1]) * at.n
+            energy += factor * o.reach * e[0]
+            most = f.coefficient[b, k] * f.load[b, p, k]
+            if most > ZERO:
+                u = slide(f, b, p, k, x)
+                v = smoothed(wp.length(u), f.slip[b, 0])
+                force += (most * v[1]) * u
+                energy += most * v[0]
+    stress_out[b, p] = force
+    energy_out[b, p] = energy
+
+
+@wp.func
+def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat33d:
+    """Second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
+    m, u = f.normal[b, p, k], slide(f, b, p, k, x)
+    v = smoothed(wp.length(u), f.slip[b, 0])
+    flat = -wp.outer(m, m)
+    for i in range(3):
+        flat[i, i] = flat[i, i] + ONE
+    return v[1] * flat + v[2] * wp.outer(u, u)
+
+
+@wp.kernel
+def tangent(
+    active: wp.array[int],
+    clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
+    nodes: wp.array2d[int],
+    weights: wp.array2d[wp.float64],
+    area: wp.array[wp.float64],
+    o: Obstacles,
+    stiffness: wp.array2d[wp.float64],
+    f: Friction,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
+):
+    """Second derivative; only that by the curvature of an obstacle has negative eigenvalues."""
+    b, p = wp.tid()
+    if active[b] == 0:
+        return
+    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    block = wp.mat33d()
+    for k in range(o.kind.shape[0]):
+        at = distance(o, b, k, x)
+        e = barrier(at.d / o.reach)
+        factor = stiffness[b, k] * area[p]
+        block += (factor * e[2] / o.reach) * wp.outer(at.n, at.n)
+        if clamp[b] == 0:
+            block += (factor * e[1]) * at.h
+        most = f.coefficient[b, k] * f.load[b, p, k]
+        if most > ZERO:
+            block += most * friction_tangent(f, b, p, k, x)
+    tangent_out[b, p, 0] = block
+
+
+@wp.struct
+class Slopes:
+    """Derivatives of a loss, (B, P, O) each: those of a point and an obstacle."""
+
+    place: wp.array3d[wp.vec3d]
+    turn: wp.array3d[wp.mat33d]
+    growth: wp.array3d[wp.float64]
+    stiffness: wp.array3d[wp.float64]
+    coefficient: wp.array3d[wp.float64]
+    load: wp.array3d[wp.float64]
+    normal: wp.array3d[wp.vec3d]
+    reference: wp.array3d[wp.vec3d]
+
+
+@wp.kernel
+def adjoint(
+    nodes: wp.array2d[int],
+    weights: wp.array2d[wp.float64],
+    area: wp.array[wp.float64],
+    o: Obstacles,
+    stiffness: wp.array2d[wp.float64],
+    f: Friction,
+    points_per_cell: int,
+    positions: wp.array2d[wp.vec3d],
+    direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
+    out: Slopes,
+):
+    """-z . d force / d value, at fixed positions."""
+    b, p, k = wp.tid()
+    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    z = line_at(direction, nodes, weights, b, p, p / points_per_cell)
+    at = distance(o, b, k, x)
+    e = barrier(at.d / o.reach)
+    factor = stiffness[b, k] * area[p]
+    # The loss is a phi + w . n, linearised in the distance phi and the normal n.
+    a, w = -(factor * e[2] / o.reach) * wp.dot(at.n, z), -(factor * e[1]) * z
+    out.stiffness[b, p, k] = -area[p] * e[1] * wp.dot(at.n, z)
+    out.growth[b, p, k] = -a
+    out.place[b, p, k] = -(a * at.n + at.h * w)
+    out.turn[b, p, k] = turn_slope(o, b, k, x, at, a, w)
+    mu, load, m = f.coefficient[b, k], f.load[b, p, k], f.normal[b, p, k]
+    u, way = slide(f, b, p, k, x), x - f.reference[b, p, k]
+    v = smoothed(wp.length(u), f.slip[b, 0])
+    work = -v[1] * wp.dot(u, z)
+    out.coefficient[b, p, k] = load * work
+    out.load[b, p, k] = mu * work
+    q = -(mu * load) * (v[1] * z + (v[2] * wp.dot(u, z)) * u)
+    out.normal[b, p, k] = -wp.dot(m, way) * q - wp.dot(q, m) * way
+    out.reference[b, p, k] = (mu * load) * (friction_tangent(f, b, p, k, x) * z)
+
+
+@wp.kernel
+def bound(
+    nodes: wp.array2d[int],
+    weights: wp.array2d[wp.float64],
+    o: Obstacles,
+    points_per_cell: int,
+    origin: wp.array2d[wp.vec3d],  # (B, N) without penetration [m]
+    positions: wp.array2d[wp.vec3d],  # (B, N) [m]
+    share: wp.array[wp.float64],  # (B) is lowered to the share of the way from origin that leaves `KEPT` of every gap
+):
+    """Bounds a step: a convex obstacle lies behind the tangential plane of its place nearest to a point."""
+    b, p, k = wp.tid()
+    cell = p / points_per_cell
+    x = line_at(origin, nodes, weights, b, p, cell)
+    at = distance(o, b, k, x)
+    fall = -wp.dot(at.n, line_at(positions, nodes, weights, b, p, cell) - x)
+    if fall > (ONE - KEPT) * at.d:
+        wp.atomic_min(share, b, (ONE - KEPT) * at.d / fall)

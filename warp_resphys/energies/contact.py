@@ -1,0 +1,379 @@
+r"""Contact of a body with rigid obstacles: a barrier against penetration, and Coulomb friction.
+
+A point of the surface, which stands for the area a, has with the distance d from an obstacle the energy
+
+    a kappa D B(d / D),     B(s) = -(s - 1)^2 ln s for s < 1, and 0 beyond,
+
+so that the pressure -kappa B'(d / D) begins at the distance D, has a continuous derivative, and grows without bound
+towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness kappa [Pa] is a constant: the gap of a
+resting body follows from it and is part of the geometry, about D (1 - sqrt(p / 3 kappa)) under a small pressure p.
+
+Friction of the coefficient mu, with the normal force lambda and the normal n of the start of a step, and the slide
+u = (1 - n n^T)(x - r) relative to the obstacle since then, has the energy
+
+    mu lambda f(|u|),     f'(y) = 2 y / e - y^2 / e^2 for y < e, and 1 beyond,     e = h v_s,
+
+with the slip speed v_s at which it is fully developed. A body that should stick creeps: at the share c of what friction
+can hold, with the speed v_s (1 - sqrt(1 - c)). As lambda and n depend on the state at the start of the step, gradients
+by it include them.
+
+In a static equilibrium after a state, friction acts against the slide since that state, with its normal forces.
+
+M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..fem.elements import Points
+from ..io.errors import InputError
+from ..kernels import contact as kernels
+from ..mesh.elements import FACES
+from ..mesh.mesh import Mesh, boundary_faces, face_triangles
+from ..stepping.constants import Constants
+from ..stepping.inputs import Inputs
+from ..stepping.quantity import Parameter, Quantity
+from ..stepping.rotations import rotations
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
+from .launcher import Launcher, warp_view
+from .obstacles import Obstacle, ObstacleSet, Pose
+
+STIFFNESS = Quantity("contact_stiffness", "Pa", 0.0, per="obstacle")
+FRICTION = Quantity("contact_friction", "", 0.0, closed=True, per="obstacle")
+GROWTH = Quantity("obstacle_growth", "m", per="obstacle", typical=1e-3)
+SHIFT = tuple(Quantity(f"obstacle_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz")
+TURN = tuple(Quantity(f"obstacle_turn_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz")
+MOTION = (
+    *(Quantity(f"obstacle_move_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz"),
+    *(Quantity(f"obstacle_rotate_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz"),
+)
+POSE: Final = ("contact_place", "contact_turn")
+FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
+_PUSHES = 50
+
+
+@dataclass(frozen=True)
+class ContactPoints(Points):
+    """Vertices of a surface."""
+
+    areas: NDArray[np.float64]  # (P,) [m^2]
+
+
+@dataclass(frozen=True)
+class Contact(Energy):
+    """Contact of a body with obstacles (equations in the module's docstring).
+
+    Parameters, one for each obstacle: ``contact_stiffness`` [Pa], ``contact_friction``, ``obstacle_growth``, by which
+    its surface lies further out [m], ``obstacle_x``, ``_y`` and ``_z``, by which it lies elsewhere [m], and
+    ``obstacle_turn_x``, ``_y`` and ``_z``, a rotation vector about its position [rad]. Inputs, if an obstacle moves,
+    are `MOTION`, which add to the last six. The points are the vertices of the surface.
+
+    Raises:
+        InputError: no obstacle, or a value out of range.
+    """
+
+    obstacles: Mapping[str, Obstacle]
+    stiffness: Parameter = 1e5  # kappa [Pa], a number or one for each obstacle
+    friction: Parameter = 0.0  # mu
+    distance: float = 1e-3  # D [m]
+    slip_speed: float = 1e-3  # v_s [m/s]
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not self.obstacles:
+            raise InputError("contact needs an obstacle or more: give them by name.")
+        for name in ("distance", "slip_speed"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")
+        STIFFNESS.check(self.stiffness)
+        FRICTION.check(self.friction)
+
+    @property
+    @override
+    def parameters(self) -> tuple[Quantity, ...]:
+        return (STIFFNESS, FRICTION, GROWTH, *SHIFT, *TURN)
+
+    @property
+    def moves(self) -> bool:
+        """Whether an obstacle moves."""
+        return any(obstacle.moves for obstacle in self.obstacles.values())
+
+    @property
+    def inputs(self) -> tuple[Quantity, ...]:  # type: ignore[override]
+        """Motions of the obstacles, if one moves."""
+        return MOTION if self.moves else ()
+
+    @property
+    @override
+    def count(self) -> int:
+        return len(self.obstacles)
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.obstacles)
+
+    @property
+    @override
+    def constants(self) -> Mapping[str, Parameter]:
+        zeros = {quantity.name: 0.0 for quantity in (GROWTH, *SHIFT, *TURN)}
+        return {STIFFNESS.name: self.stiffness, FRICTION.name: self.friction, **zeros}
+
+    @override
+    def points(self, mesh: Mesh) -> tuple[Points, ...]:
+        areas = vertex_areas(mesh)
+        vertices = np.flatnonzero(areas)
+        return (ContactPoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), areas[vertices]),)
+
+    @override
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "ContactTerm":
+        return ContactTerm(launcher, sets, self)
+
+    @override
+    def bind(self, site: EnergySite) -> "BoundContact":
+        return BoundContact(self, site)
+
+
+def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
+    """Returns the part of the surface that belongs to every vertex, (N,) [m^2]; its sum is that of the surface."""
+    faces, areas = boundary_faces(mesh), np.zeros(len(mesh.vertices))
+    if faces.shape[1] != FACES[faces.shape[1]].corners:
+        faces = face_triangles(faces)  # Integrals of quadratic shape functions vanish at corners.
+    face = FACES[faces.shape[1]]
+    places, weights = face.rule(2)
+    values, slopes = face.shape(places)
+    tangents = np.einsum("qkd,fki->fqdi", slopes, mesh.vertices[faces])
+    sizes = np.linalg.norm(np.cross(tangents[..., 0, :], tangents[..., 1, :]), axis=-1) * weights
+    np.add.at(areas, faces, np.einsum("fq,qk->fk", sizes, values))
+    return areas
+
+
+class BoundContact(BoundEnergy):
+    """Contact in a simulator.
+
+    Memory is the pose of the obstacles and that one step before, if one moves. Without memory, they have not moved.
+    """
+
+    rate_independent = True
+
+    def __init__(self, contact: Contact, site: EnergySite) -> None:
+        super().__init__(contact, site)
+        self._contact = contact
+        (points,) = site.points
+        like, obstacles = site.rest_positions, tuple(contact.obstacles.values())
+        assert isinstance(points, ContactPoints)
+        self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
+        self._area = site.tensor(points.areas)
+        self._shapes = ObstacleSet(obstacles, contact.distance, like.device)
+        self._place = site.tensor(np.array([o.position for o in obstacles]))
+        self._turn = site.tensor(np.stack([o.turn for o in obstacles]))
+        self._moving = site.tensor(np.array([float(o.moves) for o in obstacles]))
+        if contact.moves:
+            sizes = (("contact_place", "m", (3,)), ("contact_turn", "rotation", (3, 3)))
+            names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
+            self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
+        self._check(like[None], self.pose(contact.constants, {}), "at rest")
+
+    def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
+        """Returns the poses for parameters and inputs by name."""
+        values = [self._place.new_zeros(1, 1) + constants[q.name] for q in (*SHIFT, *TURN)]
+        for number, quantity in enumerate(MOTION):
+            if quantity.name in inputs:
+                values[number] = values[number] + self._moving * inputs[quantity.name]
+        rows = torch.broadcast_tensors(self._place[None, :, 0], *values)[1:]
+        shift, turn = torch.stack(rows[:3], -1), rotations(torch.stack(rows[3:], -1)) @ self._turn
+        growth = (self._place.new_zeros(1, 1) + constants[GROWTH.name]).expand(len(shift), len(self._place))
+        return Pose(self._place + shift, turn, growth)
+
+    @override
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+        values = self.energy.prepare(parameters)
+        pose = self.pose(values, {})
+        return {**values, "contact_place": pose.place, "contact_turn": pose.turn}
+
+    def _pose(self, inputs: Inputs, constants: Constants, batch: int) -> Pose:
+        """Returns the poses (B, O, ...) at the end of a step."""
+        names = (*POSE, GROWTH.name)
+        if self._contact.moves:
+            moved = self.pose({q.name: constants.value(q.name) for q in (GROWTH, *SHIFT, *TURN)}, inputs.actuation)
+            values = [moved.place, moved.turn, moved.growth]
+        else:
+            values = [constants.value(name) for name in names]
+        return Pose(*(value.expand(batch, *value.shape[1:]) for value in values))
+
+    @override
+    def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
+        state, stage = step.state, step.stage
+        now = self._pose(step.inputs, step.constants, state.batch)
+        before, earlier = self._remembered(step, now)
+        x = state.q[:, self._vertices]
+        d, n = self._shapes.distances(x, before)
+        if x.device.type == "cpu":  # On a GPU the host would wait.
+            self._check(state.q, before, "at the start of a step", d)
+        s = (d / self._contact.distance).clamp_max(1.0)
+        pressure = step.constants.value(STIFFNESS.name)[:, None] * (2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s)
+        reference = stage.velocity_reference[:, self._vertices, None].expand(-1, -1, self._contact.count, -1)
+        start = state.q
+        if self._contact.moves:
+            # Where an obstacle was at a point, it moves with the obstacle; so do the normals.
+            here = x[:, :, None].expand_as(reference)
+            inside = before.local(here)
+            ways, weights = (here, earlier.world(inside)), [weight for _, weight in stage.strain_weights] or [1.0]
+            was = sum(weight * way for weight, way in zip(weights, ways, strict=False))
+            reference = reference + now.world(inside) - was
+            n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
+            start = self._pushed_out(state.q.detach(), now, d.detach())
+        duration = stage.step if math.isfinite(stage.step) else self.site.time_step
+        values: dict[str, torch.Tensor | None] = {
+            "contact_load": pressure * self._area[:, None],
+            "contact_normal": n,
+            "contact_reference": reference,
+            "contact_slip": x.new_full((state.batch, 1), self._contact.slip_speed * duration),
+            "contact_start": start.detach(),
+        }
+        return values | dict(zip(POSE, (now.place, now.turn), strict=True))
+
+    def _remembered(self, step: EnergyStep, now: Pose) -> tuple[Pose, Pose]:
+        """Returns the poses at the start of a step and one step before."""
+        if not self._contact.moves:
+            return now, now
+        memory = step.state.memory
+        given = [memory.get(name) for name in (m.name for m in self.memory)]
+        if given[0] is None or given[1] is None:
+            rest = now if math.isfinite(step.stage.step) else self._pose(Inputs(), step.constants, step.state.batch)
+            return rest, rest
+        before = Pose(given[0], given[1], now.growth)
+        return before, before if given[2] is None or given[3] is None else Pose(given[2], given[3], now.growth)
+
+    @override
+    def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        if not self._contact.moves:
+            return {}
+        now = self._pose(step.inputs, step.constants, step.state.batch)
+        before, _ = self._remembered(step, now)
+        poses = (now.place, now.turn, before.place, before.turn)
+        return dict(zip((m.name for m in self.memory), poses, strict=True))
+
+    def _pushed_out(self, q: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> torch.Tensor:
+        """Returns positions (B, N, 3) as far from obstacles that have moved as before, at most half of D.
+
+        Args:
+            q: (B, N, 3) positions before the motion [m].
+            pose: poses after it.
+            gaps: (B, P, O) distances before it [m].
+        """
+        need, free = gaps.clamp_max(0.5 * self._contact.distance), self._free
+        for _ in range(_PUSHES):
+            d, n = self._shapes.distances(q[:, self._vertices], pose)
+            lack, worst = ((need - d) * free[:, None]).max(-1)
+            if not bool((lack > 1e-12).any()):
+                break
+            normal = n.gather(2, worst[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+            q = q.index_add(1, self._vertices, (lack.clamp_min(0.0))[..., None] * normal)
+        self._check(q, pose, "after an obstacle has moved")
+        return q
+
+    @property
+    def _free(self) -> torch.Tensor:
+        """(P,) one at vertices that are not fixed."""
+        fixed = torch.as_tensor(self.site.body.fixed_vertices + self.site.first, device=self._vertices.device)
+        return (~torch.isin(self._vertices, fixed)).to(self._area)
+
+    def _check(self, q: torch.Tensor, pose: Pose, when: str, d: torch.Tensor | None = None) -> None:
+        """Raises InputError where a vertex is within an obstacle."""
+        if d is None:
+            d, _ = self._shapes.distances(q[:, self._vertices], pose)
+        deepest = d.detach().amin((0, 1))
+        if bool((deepest <= 0.0).any()):
+            worst = int(deepest.argmin())
+            vertex = int(self._vertices[d.detach()[..., worst].amin(0).argmin()])
+            raise InputError(
+                f"the body is within the obstacle {self._contact.names[worst]!r} {when}: vertex {vertex} by "
+                f"{-1e3 * float(deepest[worst]):.3g} mm; move one of them, or move obstacles less in a step."
+            )
+
+
+class ContactTerm(Term):
+    """Kernels of contact with obstacles."""
+
+    _kernels = kernels
+
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], contact: Contact) -> None:
+        super().__init__(launcher, sets)
+        (s,) = sets
+        assert isinstance(s.source, ContactPoints)
+        self._count, self._vertices, self._reach = contact.count, s.n_vertices, contact.distance
+        self._shapes = ObstacleSet(tuple(contact.obstacles.values()), contact.distance, launcher.device)
+        self._area = torch.as_tensor(s.source.areas, device=launcher.device)
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        p, o = self.n_points, self._count
+        return {
+            **dict(zip((*POSE, GROWTH.name), ((o, 3), (o, 3, 3), (o,)), strict=True)),
+            STIFFNESS.name: (o,),
+            FRICTION.name: (o,),
+            "contact_slip": (1,),
+            **dict(zip(FRICTION_VALUES, ((p, o), (p, o, 3), (p, o, 3)), strict=True)),
+            "contact_start": (self._vertices, 3),
+        }
+
+    def _obstacles(self, values: Values) -> Any:
+        return self._shapes.at(*(value_of(values, name) for name in (*POSE, GROWTH.name)))
+
+    @override
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        friction, types = kernels.Friction(), (wp.float64, wp.vec3d, wp.vec3d)
+        friction.coefficient = warp_view(value_of(values, FRICTION.name), wp.float64)
+        friction.slip = warp_view(value_of(values, "contact_slip"), wp.float64)
+        for name, kind in zip(FRICTION_VALUES, types, strict=True):
+            setattr(friction, name.removeprefix("contact_"), warp_view(value_of(values, name), kind))
+        stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+        area = warp_view(self._area, wp.float64)
+        obstacles = self._obstacles(values)
+        return [s.nodes, s.gradients, area, obstacles, stiffness, friction, s.points_per_cell, positions]
+
+    @override
+    def feasible(self, values: Values) -> torch.Tensor | None:
+        return value_of(values, "contact_start")
+
+    @override
+    def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
+        own, (s,) = self.launcher, self.sets
+        inputs = [s.nodes, s.gradients, self._obstacles(values), s.points_per_cell, origin, positions]
+        return [own.record(kernels.bound, (own.batch, s.n_points, self._count), inputs, [share])]
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        return value_of(values, STIFFNESS.name).sum(1, keepdim=True) / self._reach * self._area
+
+    @override
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+        own, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
+        slopes, out = kernels.Slopes(), dict[str, torch.Tensor]()
+        names = ("place", "turn", "growth", "stiffness", "coefficient", "load", "normal", "reference")
+        extra: dict[str, tuple[tuple[int, ...], Any]] = {"turn": ((3, 3), wp.mat33d)}
+        extra |= dict.fromkeys(("place", "normal", "reference"), ((3,), wp.vec3d))
+        for name in names:
+            shape, kind = extra.get(name, ((), wp.float64))
+            out[name] = own.zeros(*size, *shape)
+            setattr(slopes, name, warp_view(out[name], kind))
+        inputs = self._arguments(s, values, warp_view(positions, wp.vec3d))
+        command = own.record(kernels.adjoint, (own.batch, *size), [*inputs, warp_view(direction, wp.vec3d), slopes], [])
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            own.launch(command)
+            shared = zip((*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name), names, strict=False)
+            sums = {value: out[name].sum(1) for value, name in shared}
+            return sums | {name: out[name.removeprefix("contact_")].clone() for name in FRICTION_VALUES}
+
+        return differentiate

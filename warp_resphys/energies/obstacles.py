@@ -1,0 +1,211 @@
+"""Rigid obstacles of bodies: convex shapes at a place, which may move."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from ..io.errors import InputError
+from ..kernels import obstacles as kernels
+from ..kernels.modules import launch_stream
+from .launcher import BLOCK, warp_view
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """A convex rigid body.
+
+    Args:
+        position: of its centre; of a half-space, of any point of its plane [m].
+        axis: direction of its z axis: the normal of a half-space, or the axis of a capsule or cylinder.
+        moves: whether it has the inputs `contact.MOTION`.
+
+    Raises:
+        InputError: a size that is not positive, or an axis of no length.
+    """
+
+    kind: ClassVar[int]
+    lengths: ClassVar[tuple[str, ...]] = ()  # fields that are lengths
+
+    position: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    moves: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        name = type(self).__name__
+        for key in ("position", "axis"):
+            value = getattr(self, key)
+            if np.shape(value) != (3,) or not np.isfinite(np.asarray(value, dtype=float)).all():
+                raise InputError(f"{name}.{key} is {value}: it must be three finite numbers.")
+        if not np.linalg.norm(self.axis) > 0.0:
+            raise InputError(f"{name}.axis is {self.axis}: it must have a length.")
+        for key in self.lengths:
+            value = getattr(self, key)
+            if not (np.isfinite(value) & (np.asarray(value) > 0.0)).all():
+                raise InputError(f"{name}.{key} is {value}: it must be positive, in metres.")
+
+    @property
+    def size(self) -> Vector:
+        """Sizes as in `kernels.obstacles` [m]."""
+        return (0.0, 0.0, 0.0)
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """(3, 3) rotation from its axes to those of the world."""
+        z = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
+        x = np.eye(3)[int(np.argmin(np.abs(z)))]
+        x = x - (x @ z) * z
+        x /= np.linalg.norm(x)
+        return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HalfSpace(Obstacle):
+    """All points below a plane with the normal ``axis``, such as a floor."""
+
+    kind: ClassVar[int] = int(kernels.HALF_SPACE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(Obstacle):
+    """A sphere."""
+
+    kind: ClassVar[int] = int(kernels.SPHERE)
+    lengths: ClassVar[tuple[str, ...]] = ("radius",)
+    radius: float  # [m]
+
+    @property
+    @override
+    def size(self) -> Vector:
+        return (self.radius, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rod(Obstacle):
+    """A shape of revolution."""
+
+    lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
+    radius: float  # [m]
+    length: float  # along its axis, of a capsule without its half-spheres [m]
+
+    @property
+    @override
+    def size(self) -> Vector:
+        return (self.radius, self.radius, 0.5 * self.length)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule(_Rod):
+    """All points within a radius of a segment."""
+
+    kind: ClassVar[int] = int(kernels.CAPSULE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(_Rod):
+    """A cylinder with flat ends."""
+
+    kind: ClassVar[int] = int(kernels.CYLINDER)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Obstacle):
+    """A cuboid; its edges are along the axes of the world unless ``axis`` or inputs turn it."""
+
+    kind: ClassVar[int] = int(kernels.BOX)
+    lengths: ClassVar[tuple[str, ...]] = ("edges",)
+    edges: Vector  # [m]
+
+    @property
+    @override
+    def size(self) -> Vector:
+        x, y, z = self.edges
+        return (0.5 * x, 0.5 * y, 0.5 * z)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Places (B, O, 3) [m], rotations (B, O, 3, 3) and growth (B, O) [m] of obstacles."""
+
+    place: torch.Tensor
+    turn: torch.Tensor
+    growth: torch.Tensor
+
+    def local(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns positions (B, P, O, 3) in the axes of the obstacles, from those in the world."""
+        return torch.einsum("boji,bpoj->bpoi", self.turn, x - self.place[:, None])
+
+    def world(self, y: torch.Tensor) -> torch.Tensor:
+        """Inverse of `local`."""
+        return torch.einsum("boij,bpoj->bpoi", self.turn, y) + self.place[:, None]
+
+
+class ObstacleSet:
+    """Shapes of obstacles on a device.
+
+    Args:
+        obstacles: the obstacles.
+        reach: distance at which contact begins [m].
+        device: a torch device.
+    """
+
+    def __init__(self, obstacles: tuple[Obstacle, ...], reach: float, device: torch.device) -> None:
+        kinds, sizes = np.array([o.kind for o in obstacles], dtype=np.int32), np.array([o.size for o in obstacles])
+        self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
+        self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
+        self._reach = reach
+
+    def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
+        """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
+        o = kernels.Obstacles()
+        o.kind, o.size, o.reach = self._kinds, self._sizes, wp.float64(self._reach)
+        o.place, o.turn = warp_view(place, wp.vec3d), warp_view(turn, wp.mat33d)
+        o.growth = warp_view(growth, wp.float64)
+        return o
+
+    def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
+        d, n = _Distances.apply(self, x, pose.place, pose.turn, pose.growth)
+        return d, n
+
+
+class _Distances(torch.autograd.Function):
+    """Signed distances and normals (`kernels.obstacles.measure`)."""
+
+    @override
+    @staticmethod
+    def forward(
+        ctx: Any, shapes: ObstacleSet, x: torch.Tensor, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        given = [value.detach().double().contiguous() for value in (x, place, turn, growth)]
+        size = (*x.shape[:2], place.shape[1])
+        d, n = given[0].new_zeros(size), given[0].new_zeros(*size, 3)
+        views = [warp_view(given[0], wp.vec3d), warp_view(d, wp.float64), warp_view(n, wp.vec3d)]
+        _launch(kernels.measure, size, x.device, [shapes.at(*given[1:]), *views])
+        ctx.shapes = shapes
+        ctx.save_for_backward(*given)
+        return d.to(x.dtype), n.to(x.dtype)
+
+    @override
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_d: torch.Tensor, by_n: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        given = ctx.saved_tensors
+        by = [slope.double().contiguous() for slope in (by_d, by_n)]
+        position, turn = torch.zeros_like(by[1]), by[0].new_zeros(*by[0].shape, 3, 3)
+        views = [warp_view(given[0], wp.vec3d), warp_view(by[0], wp.float64), warp_view(by[1], wp.vec3d)]
+        views += [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
+        _launch(kernels.measure_adjoint, by[0].shape, by_d.device, [ctx.shapes.at(*given[1:]), *views])
+        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -by[0].sum(1))
+        return None, *(slope.to(by_d.dtype) for slope in slopes)
+
+
+def _launch(kernel: Any, size: tuple[int, ...], device: torch.device, arguments: list[Any]) -> None:
+    wp.launch(kernel, dim=size, inputs=arguments, device=str(device), stream=launch_stream(device), block_dim=BLOCK)

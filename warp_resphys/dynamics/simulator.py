@@ -110,6 +110,8 @@ class Simulator:
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
         placed = place_energies(body, self.material)
+        if any(item.energy.is_barrier for item in placed):
+            self._check_barriers()
         energies = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
         self._energies, self._terms = energies, PotentialTerms(energies, self._coordinates, self.coupling)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
@@ -125,6 +127,18 @@ class Simulator:
         self._workspaces: dict[int, Workspace] = {}
         self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
+
+    def _check_barriers(self) -> None:
+        """Raises InputError for settings by which states would pass through barriers."""
+        if self.integrator == "midpoint":
+            raise InputError(
+                "integrator is midpoint, which extrapolates from the middle of a step and may penetrate: with contact, "
+                "choose implicit_euler or bdf2."
+            )
+        if self.settings.name == "projective_dynamics":
+            raise InputError(
+                "solver is projective_dynamics, whose constant matrix knows no contact: choose quasi_newton."
+            )
 
     @property
     def materials(self) -> dict[str, Material]:

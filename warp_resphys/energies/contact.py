@@ -25,7 +25,7 @@ M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4)
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch
@@ -79,6 +79,8 @@ class Contact(Energy):
     Raises:
         InputError: no obstacle, or a value out of range.
     """
+
+    is_barrier: ClassVar[bool] = True
 
     obstacles: Mapping[str, Obstacle]
     stiffness: Parameter = 1e5  # kappa [Pa], a number or one for each obstacle

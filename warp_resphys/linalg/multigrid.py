@@ -212,7 +212,8 @@ def _level(level: Any, device: torch.device) -> _Level:
     blocks = torch.as_tensor(a.data[row == a.indices], device=device)
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(blocks))
     matrix = _sparse(a, device)
-    x = 1.0 + torch.sin(torch.arange(a.shape[0], device=device, dtype=torch.float64))[None]
+    # A smooth start has too little of the largest eigenvector, and the smoother would not be positive definite.
+    x = torch.as_tensor(np.random.default_rng(0).standard_normal((1, a.shape[0])), device=device)
     for _ in range(_POWER_STEPS):
         x = _block_diagonal(inverse, _times(matrix, x / torch.linalg.vector_norm(x)))
     largest = _MARGIN * float(torch.linalg.vector_norm(x))

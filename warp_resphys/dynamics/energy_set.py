@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ..energies.base import BoundEnergy, EnergySite, Memory, Term
+from ..energies.contact import BoundContact, ContactForces
 from ..energies.explicit import ExplicitEnergy
 from ..energies.placed import PlacedEnergy
 from ..fem.body import Body
@@ -163,6 +164,22 @@ class EnergySet:
     ) -> dict[str, torch.Tensor]:
         """Returns the memory variables of a static equilibrium (B, N, 3) after a state."""
         return self._remembered(self._rate_independent, state, _endless_stage(state), inputs, constants, terms, q, q)
+
+    def contacts(
+        self,
+        state: State,
+        stage: ImplicitStage,
+        inputs: Inputs,
+        constants: Constants,
+        terms: Sequence[Term],
+        x: torch.Tensor,
+    ) -> dict[str, ContactForces]:
+        """Returns the contact of a step with solution x (B, N, 3), by the name of the body, if there are several."""
+        return {
+            placed.prefix.removesuffix("_"): bound.forces(placed.step(state, stage, inputs, constants, terms[i]), x)
+            for i, (placed, bound) in enumerate(self._pairs)
+            if isinstance(bound, BoundContact)
+        }
 
     @staticmethod
     def _remembered(

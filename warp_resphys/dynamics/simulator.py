@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..energies.contact import ContactForces
 from ..energies.explicit import ExplicitEnergy
 from ..energies.materials import Corotated, Material
 from ..energies.placement import Materials, joined_names, place_energies
@@ -291,6 +292,27 @@ class Simulator:
         stage = self.method.stage(state, self.time_step)
         x = self.method.solution_for(state, q)
         return State(q, state.v, memory=self._end_step(state, stage, inputs or _NO_INPUTS, constants, x, q))
+
+    def contacts(
+        self, state: State, after: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
+    ) -> dict[str, ContactForces]:
+        """Returns gaps, forces, slides and sticking at the end of a step, differentiable.
+
+        Args:
+            state: state at the start of the step.
+            after: state at its end.
+            inputs: inputs during the step.
+            parameters: parameters or prepared constants (`prepare`).
+
+        Returns:
+            Contact by the name of the body, which is empty for a single body.
+
+        Raises:
+            InputError: wrong shapes, or values that are not finite.
+        """
+        inputs, constants = self._checked(state, inputs, parameters)
+        terms, stage = self.workspace(state.batch).potential.energies, self.method.stage(state, self.time_step)
+        return self._energies.contacts(state, stage, inputs, constants, terms, after.q)
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None

@@ -158,6 +158,30 @@ def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
     return areas
 
 
+@dataclass(frozen=True)
+class ContactForces:
+    """Contact at the end of a step, for every vertex of the surface and every obstacle, differentiable.
+
+    Attributes:
+        obstacles: names of the O obstacles.
+        vertices: (P,) vertices of the surface.
+        gap: (B, P, O) distances [m].
+        normal: (B, P, O, 3) forces of the barrier on the vertices [N].
+        friction: (B, P, O, 3) forces of friction on them [N].
+        slide: (B, P, O) slide in the step [m].
+        sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
+            fully developed.
+    """
+
+    obstacles: tuple[str, ...]
+    vertices: torch.Tensor
+    gap: torch.Tensor
+    normal: torch.Tensor
+    friction: torch.Tensor
+    slide: torch.Tensor
+    sticks: torch.Tensor
+
+
 class BoundContact(BoundEnergy):
     """Contact in a simulator.
 
@@ -220,8 +244,6 @@ class BoundContact(BoundEnergy):
         d, n = self._shapes.distances(x, before)
         if x.device.type == "cpu":  # On a GPU the host would wait.
             self._check(state.q, before, "at the start of a step", d)
-        s = (d / self._contact.distance).clamp_max(1.0)
-        pressure = step.constants.value(STIFFNESS.name)[:, None] * (2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s)
         reference = stage.velocity_reference[:, self._vertices, None].expand(-1, -1, self._contact.count, -1)
         start = state.q
         if self._contact.moves:
@@ -235,13 +257,40 @@ class BoundContact(BoundEnergy):
             start = self._pushed_out(state.q.detach(), now, d.detach())
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {
-            "contact_load": pressure * self._area[:, None],
+            "contact_load": self._load(d, step.constants),
             "contact_normal": n,
             "contact_reference": reference,
             "contact_slip": x.new_full((state.batch, 1), self._contact.slip_speed * duration),
             "contact_start": start.detach(),
         }
         return values | dict(zip(POSE, (now.place, now.turn), strict=True))
+
+    def _load(self, d: torch.Tensor, constants: Constants) -> torch.Tensor:
+        """Returns the normal forces (B, P, O) at distances [N]."""
+        s = (d / self._contact.distance).clamp_max(1.0)
+        pressure = 2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s
+        return constants.value(STIFFNESS.name)[:, None] * self._area[:, None] * pressure
+
+    def forces(self, step: EnergyStep, x: torch.Tensor) -> ContactForces:
+        """Returns the forces at the solution x (B, N, 3) of a step's implicit stage [m]."""
+        values = self.begin_step(step)
+        at, pose = x[:, self._vertices], self._pose(step.inputs, step.constants, step.state.batch)
+        d, n = self._shapes.distances(at, pose)
+        normal, way = value_of(values, "contact_normal"), at[:, :, None] - value_of(values, "contact_reference")
+        u = way - (way * normal).sum(-1, keepdim=True) * normal
+        slip, square = value_of(values, "contact_slip")[..., None], u.square().sum(-1)
+        y = torch.where(square > 0.0, square.clamp_min(torch.finfo(u.dtype).tiny).sqrt(), 0.0)
+        factor = torch.where(y < slip, (2.0 - y / slip) / slip, 1.0 / y.clamp_min(torch.finfo(u.dtype).tiny))
+        most = step.constants.value(FRICTION.name)[:, None] * value_of(values, "contact_load")
+        return ContactForces(
+            self._contact.names,
+            self._vertices,
+            d,
+            self._load(d, step.constants)[..., None] * n,
+            -(most * factor)[..., None] * u,
+            y,
+            (value_of(values, "contact_load") > 0.0) & (y < slip),
+        )
 
     def _remembered(self, step: EnergyStep, now: Pose) -> tuple[Pose, Pose]:
         """Returns the poses at the start of a step and one step before."""

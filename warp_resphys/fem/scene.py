@@ -17,7 +17,7 @@ _FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with 
 
 
 class Scene(Body):
-    """Bodies in one simulator, with their vertices concatenated; there is no contact between them.
+    """Bodies in one simulator, with their vertices concatenated; there is no contact between them, only with obstacles.
 
     Names of parameters, inputs and memory variables are prefixed with the body's name, as in ``finger_tension``.
 

@@ -5,7 +5,7 @@ Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of
 
 import warp as wp
 
-from .obstacles import Obstacles, distance, turn_slope
+from .obstacles import GRID, Obstacles, distance, turn_slope
 from .points import line_at
 
 wp.set_module_options({"enable_backward": False})
@@ -13,6 +13,7 @@ wp.set_module_options({"enable_backward": False})
 ZERO, HALF, ONE, TWO, FOUR = (wp.float64(v) for v in (0.0, 0.5, 1.0, 2.0, 4.0))
 THIRD = wp.float64(1.0 / 3.0)
 INFINITE, UNDEFINED = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("nan")))
+ADVANCES = wp.constant(100)
 KEPT = wp.constant(wp.float64(0.1))  # share of a gap that one iterate leaves at least
 
 
@@ -119,7 +120,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Second derivative; only that by the curvature of an obstacle has negative eigenvalues."""
+    """Second derivative; a clamped one leaves out that by the curvature of obstacles."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -199,11 +200,30 @@ def bound(
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     share: wp.array[wp.float64],  # (B) is lowered to the share of the way from origin that leaves `KEPT` of every gap
 ):
-    """Bounds a step: a convex obstacle lies behind the tangential plane of its place nearest to a point."""
+    """Bounds a step.
+
+    A convex obstacle lies behind the tangential plane of its place nearest to a point. Along another one the step goes
+    on as far as the largest slope of its distance allows, several times.
+    """
     b, p, k = wp.tid()
     cell = p / points_per_cell
     x = line_at(origin, nodes, weights, b, p, cell)
+    way = line_at(positions, nodes, weights, b, p, cell) - x
     at = distance(o, b, k, x)
-    fall = -wp.dot(at.n, line_at(positions, nodes, weights, b, p, cell) - x)
-    if fall > (ONE - KEPT) * at.d:
-        wp.atomic_min(share, b, (ONE - KEPT) * at.d / fall)
+    kept = KEPT * at.d
+    if o.kind[k] != GRID:
+        fall = -wp.dot(at.n, way)
+        if fall > at.d - kept:
+            wp.atomic_min(share, b, (at.d - kept) / fall)
+        return
+    most = o.size[k][1] * wp.length(way)
+    t = wp.float64(0.0)
+    for _ in range(ADVANCES):
+        gap = at.d - kept
+        if most * (ONE - t) <= gap:
+            return
+        t += gap / most
+        if gap < kept:
+            break
+        at = distance(o, b, k, x + t * way)
+    wp.atomic_min(share, b, t)

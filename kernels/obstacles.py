@@ -1,8 +1,8 @@
-"""Signed distances of convex obstacles, with their first two derivatives, and the pull-back of derivatives by them.
+"""Signed distances of obstacles, with their first two derivatives, and the pull-back of derivatives by them.
 
 A point is at y = R^T (x - c) in the axes of an obstacle with place c and rotation R. The signed distance phi(y) of a
-convex obstacle is convex, so that from a point with the distance d and the normal n = grad phi no way w is shorter than
-d + n . w. Sizes s are in metres; the axis of an obstacle is its z.
+convex obstacle is convex, so that it is d + n . w or more after a way w from a point with the distance d and the normal
+n = grad phi. Sizes s are in metres; the axis of an obstacle is its z.
 
 ================  ==================================================
 `HALF_SPACE`      z <= 0
@@ -10,6 +10,7 @@ d + n . w. Sizes s are in metres; the axis of an obstacle is its z.
 `CAPSULE`         radius s_0 around a segment of half the length s_2
 `BOX`             halves of the edges s
 `CYLINDER`        radius s_0, half of the length s_2
+`GRID`            any shape, by cubic B-splines on a grid of distances
 ================  ==================================================
 """
 
@@ -17,8 +18,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-HALF_SPACE, SPHERE, CAPSULE, BOX, CYLINDER = (wp.constant(k) for k in range(5))
-ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
+HALF_SPACE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = (wp.constant(k) for k in range(6))
+ZERO, ONE, HALF, SIXTH = wp.float64(0.0), wp.float64(1.0), wp.float64(0.5), wp.float64(1.0 / 6.0)
+TWO, THREE, FOUR = wp.float64(2.0), wp.float64(3.0), wp.float64(4.0)
 LEAST = wp.constant(wp.float64(1e-150))  # keeps a division by a length defined
 
 
@@ -27,7 +29,10 @@ class Obstacles:
     """Obstacles of a batch, O of them."""
 
     kind: wp.array[int]  # (O)
-    size: wp.array[wp.vec3d]  # (O) s [m]
+    size: wp.array[wp.vec3d]  # (O) s [m]; of a grid: spacing, largest slope, and least distance at its boundary
+    low: wp.array[wp.vec3d]  # (O) first node of a grid [m]
+    nodes: wp.array[wp.vec4i]  # (O) of a grid: numbers of nodes, and index of its first coefficient
+    coefficients: wp.array[wp.float64]  # of the B-splines of all grids, z fastest [m]
     reach: wp.float64  # distance D at which contact begins [m]
     place: wp.array2d[wp.vec3d]  # (B, O) c [m]
     turn: wp.array2d[wp.mat33d]  # (B, O) R
@@ -36,7 +41,7 @@ class Obstacles:
 
 @wp.struct
 class Distance:
-    """A signed distance [m], its gradient and its second derivative, which has no negative eigenvalues."""
+    """A signed distance [m], its gradient and its second derivative."""
 
     d: wp.float64
     n: wp.vec3d
@@ -121,6 +126,59 @@ def from_cylinder(y: wp.vec3d, s: wp.vec3d) -> Distance:
 
 
 @wp.func
+def spline(t: wp.float64, derivative: int) -> wp.vec4d:
+    """Weights of four coefficients at the share t of the interval between the second and the third."""
+    s = ONE - t
+    if derivative == 1:
+        middle = wp.vec2d(t * (HALF * THREE * t - TWO), -s * (HALF * THREE * s - TWO))
+        return wp.vec4d(-HALF * s * s, middle[0], middle[1], HALF * t * t)
+    if derivative == 2:
+        return wp.vec4d(s, THREE * t - TWO, THREE * s - TWO, t)
+    middle = wp.vec2d(FOUR - THREE * t * t * (ONE + s), FOUR - THREE * s * s * (ONE + t))
+    return wp.vec4d(SIXTH * s * s * s, SIXTH * middle[0], SIXTH * middle[1], SIXTH * t * t * t)
+
+
+@wp.func
+def from_grid(o: Obstacles, k: int, y: wp.vec3d) -> Distance:
+    """Returns the interpolated distance; outside of the grid, that from it and the least distance at its boundary."""
+    out = Distance()
+    spacing, shape = o.size[k][0], o.nodes[k]
+    first = wp.vec3i()
+    share = wp.vec3d()
+    inside = wp.vec3d()
+    for i in range(3):
+        place = (y[i] - o.low[k][i]) / spacing
+        inside[i] = wp.clamp(place, ONE, wp.float64(shape[i] - 2))
+        first[i] = wp.min(int(inside[i]), shape[i] - 3)
+        share[i] = inside[i] - wp.float64(first[i])
+        out.n[i] = spacing * (place - inside[i])
+    away = wp.length(out.n)
+    if away > ZERO:
+        out.d = o.size[k][2] + away
+        out.n = out.n / away
+        return out
+    out.n = wp.vec3d()
+    for a in range(4):
+        for b in range(4):
+            start = shape[3] + ((first[0] - 1 + a) * shape[1] + first[1] - 1 + b) * shape[2] + first[2] - 1
+            line = wp.vec3d()
+            for c in range(4):
+                value = o.coefficients[start + c]
+                for m in range(3):
+                    line[m] = line[m] + value * spline(share[2], m)[c]
+            u = wp.vec3d(spline(share[0], 0)[a], spline(share[0], 1)[a], spline(share[0], 2)[a])
+            v = wp.vec3d(spline(share[1], 0)[b], spline(share[1], 1)[b], spline(share[1], 2)[b])
+            out.d += u[0] * v[0] * line[0]
+            out.n += wp.vec3d(u[1] * v[0] * line[0], u[0] * v[1] * line[0], u[0] * v[0] * line[1])
+            xy, xz, yz = u[1] * v[1] * line[0], u[1] * v[0] * line[1], u[0] * v[1] * line[1]
+            xx, yy, zz = u[2] * v[0] * line[0], u[0] * v[2] * line[0], u[0] * v[0] * line[2]
+            out.h += wp.mat33d(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+    out.n = out.n / spacing
+    out.h = out.h / (spacing * spacing)
+    return out
+
+
+@wp.func
 def distance(o: Obstacles, b: int, k: int, x: wp.vec3d) -> Distance:
     """Returns the signed distance of a position from obstacle k, in the axes of the world."""
     turn = o.turn[b, k]
@@ -136,8 +194,10 @@ def distance(o: Obstacles, b: int, k: int, x: wp.vec3d) -> Distance:
         out.d = out.d - s[0]
     elif kind == BOX:
         out = from_box(y, s)
-    else:
+    elif kind == CYLINDER:
         out = from_cylinder(y, s)
+    else:
+        out = from_grid(o, k, y)
     out.d = out.d - o.growth[b, k]
     out.n = turn * out.n
     out.h = turn * out.h * wp.transpose(turn)
@@ -184,3 +244,12 @@ def measure_adjoint(
     a, w = by_distance[b, p, k], by_normal[b, p, k]
     position_out[b, p, k] = a * at.n + at.h * w
     turn_out[b, p, k] = turn_slope(o, b, k, x, at, a, w)
+
+
+@wp.kernel
+def from_surface(surface: wp.uint64, places: wp.array[wp.vec3], distance_out: wp.array[float]):
+    """Signed distances of places from a closed surface [m]."""
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(surface, places[i], 1.0e6)
+    nearest = wp.mesh_eval_position(surface, query.face, query.u, query.v)
+    distance_out[i] = query.sign * wp.length(places[i] - nearest)

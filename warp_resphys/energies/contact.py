@@ -22,6 +22,7 @@ In a static equilibrium after a state, friction acts against the slide since tha
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -44,7 +45,9 @@ from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
-from .obstacles import Obstacle, ObstacleSet, Pose
+from .obstacles import Grid, Obstacle, ObstacleSet, Pose
+
+log = logging.getLogger(__name__)
 
 STIFFNESS = Quantity("contact_stiffness", "Pa", 0.0, per="obstacle")
 FRICTION = Quantity("contact_friction", "", 0.0, closed=True, per="obstacle")
@@ -58,6 +61,7 @@ MOTION = (
 POSE: Final = ("contact_place", "contact_turn")
 FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
 _PUSHES = 50
+_DEEP = 0.3  # share of D within which a start is warned of
 
 
 @dataclass(frozen=True)
@@ -206,7 +210,7 @@ class BoundContact(BoundEnergy):
             sizes = (("contact_place", "m", (3,)), ("contact_turn", "rotation", (3, 3)))
             names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
-        self._check(like[None], self.pose(contact.constants, {}), "at rest")
+        self._check_start(like)
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""
@@ -255,10 +259,11 @@ class BoundContact(BoundEnergy):
             reference = reference + now.world(inside) - was
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
             start = self._pushed_out(state.q.detach(), now, d.detach())
+        length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {
-            "contact_load": self._load(d, step.constants),
-            "contact_normal": n,
+            "contact_load": self._load(d, step.constants) * length[..., 0],
+            "contact_normal": n / length,
             "contact_reference": reference,
             "contact_slip": x.new_full((state.batch, 1), self._contact.slip_speed * duration),
             "contact_start": start.detach(),
@@ -337,6 +342,33 @@ class BoundContact(BoundEnergy):
         """(P,) one at vertices that are not fixed."""
         fixed = torch.as_tensor(self.site.body.fixed_vertices + self.site.first, device=self._vertices.device)
         return (~torch.isin(self._vertices, fixed)).to(self._area)
+
+    def _check_start(self, rest: torch.Tensor) -> None:
+        """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""
+        contact, thickness = self._contact, float((rest.amax(0) - rest.amin(0)).min())
+        if contact.distance > thickness:
+            raise InputError(
+                f"contact.distance is {1e3 * contact.distance:g} mm and the body {1e3 * thickness:g} mm thick: take a "
+                "hundredth to a tenth of that."
+            )
+        for name, obstacle in contact.obstacles.items():
+            if isinstance(obstacle, Grid) and obstacle.margin < contact.distance:
+                raise InputError(
+                    f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
+                    f"{1e3 * contact.distance:g} mm: give it a larger margin."
+                )
+        pose = self.pose(contact.constants, {})
+        d, _ = self._shapes.distances(rest[None, self._vertices], pose)
+        self._check(rest[None], pose, "at rest", d)
+        least = d.amin((0, 1))
+        if bool((least < _DEEP * contact.distance).any()):
+            log.warning(
+                "The body starts %.2g mm from %s, deep in its barrier, which throws it away: start it at "
+                "contact.distance (%g mm) or further, or hold it there.",
+                1e3 * float(least.min()),
+                contact.names[int(least.argmin())],
+                1e3 * contact.distance,
+            )
 
     def _check(self, q: torch.Tensor, pose: Pose, when: str, d: torch.Tensor | None = None) -> None:
         """Raises InputError where a vertex is within an obstacle."""

@@ -1,12 +1,15 @@
-"""Rigid obstacles of bodies: convex shapes at a place, which may move."""
+"""Rigid obstacles of bodies: shapes at a place, which may move."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.ndimage
 import torch
+import trimesh
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
@@ -19,7 +22,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """A convex rigid body.
+    """A rigid body.
 
     Args:
         position: of its centre; of a half-space, of any point of its plane [m].
@@ -130,6 +133,84 @@ class Box(Obstacle):
         return (0.5 * x, 0.5 * y, 0.5 * z)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grid(Obstacle):
+    """Any shape, by its signed distances at the nodes of a grid, interpolated by cubic B-splines.
+
+    Edges are rounded over about a spacing. Around the grid, the distance is that from it and ``margin``.
+
+    Raises:
+        InputError: fewer than four nodes along an axis, or distances at the boundary that are not positive.
+    """
+
+    kind: ClassVar[int] = int(kernels.GRID)
+    lengths: ClassVar[tuple[str, ...]] = ("spacing",)
+    distances: NDArray[np.float64]  # (I, J, K) [m]
+    spacing: float  # of the nodes [m]
+    low: Vector  # place of the first node in the axes of the obstacle [m]
+
+    def __post_init__(self) -> None:
+        """Checks the grid."""
+        super().__post_init__()
+        shape = np.shape(self.distances)
+        if len(shape) != 3 or min(shape) < 8 or not np.isfinite(self.distances).all():
+            raise InputError(f"Grid.distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes.")
+        if not self.margin > 0.0:
+            raise InputError("Grid.distances reach zero at the boundary of the grid: let it end outside of the shape.")
+
+    @cached_property
+    def margin(self) -> float:
+        """Least distance one node within the boundary, where the interpolation ends [m]."""
+        inner = np.ones(np.shape(self.distances), dtype=bool)
+        inner[2:-2, 2:-2, 2:-2] = False
+        return float(self.distances[inner].min())
+
+    @cached_property
+    def coefficients(self) -> NDArray[np.float64]:
+        """(I, J, K) coefficients of the B-splines [m]."""
+        return np.asarray(scipy.ndimage.spline_filter(self.distances, 3, output=np.float64, mode="mirror"))
+
+    @property
+    @override
+    def size(self) -> Vector:
+        slopes = np.gradient(self.distances, self.spacing)
+        return (self.spacing, 1.2 * float(np.sqrt(sum(slope**2 for slope in slopes)).max()), self.margin)
+
+    @classmethod
+    def of_surface(
+        cls, vertices: ArrayLike, triangles: ArrayLike, spacing: float, margin: float | None = None, **pose: Any
+    ) -> "Grid":
+        """Returns the grid of a closed surface.
+
+        Args:
+            vertices: (N, 3) in the axes of the obstacle [m].
+            triangles: (T, 3) counter-clockwise seen from outside.
+            spacing: of the nodes [m]: half of the smallest radius, or less.
+            margin: by which the grid is larger than the surface; four spacings if omitted [m].
+            pose: position, axis and ``moves``.
+
+        Raises:
+            InputError: a surface that is not closed.
+        """
+        surface = trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles))
+        if not surface.is_watertight:
+            raise InputError("the surface of the obstacle is not closed, so that it has no inside: repair it.")
+        width = (4.0 * spacing if margin is None else margin) + 2.0 * spacing
+        low, high = surface.bounds + np.array([[-width], [width]])
+        shape = np.ceil((high - low) / spacing).astype(int) + 1
+        nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
+        own = wp.Mesh(
+            wp.array(surface.vertices, dtype=wp.vec3, device="cpu"),
+            wp.array(surface.faces.ravel(), dtype=int, device="cpu"),
+            support_winding_number=True,
+        )
+        out = wp.zeros(nodes[..., 0].size, dtype=float, device="cpu")
+        places: Any = wp.array(nodes.reshape(-1, 3), dtype=wp.vec3, device="cpu")
+        wp.launch(kernels.from_surface, out.size, [own.id, places], [out], device="cpu")
+        distances = out.numpy().astype(float).reshape(nodes.shape[:3])
+        return cls(distances=distances, spacing=spacing, low=(low[0], low[1], low[2]), **pose)
+
+
 @dataclass(frozen=True)
 class Pose:
     """Places (B, O, 3) [m], rotations (B, O, 3, 3) and growth (B, O) [m] of obstacles."""
@@ -161,11 +242,22 @@ class ObstacleSet:
         self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
         self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
         self._reach = reach
+        grids = [o if isinstance(o, Grid) else None for o in obstacles]
+        parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
+        firsts = np.cumsum([0, *(len(part) for part in parts)])
+        nodes = [
+            (0,) * 4 if g is None else (*g.distances.shape, first) for g, first in zip(grids, firsts, strict=False)
+        ]
+        low = [(0.0,) * 3 if grid is None else grid.low for grid in grids]
+        self._nodes: Any = wp.array(np.array(nodes, dtype=np.int32), dtype=wp.vec4i, device=str(device))
+        self._low: Any = wp.array(np.array(low), dtype=wp.vec3d, device=str(device))
+        self._coefficients: Any = wp.array(np.concatenate(parts), dtype=wp.float64, device=str(device))
 
     def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
         """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
         o = kernels.Obstacles()
         o.kind, o.size, o.reach = self._kinds, self._sizes, wp.float64(self._reach)
+        o.nodes, o.low, o.coefficients = self._nodes, self._low, self._coefficients
         o.place, o.turn = warp_view(place, wp.vec3d), warp_view(turn, wp.mat33d)
         o.growth = warp_view(growth, wp.float64)
         return o

@@ -51,9 +51,7 @@ muscles = [
 ]
 floor = Contact({"floor": HalfSpace()}, friction=0.6, stiffness=2e4, distance=1e-3, slip_speed=5e-3)
 silicone = Corotated(6e4, 0.45, density=1070.0, stiffness_damping=4e-3)
-simulator = Simulator(
-    Body(mesh, energies=[Muscles(muscles), floor]), silicone, time_step=0.01, relative_tolerance=1e-6
-)
+simulator = Simulator(Body(mesh, energies=[Muscles(muscles), floor]), silicone, time_step=0.01, relative_tolerance=1e-6)
 
 # %% [markdown]
 # ## Gaits
@@ -101,7 +99,9 @@ grid = torch.cartesian_prod(phase, phase)
 with torch.no_grad():
     ways, motions = crawl(waves(grid))
 best = int(ways.argmax())
-print(f"best of 36 waves: {1e3 * ways[best]:.1f} mm in {STEPS * simulator.time_step:g} s, phases {np.round(grid[best].tolist(), 2)} rad")
+print(
+    f"best of 36 waves: {1e3 * ways[best]:.1f} mm in {STEPS * simulator.time_step:g} s, phases {np.round(grid[best].tolist(), 2)} rad"
+)
 
 # %% [markdown]
 # ## A gait by gradients

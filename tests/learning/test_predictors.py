@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from warp_resphys import State
+from warp_resphys.experiment.models import Learned
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.predictors import LearnedPredictor, Range
@@ -109,3 +110,10 @@ def test_a_checkpoint_keeps_it(trained, tmp_path):
             assert again.missed is None
         else:
             torch.testing.assert_close(again.missed, own.missed)
+
+
+def test_a_model_moves_to_a_device_with_its_range():
+    learned = Learned(torch.nn.Linear(2, 1), BOX).to(torch.device("meta"))
+    assert {x.device.type for x in (*learned.range_.edges, learned.range_.missed, *learned.network.parameters())} == {
+        "meta"
+    }

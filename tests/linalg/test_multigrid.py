@@ -8,6 +8,8 @@ from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.catalogue import make_material
+from warp_resphys.energies.contact import Contact
+from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.fem.body import Body
 from warp_resphys.linalg import multigrid
 from warp_resphys.linalg.conjugate_gradients import conjugate_gradients
@@ -89,6 +91,20 @@ def test_the_cycle_is_symmetric_and_positive_definite():
     operator = cycle.apply(torch.eye(solver.n, dtype=torch.float64)).numpy()
     np.testing.assert_allclose(operator, operator.T, rtol=0, atol=1e-10 * np.abs(operator).max())
     assert np.linalg.eigvalsh(0.5 * (operator + operator.T))[0] > 0.0
+
+
+def test_no_eigenvalue_exceeds_what_the_smoother_is_made_for():
+    """Also where few vertices are stiff: the tip is pressed against a floor."""
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (9, 3, 3))
+    slope = HalfSpace(position=(0.0, 0.0, -2e-3), axis=(-0.019, 0.0, 1.0))  # 0.1 mm below the tip
+    floor = Contact({"floor": slope}, stiffness=1e5)
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[floor])
+    simulator = Simulator(body, make_material("corotated", youngs_modulus=2.15e5, poissons_ratio=0.45, density=1070.0))
+    solver, values = system(simulator)
+    for level in solver.factor(values).factors[0].cycle._levels:
+        root = torch.block_diag(*torch.linalg.cholesky(level.inverse)).numpy()
+        largest = np.linalg.eigvalsh(root.T @ level.matrix.to_dense().numpy() @ root)[-1]
+        assert 0.8 * level.largest < largest < level.largest
 
 
 def test_a_free_body_has_the_rigid_motions_as_its_near_null_space():

@@ -10,8 +10,8 @@
 #
 # A soft slab with three muscles along its lower side crawls by friction: it arches, so that one end presses harder on
 # the floor than the other, and the other end slides. Gradients pass through contact and friction
-# ([the equations](../theory.md#contact)), also where vertices stick, slide and lift off, and find a gait that is faster than any of
-# a grid of waves.
+# ([the equations](../theory.md#contact)), also where vertices stick, slide and lift off, and find a gait that is faster
+# than any of a grid of waves.
 #
 # ## The body and the floor
 
@@ -56,8 +56,8 @@ simulator = Simulator(Body(mesh, energies=[Muscles(muscles), floor]), silicone, 
 # %% [markdown]
 # ## Gaits
 #
-# A gait is a stress of every muscle, between 0 and 10 kPa, with a period of half a second: a constant and two harmonics,
-# through a sigmoid. Three periods are simulated; the first one begins gently.
+# A gait is a stress of every muscle, between 0 and 10 kPa, with a period of half a second: a constant and two
+# harmonics, through a sigmoid. Three periods are simulated; the first one begins gently.
 
 # %%
 PERIOD, STEPS, MOST = 0.5, 150, 1e4  # s, steps, Pa
@@ -99,8 +99,9 @@ grid = torch.cartesian_prod(phase, phase)
 with torch.no_grad():
     ways, motions = crawl(waves(grid))
 best = int(ways.argmax())
+middle_phase, front_phase = grid[best].tolist()
 print(
-    f"best of 36 waves: {1e3 * ways[best]:.1f} mm in {STEPS * simulator.time_step:g} s, phases {np.round(grid[best].tolist(), 2)} rad"
+    f"best of 36 waves: {1e3 * ways[best]:.1f} mm in 1.5 s, with phases of {middle_phase:.2f} and {front_phase:.2f} rad"
 )
 
 # %% [markdown]
@@ -161,8 +162,8 @@ plt.show()
 # %% [markdown]
 # ## What pushes
 #
-# `Simulator.contacts` has gaps, normal forces, friction and the slide of every vertex in a step; they are differentiable too. Over the
-# last period, the forces of friction of each half of the slab:
+# `Simulator.contacts` has gaps, normal forces, friction and the slide of every vertex in a step; they are
+# differentiable too. Over the last period, the forces of friction of each half of the slab:
 
 # %%
 forces = []

@@ -15,6 +15,7 @@ from ..experiment.laboratory import laboratory_simulator, make_setup
 from ..experiment.target import substeps_of
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
+from ..report.obstacles import ObstacleSurface
 from ..robot.state import RobotState
 from ..settings.stages import PlayedSettings
 from ..stepping.inputs import Inputs
@@ -100,6 +101,11 @@ class Laboratory(World):
     def bodies(self) -> tuple[IntArray, FloatArray]:
         triangles = boundary_triangles(self._simulator.body.mesh)
         return triangles, np.asarray(self._frame.apply(self.state.q.double().cpu().numpy()))
+
+    @override
+    def obstacles(self) -> ObstacleSurface:
+        surface = ObstacleSurface.of(self._simulator.body)
+        return replace(surface, points=self._frame.apply(surface.points))
 
     def seen(self, number: int) -> FloatArray:
         """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..report.obstacles import ObstacleSurface
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
@@ -47,3 +49,7 @@ class World(ABC):
     def bodies(self) -> tuple[IntArray, FloatArray]:
         """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
+
+    def obstacles(self) -> ObstacleSurface:
+        """Surfaces of the obstacles that the bodies touch."""
+        return ObstacleSurface()

@@ -6,8 +6,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..report.bodies import BODIES, BODY_LIGHT, sharp_edges
+from ..report.bodies import BODIES, BODY_LIGHT, obstacle_layers, sharp_edges
 from ..report.camera import frame_of
+from ..report.obstacles import ObstacleSurface
 from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, view_axes
 
 _SIZE: Final = (480, 480)  # px
@@ -24,12 +25,13 @@ class Camera:
     Args:
         up: (3,) upward direction of the pictures.
         points: (P, 3) that fill the frame [m].
+        obstacles: that the robots touch.
 
     Raises:
         DrawingError: this machine cannot render.
     """
 
-    def __init__(self, up: FloatArray, points: FloatArray) -> None:
+    def __init__(self, up: FloatArray, points: FloatArray, obstacles: ObstacleSurface) -> None:
         up = up / np.linalg.norm(up)
         side = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
         side /= np.linalg.norm(side)
@@ -37,6 +39,7 @@ class Camera:
         self._axes = view_axes(np.cos(_TILT) * level + np.sin(_TILT) * up, up)
         self._focus, half = frame_of(points, self._axes, _MARGIN)
         self._half = float(half.max())
+        self._around = obstacle_layers(obstacles)
         self._renderer = Renderer()
 
     def pictures(
@@ -64,6 +67,7 @@ class Camera:
         before = {name: self._half * share for name, share in _BEFORE.items()}
         radii = {name: self._half * share for name, share in _RADII.items()}
         layers = [
+            *self._around,
             Layer("balls", paths[:, :1], None, _GOAL, size=radii["goal"], shift=before["goals"]),
             Layer("balls", markers, None, INK, size=radii["marker"], shift=before["markers"]),
         ]

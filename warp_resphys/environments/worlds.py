@@ -11,6 +11,7 @@ from ..control.reduced import ReducedModel
 from ..control.world import BoolArray, FloatArray, IntArray, World
 from ..io.errors import InputError
 from ..mesh.mesh import boundary_triangles
+from ..report.obstacles import ObstacleSurface
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 
@@ -98,6 +99,10 @@ class RobotWorld(World):
     @override
     def bodies(self) -> tuple[IntArray, FloatArray]:
         return boundary_triangles(self.robot.simulator.body.mesh), self._state.q.double().cpu().numpy()
+
+    @override
+    def obstacles(self) -> ObstacleSurface:
+        return ObstacleSurface.of(self.robot.simulator.body, self._nominal.parameters)
 
 
 class ReducedWorld(World):

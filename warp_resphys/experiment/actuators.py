@@ -1,6 +1,6 @@
-"""Actuators of a body from the configuration (chambers, tendons, muscles), and the input that drives them."""
+"""What acts on a body by its configuration: actuators, the input that drives them, a fluid, and obstacles."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, cast
@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..energies.base import Energy
+from ..energies.contact import Contact
 from ..energies.fibres import Fibres
 from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
+from ..energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
@@ -24,6 +26,13 @@ from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, Tendo
 from ..settings.mesh import PlaceSettings
 from ..stepping.quantity import Quantity
 
+_SHAPES: Final[Mapping[str, Callable[..., Obstacle]]] = {
+    "half_space": HalfSpace,
+    "sphere": Sphere,
+    "capsule": Capsule,
+    "cylinder": Cylinder,
+    "box": Box,
+}
 # Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
@@ -35,7 +44,9 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 
 
 def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSettings | None) -> list[Energy]:
-    """Builds the energies of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium`` and ``payload_string``.
+    """Builds the energies of a body besides its material.
+
+    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string`` and ``obstacles``.
 
     Args:
         settings: of the body.
@@ -61,6 +72,8 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
         if payload_at is None:
             raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
         energies.append(Strings([select_vertices(mesh, **payload_at.arguments())], **dict(settings.payload_string)))
+    if settings.obstacles:
+        energies.append(build_contact(settings))
     return energies
 
 
@@ -167,3 +180,16 @@ def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:
         for name, bundle in settings.bundles.items()
     ]
     return Muscles(muscles, settings.stiffness, toe=settings.toe)
+
+
+def build_contact(settings: BodySettings) -> Contact:
+    """Builds the contact of a body with its ``obstacles``."""
+    obstacles = {}
+    for name, obstacle in settings.obstacles.items():
+        own = dict(obstacle)
+        obstacles[name] = _SHAPES[own.pop("shape")](**own)
+    values = dict(settings.contact)
+    for key in ("stiffness", "friction"):
+        if isinstance(values[key], dict):
+            values[key] = [values[key][name] for name in obstacles]
+    return Contact(obstacles, **values)

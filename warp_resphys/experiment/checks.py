@@ -128,6 +128,8 @@ def _check_control(run: RunSettings, body: Body) -> None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
     if drive_of(run, body) is None:
         raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
+    if run.obstacles:
+        raise InputError("control plans with a reduced model, which has no contact: set control=none, or obstacles={}.")
     if run.is_laboratory and any(trial.payload for trial in trials_of(run)):
         raise InputError("control does not support payloads: remove them from laboratory.trials.")
 

@@ -35,6 +35,7 @@ from ..report.data import (
     models_in_figures,
 )
 from ..report.notes import error_notes, kept_note, material_note, network_note, published_note, target_note
+from ..report.obstacles import ObstacleSurface
 from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
@@ -92,6 +93,7 @@ def make_report(context: StageContext) -> None:
         tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
+        obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
         trials=trials,
         film=film,
         driven=driven,

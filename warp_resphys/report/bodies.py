@@ -1,7 +1,7 @@
 """Scenes of bodies: coloured by their distance from a target, or in motion with measured and simulated markers."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +10,7 @@ from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
 from .camera import axes_from_below, frame_of, height_of, motion_axes, picture_size
 from .data import MODELS, mean_distance
+from .obstacles import OBSTACLE, OBSTACLE_LIGHT, ObstacleSurface
 from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, RenderScene, View, pace, view_axes
 
 _LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
@@ -52,13 +53,16 @@ def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: F
     }
 
 
-def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> RenderScene | None:
+def distance_scene(
+    mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray, obstacles: ObstacleSurface | None = None
+) -> RenderScene | None:
     """Return deformed bodies, coloured by the distance from the target's vertices, from zero to the largest of each.
 
     Args:
         mesh: The undeformed body, drawn as an outline.
         positions: (N, 3) deformed positions [m] by name; diverged bodies are left out.
         target: (N, 3) positions of the target [m].
+        obstacles: That the body touches.
 
     Returns:
         A view of each body; None if all of them have diverged.
@@ -73,13 +77,14 @@ def distance_scene(mesh: Mesh, positions: Mapping[str, FloatArray], target: Floa
     triangles, edges = boundary_triangles(mesh), face_edges(mesh)
     outline, line = (width * _LONGER_SIDE for width in _WIDTHS)
     sharp = sharp_edges(mesh.vertices, triangles)
+    around = [] if obstacles is None else obstacle_layers(obstacles)
     rest = Layer("lines", mesh.vertices, sharp, OUTLINE, size=outline, shift=-nudge)
     views = []
     for name, most in largest.items():
         q, paint = positions[name], np.linalg.norm(positions[name] - target, axis=1) / most
         surface = Layer("surface", q, triangles, paint=paint, light=(1.0 - SHADE, SHADE))
         rims = Layer("lines", q, edges, "black", size=line, opacity=0.35, shift=0.2 * nudge)
-        views.append(View([surface, rims, rest], axes, focus, half[1]))
+        views.append(View([surface, rims, rest, *around], axes, focus, half[1]))
     return RenderScene(views, picture_size(half, _LONGER_SIDE))
 
 
@@ -107,6 +112,18 @@ def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
     return np.asarray(edges[~smooth])
 
 
+def obstacle_layers(obstacles: ObstacleSurface, width: float = 1.5) -> list[Layer]:
+    """Return layers of obstacles, with lines [px wide] along their sharp edges."""
+    if not len(obstacles.points):
+        return []
+    points, triangles = obstacles.points, obstacles.triangles
+    edges = sharp_edges(points, triangles)
+    return [
+        Layer("surface", points, triangles, OBSTACLE, light=OBSTACLE_LIGHT),
+        *([Layer("lines", points, edges, OUTLINE, size=width)] if len(edges) else []),
+    ]
+
+
 @dataclass(frozen=True, eq=False)
 class ComparedMotion:
     """A measured motion and its simulations, at the same T times."""
@@ -120,6 +137,7 @@ class ComparedMotion:
     gravity: FloatArray  # (3,) direction of gravity.
     from_below: bool = False  # Whether the second view is from below, as for hanging bodies, rather than a close-up.
     target: FloatArray | None = None  # (T, N, 3) [m] of the vertices, where every one is observed.
+    obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # Of the last model.
 
     @property
     def is_fast(self) -> bool:
@@ -210,7 +228,8 @@ def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0)
         second = axes
         near, near_height = _follow(motion, simulated, axes, size)
         near = np.where(np.isfinite(near), near, middle)
-    layers = [*_bodies(motion.mesh, positions, height), _stems(motion, positions[-1], simulated[-1])]
+    layers = [*obstacle_layers(motion.obstacles), *_bodies(motion.mesh, positions, height)]
+    layers.append(_stems(motion, positions[-1], simulated[-1]))
     room = headroom * height
     return [
         View([*layers, *_dots(motion.measured, simulated, half_height, _RADII[size])], turned, focus, half_height)

@@ -15,9 +15,10 @@ from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
-from .bodies import face_edges, sharp_edges
+from .bodies import face_edges, obstacle_layers, sharp_edges
 from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
+from .obstacles import ObstacleSurface
 from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, RenderScene, View, chain, draw, view_axes
 
 TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
@@ -44,6 +45,7 @@ class MeshSummary:
     chambers: tuple[Chamber, ...]  # Closed chambers.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
     inside: str = "Chambers"  # Title of the coloured parts.
+    obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
 
     @property
     def volume(self) -> float:
@@ -129,6 +131,7 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
         Layer("lines", vertices, face_edges(mesh), INK, size=line, opacity=0.6, shift=lift),
         *([clamped] if len(summary.fixed) else []),
         *dots,
+        *obstacle_layers(summary.obstacles, line),
     ]
     cut = [
         Layer("surface", vertices, outer, BODY, light=cut_light, plane=plane),

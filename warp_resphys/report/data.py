@@ -15,6 +15,7 @@ from ..mesh.mesh import Mesh
 from ..settings.run import RunSettings
 from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity
+from .obstacles import ObstacleSurface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -148,6 +149,7 @@ class RunReport:
     tip: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # Vertices, where all are observed.
     chambers: tuple[Chamber, ...] = ()  # Chambers under pressure.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
+    obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
     trials: TrialResults | None = None  # Test trials; None over the folds.
     film: Film | None = None  # Motion of the bodies in one of them.
     driven: Driven | None = None  # Inputs of all trials.

@@ -46,7 +46,11 @@ def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, F
 
 
 def _draw_pictures(data: RunReport, motion: ComparedMotion) -> list[Pixels]:
-    shape = None if data.trials is None or data.sees_markers else distance_scene(data.mesh, *_bodies(data.trials))
+    shape = (
+        None
+        if data.trials is None or data.sees_markers
+        else distance_scene(data.mesh, *_bodies(data.trials), data.obstacles)
+    )
     return draw(motion.scene(), *([] if shape is None else [shape]))
 
 
@@ -85,7 +89,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     whole = None if trials.labels else trials.target[row][frames]
     at_rest = trials.bound[points]
     return ComparedMotion(
-        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole
+        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole, data.obstacles
     )
 
 
@@ -234,7 +238,7 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         constants = data.settings.simulation.parameters
         density = fmean(value for name, value in constants.items() if name.endswith("density"))
         coloured = f"{quantity.per}s".capitalize()
-        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured)
+        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
         draw_mesh(path, summary, trials.bound if trials.labels else None)
         return drawn_file(path, alt, caption)
 

@@ -44,6 +44,7 @@ class View {
     this.modes = decoded(data.modes, Int16Array);
     this.weights = decoded(data.weights, Float32Array);
     this.errors = data.errors === null ? null : bytes(data.errors);
+    this.obstacles = decoded(data.obstacles, Float32Array);
     this.measured = decoded(data.measured, Float32Array);
     this.simulated = decoded(data.simulated, Float32Array);
     this.place = new Float32Array(this.rest.length);
@@ -86,7 +87,7 @@ class View {
     this.places = gl.createBuffer();
     this.paints = gl.createBuffer();
     this.indices = {};
-    for (const name of ["faces", "edges", "sharp"]) {
+    for (const name of ["faces", "edges", "sharp", "sides"]) {
       const index = decoded(this.data[name], Uint32Array);
       this.indices[name] = {buffer: gl.createBuffer(), count: index.length};
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indices[name].buffer);
@@ -280,6 +281,10 @@ class View {
       this.load(this.rest);
       this.lines("sharp", [...outline, 1], 0.0);
     }
+    if (this.obstacles.length) {
+      this.load(this.obstacles);
+      this.surface(rgb(data.solid), 1.0, false, 0.0, "sides");
+    }
     if (front !== undefined && this.body(front, frame)) {
       const painted = coloured && this.paint(front, frame);
       this.load(this.place);
@@ -338,9 +343,9 @@ class View {
     gl.depthMask(!clear);
   }
 
-  surface(tone, opacity, painted, nearer) {
+  surface(tone, opacity, painted, nearer, name = "faces") {
     this.style(1, [...tone, opacity], painted, nearer);
-    this.indexed("faces", this.gl.TRIANGLES);
+    this.indexed(name, this.gl.TRIANGLES);
   }
 
   lines(name, tone, nearer) {

@@ -20,6 +20,7 @@ from .bodies import ComparedMotion, face_edges, sharp_edges, without_diverged
 from .camera import frame_of, motion_axes, upwards
 from .data import MODELS, FloatArray, mean_distance
 from .figures import TONES
+from .obstacles import OBSTACLE
 from .page import ViewInSpace
 from .render import COLOUR_MAP, MEASURED, OUTLINE
 
@@ -81,6 +82,8 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         "faces": _encoded(faces, "<u4"),
         "edges": _encoded(np.searchsorted(surface, face_edges(motion.mesh)), "<u4"),
         "sharp": _encoded(sharp_edges(rest, faces), "<u4"),
+        "obstacles": _encoded(motion.obstacles.points, "<f4"),
+        "sides": _encoded(motion.obstacles.triangles, "<u4"),
         "modes": _encoded(np.rint(basis / scales[:, None]), "<i2"),
         "scales": scales.tolist(),
         "weights": _encoded(weights, "<f4"),
@@ -96,6 +99,7 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         "colours": [to_hex(stop) for stop in colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, _STOPS))],
         "ink": {"light": TONES["ink"].light, "dark": TONES["ink"].dark},
         "outline": OUTLINE,
+        "solid": OBSTACLE,
         "seen": MEASURED,
     }
     payload = Markup(json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

@@ -4,8 +4,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
+from ..io.errors import listed
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
+from .obstacles import ContactSettings, ObstacleSettings
 
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
@@ -253,6 +255,21 @@ class BodySettings(Settings):
     payload_string: StringSettings | None = setting(
         None, "string on which payloads hang; null: they are attached to the body"
     )
+    obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
+    contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
+
+    @model_validator(mode="after")
+    def _touches(self) -> Self:
+        if not self.obstacles and self.contact != ContactSettings():
+            raise ValueError("contact is set, but obstacles has none: name an obstacle, or leave contact out.")
+        for key in ("stiffness", "friction"):
+            values = getattr(self.contact, key)
+            if isinstance(values, dict) and values.keys() != self.obstacles.keys():
+                raise ValueError(
+                    f"contact.{key} has values for {listed(values) or 'none'}, but the obstacles are "
+                    f"{listed(self.obstacles)}: give one for each."
+                )
+        return self
 
 
 class SteppedSettings(BodySettings):

@@ -20,6 +20,7 @@ from ..report.camera import hangs
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times, shown_models
 from ..report.driven_film import DrivenBodies
+from ..report.obstacles import ObstacleSurface
 from ..report.render import DrawingError, RenderScene, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
@@ -131,7 +132,8 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     bound = robot.observe(robot.state(mesh.vertices))[0].double().cpu().numpy()[some]
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
     from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
-    return ComparedMotion(mesh, times, played.markers[frames][:, some], positions, markers, bound, gravity, from_below)
+    seen, obstacles = played.markers[frames][:, some], ObstacleSurface.of(robot.simulator.body, robot.parameters)
+    return ComparedMotion(mesh, times, seen, positions, markers, bound, gravity, from_below, obstacles=obstacles)
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:

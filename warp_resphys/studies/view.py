@@ -22,6 +22,7 @@ from ..io.settings import Count, Positive, Settings, Word, setting
 from ..report.bodies import sharp_edges
 from ..report.camera import upwards
 from ..report.figures import TONES
+from ..report.obstacles import OBSTACLE, ObstacleSurface
 from ..report.render import MEASURED
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, load, trial_names
@@ -193,6 +194,17 @@ class Page:
         self._target = server.scene.add_mesh_simple(
             "/measured body", places, live.faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
         )
+        self._obstacles: Any = None
+        around = self._around()
+        if len(around.points):
+            self._obstacles = server.scene.add_mesh_simple(
+                "/obstacles",
+                self._shown(around.points),
+                around.triangles.astype(np.uint32),
+                color=_bytes(OBSTACLE),
+                flat_shading=True,
+                side="double",
+            )
         edges = places[self._sharp]
         self._edges = server.scene.add_line_segments("/edges", edges, (30, 40, 50), thickness=0.003)
         none = np.zeros((1, 3), dtype=np.float32)
@@ -222,6 +234,11 @@ class Page:
         async def _(client: Any) -> None:
             if client.client_id == self._holder:
                 self._let_go()
+
+    def _around(self) -> ObstacleSurface:
+        """Obstacles of the robot, with its current parameters."""
+        self._placed = self._live.robot
+        return ObstacleSurface.of(self._placed.simulator.body, self._placed.parameters)
 
     def _let_go(self) -> None:
         self._holder = None
@@ -389,6 +406,8 @@ class Page:
 
     def _show(self) -> None:
         live = self._live
+        if self._obstacles is not None and self._placed is not live.robot:
+            self._obstacles.vertices = self._shown(self._around().points)
         if self._shown_state is live.state and self._shown_trial is live.trial:
             return
         self._shown_state, self._shown_trial = live.state, live.trial

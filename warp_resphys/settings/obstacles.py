@@ -1,0 +1,70 @@
+"""Settings of rigid obstacles, and of contact with them."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ..io.settings import NotNegative, Positive, Settings, Vector, setting
+from .mesh import Direction
+
+
+class _Placed(Settings):
+    position: Vector = setting((0.0, 0.0, 0.0), "of its centre; of a half-space, of a point of its plane", "m")
+    axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
+
+
+class HalfSpaceSettings(_Placed):
+    """All points below a plane, such as a floor."""
+
+    shape: Literal["half_space"]
+
+
+class SphereSettings(_Placed):
+    """A sphere."""
+
+    shape: Literal["sphere"]
+    radius: Positive = setting(unit="m")
+
+
+class CapsuleSettings(_Placed):
+    """All points within a radius of a segment."""
+
+    shape: Literal["capsule"]
+    radius: Positive = setting(unit="m")
+    length: Positive = setting(description="along its axis, without the half-spheres", unit="m")
+
+
+class CylinderSettings(_Placed):
+    """A cylinder with flat ends."""
+
+    shape: Literal["cylinder"]
+    radius: Positive = setting(unit="m")
+    length: Positive = setting(description="along its axis", unit="m")
+
+
+class CuboidSettings(_Placed):
+    """A cuboid with edges along the axes of the world, unless its axis turns it."""
+
+    shape: Literal["box"]
+    edges: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] = setting(
+        description="their lengths", unit="m"
+    )
+
+
+ObstacleSettings = Annotated[
+    HalfSpaceSettings | SphereSettings | CapsuleSettings | CylinderSettings | CuboidSettings,
+    Field(discriminator="shape"),
+]
+
+
+class ContactSettings(Settings):
+    """Contact of the body with its obstacles, by `energies.contact`."""
+
+    stiffness: Positive | dict[str, Positive] = setting(
+        1.0e5, "of the barrier, a number or one by obstacle; the gap of a resting body follows from it", "Pa"
+    )
+    friction: NotNegative | dict[str, NotNegative] = setting(
+        0.0, "coefficient of friction, a number or one by obstacle"
+    )
+    distance: Positive = setting(1.0e-3, "at which contact begins", "m")
+    slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")

@@ -12,6 +12,7 @@ from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Trajectory as Trajectory
 from .energies.base import Energy as Energy
 from .energies.catalogue import make_material as make_material
+from .energies.contact import Contact as Contact
 from .energies.fibres import Fibres as Fibres
 from .energies.law_files import read_material as read_material
 from .energies.law_files import share_outside_law as share_outside_law
@@ -27,6 +28,11 @@ from .energies.medium import Medium as Medium
 from .energies.muscles import Muscle as Muscle
 from .energies.muscles import Muscles as Muscles
 from .energies.neural import NeuralMaterial as NeuralMaterial
+from .energies.obstacles import Box as Box
+from .energies.obstacles import Capsule as Capsule
+from .energies.obstacles import Cylinder as Cylinder
+from .energies.obstacles import HalfSpace as HalfSpace
+from .energies.obstacles import Sphere as Sphere
 from .energies.pointwise import PointwiseEnergy as PointwiseEnergy
 from .energies.pressure import Pressure as Pressure
 from .energies.strings import Strings as Strings

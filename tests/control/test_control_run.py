@@ -14,7 +14,7 @@ import warp_resphys
 from support.configured import check, composed
 from support.main_job import IN_RUN, run, run_without_report
 from support.sentences import offending
-from warp_resphys import pipeline
+from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import reduced_twin as reduced_twin_module
 from warp_resphys.control import reduction, sampling
 from warp_resphys.control.controllers import LinearRecedingHorizon, OpenLoop, RecedingHorizon
@@ -203,14 +203,17 @@ class TestReducedModel:
         with pytest.raises(InputError, match="midpoint"):
             replace(model, integrator="midpoint")
 
-    def test_friction_and_a_medium_are_refused(self, robot, monkeypatch):
+    def test_friction_a_medium_and_obstacles_are_refused(self, robot, monkeypatch):
         sampling.check_reducible(robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ("density",))
         with pytest.raises(InputError, match="density is no stiffness"):
             sampling.check_reducible(robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ())
-        body = robot.simulator.body
-        monkeypatch.setitem(vars(body), "energies", [*body.energies, SimpleNamespace(memory=("slide",))])
+        body, energies = robot.simulator.body, robot.simulator.body.energies
+        monkeypatch.setitem(vars(body), "energies", [*energies, Contact({"floor": HalfSpace(position=(0, 0, -9))})])
+        with pytest.raises(InputError, match="obstacles cannot be reduced"):
+            sampling.check_reducible(robot)
+        monkeypatch.setitem(vars(body), "energies", [*energies, SimpleNamespace(memory=("slide",))])
         with pytest.raises(InputError, match="with memory"):
             sampling.check_reducible(robot)
 

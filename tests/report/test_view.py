@@ -14,9 +14,11 @@ from support.driven_run import write_run as write_driven
 from support.report_page import FAILING, Page, report
 from support.vertex_run import settings as vertex_settings
 from support.vertex_run import write_run as write_vertex
+from warp_resphys import Body, Contact, Sphere
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
 from warp_resphys.report.bodies import ComparedMotion
+from warp_resphys.report.obstacles import OBSTACLE, ObstacleSurface
 from warp_resphys.report.view import reduced, view_in_space
 
 RUNS = {"markers": (write_driven, arm_settings), "vertices": (write_vertex, vertex_settings)}
@@ -42,6 +44,20 @@ def swinging(frames=40, models=("simulation", "resphys")):
     markers = {model: q[:, some] for model, q in positions.items()}
     gravity = np.array([0.0, 0.0, -9.81])
     return ComparedMotion(mesh, times, target[:, some], positions, markers, mesh.vertices[some], gravity), target
+
+
+def test_the_scenes_of_a_motion_have_its_obstacles():
+    motion, _ = swinging()
+    ball = Sphere(position=(0.05, 0.01, -0.1), radius=0.03)
+    surface = ObstacleSurface.of(Body(motion.mesh, energies=[Contact({"ball": ball})]))
+    motion = ComparedMotion(**{**vars(motion), "obstacles": surface})
+    for scene in (motion.scene(), motion.film()):
+        for view in scene.views:
+            (drawn,) = (layer for layer in view.layers if layer.kind == "surface" and layer.colour == OBSTACLE)
+            np.testing.assert_array_equal(drawn.points, surface.points)
+    data = json.loads(str(view_in_space("view", motion, ["resphys"], "caption", "alt").payload))
+    np.testing.assert_allclose(decoded(data["obstacles"], "<f4").reshape(-1, 3), surface.points, atol=1e-8)
+    np.testing.assert_array_equal(decoded(data["sides"], "<u4").reshape(-1, 3), surface.triangles)
 
 
 @pytest.mark.parametrize("every_vertex", [False, True])

@@ -103,7 +103,7 @@ def make_report(context: StageContext) -> None:
         law=law,
         **(read_stretches(folder, mesh, trials, film) if law else {}),
         start=data_sheet(run, identification),
-        truth=truth.get("material", {}),
+        truth={**truth.get("material", {}), **(true_contact(run) if truth else {})},
         training=_histories(folder, False),
         refinement=_histories(folder, True),
         network_note=network_note(run, on_law=bool(law.get("accepted"))) if learned else "",
@@ -203,6 +203,21 @@ def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str,
     names = {name for model in identification.values() for name in model.get("parameters", {})}
     simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
     return configured_parameters(simulator, (*names, "youngs_modulus", "poissons_ratio"))
+
+
+def true_contact(run: RunSettings) -> dict[str, float]:
+    """Constants of the simulated laboratory's contact and shifts of its obstacles, by parameter."""
+    assert run.laboratory is not None
+    truth, obstacles = dict[str, float](), run.laboratory.obstacles
+    for name, obstacle in obstacles.items():
+        part = f"_{name}" if len(obstacles) > 1 else ""
+        for key in ("stiffness", "friction"):
+            value = getattr(run.laboratory.contact, key)
+            truth[f"contact_{key}{part}"] = value[name] if isinstance(value, dict) else value
+        if name in run.obstacles:
+            shift = np.subtract(obstacle.position, run.obstacles[name].position)
+            truth |= {f"obstacle_{axis}{part}": float(x) for axis, x in zip("xyz", shift, strict=True)}
+    return truth
 
 
 def read_trials(folder: Path, run: RunSettings) -> TrialResults:

@@ -30,6 +30,11 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
     "tendon_friction": ("Friction of the tendons", "", 1.0),
     "tendon_bristle_length": ("Bristle length of the tendons", "mm", 1e3),
+    "contact_stiffness": ("Stiffness of the obstacles", "kPa", 1e-3),
+    "contact_friction": ("Friction of the obstacles", "", 1.0),
+    "obstacle_growth": ("Growth of the obstacles", "mm", 1e3),
+    **{f"obstacle_{axis}": (f"Shift along {axis} of the obstacles", "mm", 1e3) for axis in "xyz"},
+    **{f"obstacle_turn_{axis}": (f"Turn about {axis} of the obstacles", "°", 180.0 / np.pi) for axis in "xyz"},
     "clamp_turn": ("Turn of the second clamp", "°", 180.0 / np.pi),
     "clamp_shift": ("Shift of the second clamp", "mm", 1e3),
     "focal_factor": ("Factor of the focal length", "", 1.0),
@@ -183,7 +188,7 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Return name, unit and factor of a parameter, also of tendons, Prony branches, sliders, inputs and regions."""
+    """Return name, unit and factor of a parameter, of parts, Prony branches, sliders, inputs and regions."""
     if command := _COMMAND.fullmatch(parameter):
         words, word, octave = command.groups()
         kind, unit, factor = _COMMANDS[word]
@@ -194,6 +199,11 @@ def parameter_wording(parameter: str) -> Wording:
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
         kind, unit, factor = _PARAMETERS[offset[1]]
         return f"{kind.removesuffix(' of the tendons')} of the tendon '{offset[2]}'", unit, factor
+    if obstacle := re.fullmatch(
+        r"(contact_(?:stiffness|friction)|obstacle_(?:growth|(?:turn_)?[xyz]))_(.+)", parameter
+    ):
+        kind, unit, factor = _PARAMETERS[obstacle[1]]
+        return f"{kind.removesuffix('s')} '{obstacle[2]}'", unit, factor
     if branch := re.fullmatch(r"prony_(ratio|time)_(\d+)", parameter):
         kind, number = branch.groups()
         return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)

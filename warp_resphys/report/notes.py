@@ -58,6 +58,8 @@ _OF_A_TARGET: Final = {
     "muscles": "muscle fibres",
     "medium": "fluid",
     "payload_string": "payload string",
+    "obstacles": "obstacles",
+    "contact": "contact",
 }
 
 

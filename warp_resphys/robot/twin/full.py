@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from ...energies.contact import Contact
 from ...energies.strings import PAYLOAD
 from ...io.errors import ConvergenceError, InputError, listed
 from ...learning.parameters import check_names, identifiable_parameters
@@ -67,7 +68,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         start: of the robot, one environment; its equilibrium under the inputs if omitted.
 
     Raises:
-        InputError: an unknown parameter or input; a network in place of the simulator.
+        InputError: an unknown parameter or input; a network in place of the simulator; obstacles.
         ConvergenceError: there is no equilibrium.
     """
 
@@ -83,6 +84,10 @@ class FullEstimator(TwinEstimator[FullBelief]):
     ) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
+        if any(isinstance(energy, Contact) for energy in robot.simulator.body.energies):
+            raise InputError(
+                "a twin cannot follow a robot with obstacles, into which its corrections would move the body."
+            )
         self._refined, self.robot = dict(refine or {}), robot
         self._check()
         self._known = self._values(inputs)

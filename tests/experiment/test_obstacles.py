@@ -1,0 +1,149 @@
+"""Obstacles from a configuration: contact of the body and of its target, and robots that keep them."""
+
+import numpy as np
+import pytest
+import torch
+
+from support.configured import check, composed, settings
+from warp_resphys.energies.contact import Contact
+from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
+from warp_resphys.experiment.actuators import build_contact
+from warp_resphys.experiment.build import build_body, build_simulator
+from warp_resphys.experiment.report import true_contact
+from warp_resphys.experiment.target import target_settings
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.parameters import constants_of, identifiable_parameters
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.robot.description import Description
+from warp_resphys.robot.robot import Robot
+from warp_resphys.robot.twin.full import FullEstimator
+from warp_resphys.settings.body import SimulatorSettings
+
+BEAM = "mesh.divisions=[4,1,1]"
+FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
+TWO = (
+    "{floor: {shape: half_space, position: [0, 0, -0.05]}, ball: {shape: sphere, position: [0, 0, 0.1], radius: 0.01}}"
+)
+
+
+def test_every_shape_is_built_with_its_own_friction():
+    shapes = {
+        "floor": "{shape: half_space, position: [0, 0, -0.1], axis: [0, 1, 1]}",
+        "ball": "{shape: sphere, radius: 0.01}",
+        "finger": "{shape: capsule, radius: 0.01, length: 0.03}",
+        "bar": "{shape: cylinder, radius: 0.02, length: 0.04, axis: [0, 1, 0]}",
+        "block": "{shape: box, edges: [0.1, 0.2, 0.3]}",
+    }
+    obstacles = ", ".join(f"{name}: {text}" for name, text in shapes.items())
+    friction = "{block: 0.5, floor: 0.1, ball: 0.2, finger: 0.3, bar: 0.4}"
+    contact = build_contact(
+        settings(f"obstacles={{{obstacles}}}", f"contact={{friction: {friction}, distance: 2e-3, stiffness: 5e4}}")
+    )
+    assert dict(contact.obstacles) == {
+        "floor": HalfSpace(position=(0.0, 0.0, -0.1), axis=(0.0, 1.0, 1.0)),
+        "ball": Sphere(radius=0.01),
+        "finger": Capsule(radius=0.01, length=0.03),
+        "bar": Cylinder(radius=0.02, length=0.04, axis=(0.0, 1.0, 0.0)),
+        "block": Box(edges=(0.1, 0.2, 0.3)),
+    }
+    assert contact.friction == [0.1, 0.2, 0.3, 0.4, 0.5]
+    assert (contact.stiffness, contact.distance, contact.slip_speed) == (5e4, 2e-3, 1e-3)
+
+
+def test_without_obstacles_there_is_no_contact():
+    assert build_body(settings(BEAM)).energies == ()
+
+
+def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
+    run = settings(BEAM, f"obstacles={FLOOR}", "contact={friction: 0.3}", "target.contact={friction: 0.6}")
+    (played,) = build_body(target_settings(run, run.target)).energies
+    assert isinstance(played, Contact)
+    assert played.obstacles == {"floor": HalfSpace(position=(0.0, 0.0, -0.005))}
+    assert (played.friction, build_contact(run).friction) == (0.6, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["contact={friction: 0.5}"], r"contact is set, but obstacles has none: name an obstacle"),
+        (
+            [f"obstacles={FLOOR}", "contact={friction: {wall: 0.5}}"],
+            r"values for 'wall', but the obstacles are 'floor'",
+        ),
+        ([f"obstacles={TWO}", "contact={stiffness: {ball: 1e5}}"], r"contact\.stiffness has values for 'ball'"),
+        ([f"obstacles={FLOOR}", "contact={distance: 0}"], r"contact\.distance"),
+        (["obstacles={floor: {shape: plane}}"], r"obstacles\.floor\.shape.*half_space"),
+        (["obstacles={ball: {shape: sphere}}"], r"obstacles\.ball\.radius"),
+        (["obstacles={floor: {shape: half_space, radius: 1.0}}"], r"obstacles\.floor\.radius"),
+        (["obstacles={floor: {shape: half_space, axis: [0, 0, 0]}}"], r"obstacles\.floor\.axis"),
+        (["obstacles={floor: {shape: half_space, position: [0, 0, 0.01]}}"], r"within the obstacle 'floor' at rest"),
+    ],
+)
+def test_obstacles_that_do_not_fit_are_refused(given, said):
+    with pytest.raises(InputError, match=said):
+        check(composed(BEAM, *given))
+
+
+def test_a_run_with_control_is_refused():
+    floor = "{floor: {shape: half_space, position: [0, 0, -0.5]}}"
+    with pytest.raises(InputError, match="reduced model, which has no contact"):
+        check(composed("experiment=tendon_rod_control", f"obstacles={floor}"))
+
+
+def test_parameters_have_a_name_for_each_obstacle():
+    run = settings(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
+    simulator = build_simulator(run, run.simulation)
+    assert {"contact_friction", "contact_friction_floor", "obstacle_x_ball", "obstacle_turn_y_floor"} <= {
+        *identifiable_parameters(simulator)
+    }
+    constants = constants_of(simulator, {"contact_friction_ball": torch.tensor([0.7, 0.8], dtype=torch.float64)})
+    assert constants["contact_friction"].tolist() == [[0.1, 0.7], [0.1, 0.8]]
+
+
+def test_the_truth_of_a_laboratory_is_by_parameter():
+    truth = true_contact(settings("experiment=beam_obstacle"))
+    assert truth["contact_friction"] == 0.5
+    assert truth["obstacle_x"] == pytest.approx(1.5e-3)
+    assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    run = settings(BEAM, f"obstacles={FLOOR}", "contact={friction: 0.4}", "integrator=bdf2")
+    described = Description(
+        "beam",
+        "sysid",
+        SimulatorSettings.of(run),
+        run.simulation,
+        box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1)),
+        {"obstacle_z": 1e-3, "contact_friction": 0.2},
+    )
+    return Robot(described)
+
+
+def test_a_robot_rests_and_falls_on_its_obstacle(robot):
+    """A floor 4 mm below the beam, which bends 8 mm under its weight."""
+    lowest = float(robot.settle().q[0, :, 2].min())
+    assert -4e-3 < lowest < -3e-3
+    assert float(robot.with_parameters(obstacle_z=-0.1).settle().q[0, :, 2].min()) < -6e-3
+    state = robot.begin()
+    for _ in range(30):
+        state = robot.step(state)
+        assert float(state.q[0, :, 2].min()) > -4e-3
+
+
+def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
+    path = tmp_path / "robot.safetensors"
+    robot.description.write(path)
+    loaded = Robot(Description.read(path))
+    (contact,) = loaded.simulator.body.energies
+    assert contact == build_contact(robot.description.settings)
+    state, again = robot.begin(), loaded.begin()
+    for _ in range(12):
+        state, again = robot.step(state), loaded.step(again)
+    np.testing.assert_array_equal(again.q, state.q)
+
+
+def test_a_twin_is_refused(robot):
+    with pytest.raises(InputError, match="a twin cannot follow a robot with obstacles"):
+        FullEstimator(robot, {})

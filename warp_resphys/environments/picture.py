@@ -37,7 +37,7 @@ class Camera:
         side /= np.linalg.norm(side)
         level = np.cos(_TURN) * np.cross(side, up) + np.sin(_TURN) * side
         self._axes = view_axes(np.cos(_TILT) * level + np.sin(_TILT) * up, up)
-        self._focus, half = frame_of(points, self._axes, _MARGIN)
+        self._focus, half = frame_of(np.concatenate([points, obstacles.near(points)]), self._axes, _MARGIN)
         self._half = float(half.max())
         self._around = obstacle_layers(obstacles)
         self._renderer = Renderer()

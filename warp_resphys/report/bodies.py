@@ -72,12 +72,15 @@ def distance_scene(
     if not largest:
         return None
     axes = view_axes(TOWARDS_VIEWER)
-    focus, half = frame_of(np.concatenate([mesh.vertices, *(positions[name] for name in largest)]), axes, MARGIN)
+    shown = np.concatenate([mesh.vertices, *(positions[name] for name in largest)])
+    around = [] if obstacles is None else obstacle_layers(obstacles)
+    if obstacles is not None:
+        shown = np.concatenate([shown, obstacles.near(shown)])
+    focus, half = frame_of(shown, axes, MARGIN)
     nudge = 2.0 * _NUDGE * half.max()  # [m]
     triangles, edges = boundary_triangles(mesh), face_edges(mesh)
     outline, line = (width * _LONGER_SIDE for width in _WIDTHS)
     sharp = sharp_edges(mesh.vertices, triangles)
-    around = [] if obstacles is None else obstacle_layers(obstacles)
     rest = Layer("lines", mesh.vertices, sharp, OUTLINE, size=outline, shift=-nudge)
     views = []
     for name, most in largest.items():
@@ -218,6 +221,7 @@ def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0)
     seen = np.concatenate([rest[None], *positions])
     axes = motion_axes(motion.gravity, seen)
     everything = np.concatenate([points.reshape(-1, 3) for points in (seen, simulated, motion.measured)])
+    everything = np.concatenate([everything, motion.obstacles.near(everything)])
     middle, half = frame_of(everything, axes)
     height = height_of(half, size)
     if motion.from_below:

@@ -74,7 +74,10 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     dots = np.empty((0, 3)) if markers is None else markers
     shown = dots[np.isfinite(dots).all(axis=1)]
     radius = _DOT * float(np.ptp(summary.mesh.vertices, axis=0).max())
-    focus, half = frame_of(np.concatenate([summary.mesh.vertices, shown - radius, shown + radius]), axes, _MARGIN)
+    around = summary.obstacles.near(summary.mesh.vertices)
+    focus, half = frame_of(
+        np.concatenate([summary.mesh.vertices, shown - radius, shown + radius, around]), axes, _MARGIN
+    )
     half = np.maximum(half, _NARROWEST * half.max())
     size = picture_size(half, _LONGER_SIDE)
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]

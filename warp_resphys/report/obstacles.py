@@ -17,6 +17,7 @@ from .render import FloatArray, IntArray
 OBSTACLE: Final = "#b9b2a6"  # Colour of obstacles: a warm grey beside the blue of bodies.
 OBSTACLE_LIGHT: Final = (0.62, 0.42)
 _CORNERS: Final = 64  # Of a circle.
+_NEAR: Final = 0.2  # Width of the space around a body in which its obstacles are shown, over its size.
 _PLATE: Final = (1.5, 0.02)  # Edge and thickness of the plate that stands for a half-space, over the body's size.
 
 
@@ -47,6 +48,12 @@ class ObstacleSurface:
                 triangles.append(_outwards(hull) + sum(map(len, points)))
                 points.append(own @ matrix.T + obstacle.position + shift)
         return cls(np.concatenate(points), np.concatenate(triangles))
+
+    def near(self, points: FloatArray) -> FloatArray:
+        """Return corners (Q, 3) [m] of the surface within the frame of points (P, 3) of a body and a margin."""
+        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+        margin = _NEAR * (high - low).max()
+        return np.clip(self.points, low - margin, high + margin)
 
 
 def _value(parameters: Mapping[str, Any], name: str, part: str) -> float:

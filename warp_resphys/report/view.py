@@ -50,7 +50,8 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
     basis, weights = reduced(places - rest, _TOLERANCE * size, _MOST_MODES)
     scales = np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
-    centre, half = frame_of(np.concatenate([rest, places.reshape(-1, 3)]), axes)
+    points = np.concatenate([rest, places.reshape(-1, 3)])
+    centre, half = frame_of(np.concatenate([points, motion.obstacles.near(points)]), axes)
     simulated = np.stack(list(motion.markers.values()))  # (B, F, M, 3)
     means = mean_distance(simulated, np.broadcast_to(motion.measured, simulated.shape))  # (B, F) [mm]
     away = 1e3 * _distances(simulated, motion.measured)

@@ -12,6 +12,7 @@ from warp_resphys.environments.picture import Camera
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, RobotVectorEnv
 from warp_resphys.io.errors import InputError
+from warp_resphys.report.obstacles import ObstacleSurface
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
 
@@ -199,7 +200,7 @@ class TestPictures:
         corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]])
         heights = []
         for up in (1.0, -1.0):
-            camera = Camera(np.array([0.0, 0.0, up]), corners)
+            camera = Camera(np.array([0.0, 0.0, up]), corners, ObstacleSurface())
             nothing = np.zeros((0, 3), dtype=np.int64)
             (pixels,) = camera.pictures(nothing, corners[None], corners[None, :1], [corners[1:2]], [""])
             camera.close()

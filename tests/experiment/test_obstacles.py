@@ -1,5 +1,7 @@
 """Obstacles from a configuration: contact of the body and of its target, and robots that keep them."""
 
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +20,8 @@ from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.robot.twin.full import FullEstimator
 from warp_resphys.settings.body import SimulatorSettings
+from warp_resphys.studies.live import LiveRobot
+from warp_resphys.studies.view import Page
 
 BEAM = "mesh.divisions=[4,1,1]"
 FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
@@ -146,3 +150,16 @@ def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
 def test_a_twin_is_refused(robot):
     with pytest.raises(InputError, match="a twin cannot follow a robot with obstacles"):
         FullEstimator(robot, {})
+
+
+def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):
+    server, live, meshes = MagicMock(), LiveRobot(robot), {}
+    server.scene.add_mesh_simple.side_effect = lambda name, points, *_, **__: meshes.setdefault(
+        name, MagicMock(vertices=points)
+    )
+    page = Page(server, live)
+    before = meshes["/obstacles"].vertices
+    live.set_parameter("obstacle_z", 0.0)
+    page.run(0.05)
+    moved = meshes["/obstacles"].vertices - before
+    np.testing.assert_allclose(moved, np.tile([0.0, 0.0, -1e-3 / live.size], (8, 1)), atol=1e-6)

@@ -266,8 +266,8 @@ class BodySettings(Settings):
             values = getattr(self.contact, key)
             if isinstance(values, dict) and values.keys() != self.obstacles.keys():
                 raise ValueError(
-                    f"contact.{key} has values for {listed(values) or 'none'}, but the obstacles are "
-                    f"{listed(self.obstacles)}: give one for each."
+                    f"contact.{key} has values for {listed([*values])}, but the obstacles are "
+                    f"{listed([*self.obstacles])}: give one for each."
                 )
         return self
 

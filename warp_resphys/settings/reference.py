@@ -58,7 +58,9 @@ def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) ->
     """
     kinds = [kind for kind in options(schema, node) if "properties" in kind]
     for kind in kinds:
-        words = [f"`{name}: {key['const']}`" for name, key in kind["properties"].items() if "const" in key and kinds[1:]]
+        words = [
+            f"`{name}: {key['const']}`" for name, key in kind["properties"].items() if "const" in key and kinds[1:]
+        ]
         yield f"## {' '.join([f'`{path}`' if path else 'The run', *words])}\n"
         if path:
             yield f"{kind.get('description', '')}\n"

@@ -1,0 +1,434 @@
+"""Contact with rigid obstacles: shapes, barrier, Coulomb's friction, gradients, moved obstacles, refusals."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Mesh,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.energies.contact import Contact, vertex_areas
+from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
+from warp_resphys.io.errors import InputError
+from warp_resphys.studies.gradient_check import central_difference
+
+CPU = torch.device("cpu")
+G, DENSITY = 9.81, 1070.0
+SIDE = 0.02
+BLOCK = box_hexahedra((SIDE,) * 3, (2, 2, 2))
+SOFT = Corotated(264e3, 0.45, density=DENSITY, stiffness_damping=2e-3)
+KAPPA, D = 2e4, 1e-3
+GROOVE = {"left": 0.6, "right": -0.4}
+PLACED = {"position": (0.004, -0.003, 0.002), "axis": (0.3, -0.2, 0.9)}
+SHAPES = {
+    "half-space": HalfSpace(**PLACED),
+    "sphere": Sphere(radius=0.02, **PLACED),
+    "capsule": Capsule(radius=0.012, length=0.03, **PLACED),
+    "box": Box(edges=(0.02, 0.03, 0.04), **PLACED),
+    "cylinder": Cylinder(radius=0.015, length=0.03, **PLACED),
+}
+
+
+def vector(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def distances(obstacle, x):
+    """Signed distances (...) of positions (..., 3), by projection on the shape."""
+    y = (x - np.asarray(obstacle.position)) @ obstacle.turn
+    half = np.array(obstacle.size)
+    if isinstance(obstacle, HalfSpace):
+        return y[..., 2]
+    if isinstance(obstacle, Sphere | Capsule):
+        half = np.array([0.0, 0.0, half[2]])
+        return np.linalg.norm(y - np.clip(y, -half, half), axis=-1) - obstacle.radius
+    if isinstance(obstacle, Cylinder):
+        y = np.stack([np.hypot(y[..., 0], y[..., 1]), y[..., 2]], -1)
+        half = np.array([obstacle.radius, half[2]])
+    outside = np.linalg.norm(y - np.clip(y, -half, half), axis=-1)
+    return np.where(outside > 0.0, outside, (np.abs(y) - half).max(-1))
+
+
+def measured(obstacle, x):
+    """Distances (P,) and normals (P, 3) of positions (P, 3)."""
+    return (value[0, :, 0] for value in ObstacleSet((obstacle,), D, CPU).distances(x[None], pose_of(obstacle)))
+
+
+def pose_of(obstacle):
+    return Pose(vector(obstacle.position)[None], torch.as_tensor(obstacle.turn)[None, None], torch.zeros(1, 1).double())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_and_normals_within_and_around_a_shape(shape):
+    """Normals lead to the surface: x - d n lies on it; they are continuous outside, where regions of a shape meet."""
+    obstacle = SHAPES[shape]
+    assert obstacle.turn.T @ obstacle.turn == pytest.approx(np.eye(3), abs=1e-15)
+    assert obstacle.turn[:, 2] == pytest.approx(np.array(PLACED["axis"]) / np.linalg.norm(PLACED["axis"]))
+    x = torch.as_tensor(np.random.default_rng(0).normal(size=(4000, 3)) * 0.025 + obstacle.position)
+    d, n = measured(obstacle, x)
+    np.testing.assert_allclose(d, distances(obstacle, x.numpy()), atol=1e-15)
+    assert int((d < 0.0).sum()) > 200
+    assert n.norm(dim=-1).numpy() == pytest.approx(1.0, abs=1e-14)
+    np.testing.assert_allclose(distances(obstacle, (x - d[:, None] * n).numpy()), 0.0, atol=1e-15)
+    # The projection on a convex set is no expansion, so that n turns by no more than |dx| / d.
+    ways = torch.as_tensor(np.random.default_rng(1).normal(size=x.shape)) * 1e-3
+    further, turned = measured(obstacle, x + ways)
+    apart = torch.minimum(d, further) > 1e-4
+    size = ways.norm(dim=-1)
+    assert bool(((turned - n).norm(dim=-1) <= 2.0 * size / torch.minimum(d, further))[apart].all())
+    assert bool((d + (n * ways).sum(-1) <= further + 1e-15).all())  # convexity, on which bounds of steps rely
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_derivatives_of_distances_and_normals(shape):
+    """By position, place, rotation and growth: first and second derivatives of the distance, and `turn_slope`."""
+    obstacles = (SHAPES[shape], replace(SHAPES[shape], axis=(1.0, 0.5, 0.1)))
+    rng, shapes = np.random.default_rng(2), ObstacleSet(obstacles, D, CPU)
+    y = rng.normal(size=(2, 40, 3)) * 0.025
+    turns = np.stack([np.stack([o.turn for o in obstacles])] * 2)
+    given = (y, rng.normal(size=(2, 2, 3)) * 1e-3, turns, rng.normal(size=(2, 2)) * 1e-3)
+    given = tuple(torch.as_tensor(value).requires_grad_() for value in given)
+    weights = [torch.as_tensor(rng.normal(size=size)) for size in ((2, 40, 2), (2, 40, 2, 3))]
+
+    def total(x, place, turn, growth):
+        d, n = shapes.distances(x, Pose(place, turn, growth))
+        return (weights[0] * d).sum() + 0.01 * (weights[1] * n).sum()
+
+    assert torch.autograd.gradcheck(total, given, eps=1e-8, atol=2e-6, rtol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "mesh", [box_hexahedra((0.1, 0.03, 0.02), (3, 2, 2), nodes=n) for n in (8, 20, 27)] + [box_tetrahedra(order=2)]
+)
+def test_areas_of_vertices_sum_to_the_surface(mesh):
+    size, areas = np.ptp(mesh.vertices, axis=0), vertex_areas(mesh)
+    assert areas.sum() == pytest.approx(2.0 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0]))
+    assert areas.min() == 0.0
+    inner = ((mesh.vertices > 1e-9) & (mesh.vertices < size - 1e-9)).all(1)
+    assert np.all(areas[inner] == 0.0)
+
+
+def simulator(obstacles, mu=0.0, material=SOFT, mesh=BLOCK, fixed=(), slip_speed=1e-3, distance=D, kappa=KAPPA, **options):
+    obstacles = obstacles if isinstance(obstacles, dict) else {"obstacle": obstacles}
+    contact = Contact(obstacles, stiffness=kappa, friction=mu, distance=distance, slip_speed=slip_speed)
+    options = {"time_step": 5e-3, "gravity": (0.0, 0.0, -G), **options}
+    return Simulator(Body(mesh, fixed=fixed, energies=[contact]), material, **options)
+
+
+def raised(mesh, *shift):
+    return Mesh(mesh.vertices + np.array(shift), mesh.cells)
+
+
+def resting_gap(weight):
+    """Gap at which the vertices below the block carry its weight [N]."""
+    area = vertex_areas(BLOCK)[select_vertices(BLOCK, z=0.0)].sum()
+    pressure = weight / (KAPPA * area)
+    return D * brentq(lambda s: 2.0 * (s - 1.0) * math.log(s) + (s - 1.0) ** 2 / s - pressure, 1e-6, 1.0 - 1e-9)
+
+
+def resting(tilt=0.0, **options):
+    """A block at rest on a floor, under gravity that is tilted by an angle [degrees]."""
+    gap = resting_gap(DENSITY * SIDE**3 * G * math.cos(math.radians(tilt)))
+    return simulator(HalfSpace(position=(0.0, 0.0, -gap)), **options), gap
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_a_hard_block_rests_at_the_gap_that_carries_it(integrator):
+    s, gap = resting(material=Corotated(1e8, 0.3, density=DENSITY, stiffness_damping=1e-3), integrator=integrator)
+    end = s.rollout(State(s.rest_state().q + vector(0.0, 0.0, 1e-4), s.rest_state().v), 80).q[-1, 0]
+    bottom = end[torch.as_tensor(select_vertices(BLOCK, z=0.0)), 2] + gap
+    assert bottom.numpy() == pytest.approx(gap, rel=1e-3)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_a_block_on_an_incline_sticks_and_slides(integrator, device):
+    """It creeps below arctan mu with v_s (1 - sqrt(1 - tan a / mu)), and accelerates by g (sin a - mu cos a) above."""
+    mu, slip = torch.tensor([[0.3], [0.3], [0.6], [0.6]], dtype=torch.float64), 1e-3
+    angles = [math.degrees(math.atan(m)) + more for m, more in zip(mu[:, 0], (-0.5, 0.5, -0.5, 0.5), strict=True)]
+    radians = np.radians(angles)
+    gravity = torch.as_tensor(G * np.stack([np.sin(radians), 0.0 * radians, -np.cos(radians)], 1))
+    s, _ = resting(20.0, integrator=integrator, slip_speed=slip, device=device)
+    given = {"contact_friction": mu, "gravity": gravity}
+    v = s.rollout(s.rest_state(4), 100, None, given).v.mean(2)[..., 0].cpu().numpy()
+    share = np.tan(radians) / mu[:, 0].numpy()
+    stick, slide = [0, 2], [1, 3]
+    assert v[-1, stick] == pytest.approx(slip * (1.0 - np.sqrt(1.0 - share[stick])), rel=1e-4)
+    expected = G * (np.sin(radians) - mu[:, 0].numpy() * np.cos(radians))
+    assert (v[-1] - v[50])[slide] / (50 * s.time_step) == pytest.approx(expected[slide], rel=1e-4)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_block_that_is_thrown_at_a_shape_does_not_penetrate(shape, integrator, device):
+    """Three throws at 5 m/s with a spin: at a face, an edge and past the centre."""
+    obstacle = replace(SHAPES[shape], position=(0.0, 0.0, 0.0))
+    ways = np.array([[0.3, -0.2, 0.9], [0.9, 0.3, 0.4], [0.5, 0.8, 0.6]])
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    s = simulator(
+        obstacle, 0.4, mesh=raised(BLOCK, 0.0, 0.0, 0.08), integrator=integrator, time_step=2e-3, distance=2e-4, device=device
+    )
+    centre = s.rest_positions.mean(0)
+    beside = torch.as_tensor(0.06 * ways, device=device)[:, None]
+    q = s.rest_positions - centre + beside
+    spin = s.tensor([20.0, 30.0, -10.0])
+    v = -5.0 * s.tensor(ways)[:, None] + torch.linalg.cross(spin.expand_as(q), q - beside)
+    trajectory = s.rollout(State(q, v), 40)
+    outer = torch.as_tensor(np.flatnonzero(vertex_areas(BLOCK)), device=device)
+    gaps = distances(obstacle, trajectory.q[:, :, outer].cpu().numpy()).min(-1)
+    assert gaps.min() > 0.0
+    assert np.all(gaps.min(0) < 2e-4)  # they hit
+
+
+def energies(s, trajectory):
+    """Kinetic and potential energy (T + 1,) of the first environment [J], with that of the barrier."""
+    mass, values = s.prepare().mass[0, :, None], []
+    for q, v in zip(trajectory.q, trajectory.v, strict=True):
+        s.linearise(State(q, torch.zeros_like(q))).residual(q)
+        own = mass[:, 0] * (0.5 * v[0].square().sum(-1) + G * q[0, :, 2])
+        values.append(float(s.workspace(1).potential.energy) + float(own.sum()))
+    return np.array(values)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_implicit_euler_gains_no_energy(mu):
+    material = replace(SOFT, stiffness_damping=0.0)
+    s = simulator(HalfSpace(position=(0.0, 0.0, -0.004)), mu, material, time_step=1e-3, relative_tolerance=1e-11)
+    start = s.rest_state()
+    spin = torch.linalg.cross(vector(5.0, 20.0, 3.0).expand_as(start.q), start.q)
+    trajectory = s.rollout(State(start.q, spin + vector(0.4, 0.0, -1.5)), 60)
+    total = energies(s, trajectory)
+    assert np.diff(total).max() < 1e-9 * total[0]
+    assert total[-1] < 0.97 * total[0]
+    assert float(trajectory.v[:, 0, :, 2].mean(1).max()) > 0.1  # it rebounds
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_the_tangential_impulse_of_an_oblique_impact_is_mu_times_the_normal_one(integrator):
+    """The normal force is that of the start of a step, so that both differ by one step's change, of first order."""
+    mu, error = 0.15, []
+    for h in (5e-4, 2.5e-4):
+        s = simulator(
+            HalfSpace(position=(0.0, 0.0, -1.5e-3)), mu, gravity=(0.0, 0.0, 0.0), time_step=h, integrator=integrator
+        )
+        start = s.rest_state()
+        trajectory = s.rollout(State(start.q, start.v + vector(2.0, 0.0, -0.5)), round(0.02 / h))
+        mass = s.prepare().mass[0, :, None]
+        impulse = (mass * (trajectory.v[-1, 0] - trajectory.v[0, 0])).sum(0)
+        assert float(trajectory.q[-1, ..., 2].min()) > 0.0
+        error.append(abs(float(-impulse[0] / impulse[2]) / mu - 1.0))
+    assert max(error) < 2e-3
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_batch_is_bit_for_bit_its_environments(moves):
+    """In a groove, whose two sides approach by different ways."""
+    sides = {name: HalfSpace(position=(0.01, 0.0, -0.008), axis=(x, 0.0, 1.0), moves=moves) for name, x in GROOVE.items()}
+    s, steps = simulator(sides, 0.3), 12
+    start = s.rest_state(4)
+    speeds = vector([0.0, 0.0, 0.0], [0.0, 0.0, -2.0], [1.0, 0.1, -0.2], [0.3, 0.0, 1.0])
+    start = State(start.q, start.v + speeds[:, None])
+    times = torch.linspace(0.0, 1.0, steps, dtype=torch.float64)[:, None, None]
+    rise = times * vector([0.0, 1e-3], [5e-3, 2e-3], [-2e-3, 8e-3], [8e-3, 8.5e-3])
+    trajectory = s.rollout(start, steps, Inputs(obstacle_move_z=rise) if moves else None)
+    for b in range(4):
+        row = slice(b, b + 1)
+        inputs = Inputs(obstacle_move_z=rise[:, row]) if moves else None
+        alone = replace(s).rollout(State(start.q[row], start.v[row]), steps, inputs)
+        assert torch.equal(alone.q[:, 0], trajectory.q[:, b])
+        assert torch.equal(alone.v[:, 0], trajectory.v[:, b])
+
+
+@pytest.mark.parametrize("fraction", [0.5, 2.0])
+def test_a_plate_that_moves_by_more_than_a_gap_in_a_step_presses_a_block(fraction):
+    plate = HalfSpace(position=(0.0, 0.0, SIDE + 0.5 * D), axis=(0.0, 0.0, -1.0), moves=True)
+    s = simulator(plate, 0.5, fixed=select_vertices(BLOCK, z=0.0), gravity=(0.0, 0.0, 0.0), time_step=1e-2)
+    steps = 1 + round(4.0 / fraction)
+    way = -fraction * D * torch.arange(steps, dtype=torch.float64)[:, None, None]
+    trajectory = s.rollout(s.rest_state(), steps, Inputs(obstacle_move_z=way))
+    top = trajectory.q[1:, 0, :, 2].max(1).values
+    gap = SIDE + 0.5 * D + way[:, 0, 0] - top
+    assert bool((gap > 0.0).all())
+    assert bool((gap < D).all())
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_a_floor_that_moves_carries_a_block(integrator):
+    """A conveyor at 0.05 m/s, and a table that turns: the block follows both."""
+    s, gap = resting(mu=0.5, integrator=integrator)
+    s = simulator(HalfSpace(position=(0.0, 0.0, -gap), moves=True), 0.5, integrator=integrator)
+    times = s.time_step * torch.arange(1, 61, dtype=torch.float64)[:, None, None]
+    speed = 0.05
+    carried = s.rollout(s.rest_state(), 60, Inputs(obstacle_move_x=speed * times)).v[-1, 0]
+    assert carried.numpy() == pytest.approx(np.broadcast_to([speed, 0.0, 0.0], carried.shape), abs=2e-5)
+    rate = 1.0
+    turned = s.rollout(s.rest_state(), 60, Inputs(obstacle_rotate_z=rate * times))
+    bottom = torch.as_tensor(select_vertices(BLOCK, z=0.0))
+    q, v = turned.q[-1, 0, bottom], turned.v[-1, 0, bottom]
+    expected = torch.linalg.cross(vector(0.0, 0.0, rate).expand_as(q), q)
+    assert v[:, :2].numpy() == pytest.approx(expected[:, :2].numpy(), abs=1e-3)
+
+
+TIGHT = SolverSettings("newton", relative_tolerance=1e-13)
+
+
+def compare(losses, values, sizes, seed=3):
+    """Compares gradients of losses (B,), one for each environment, with differences along random directions.
+
+    Args:
+        losses: function of the values by name.
+        values: (B, ...) by name.
+        sizes: of the changes by name, so small that no point begins or ends to touch or slide.
+        seed: of the directions.
+    """
+    random = torch.Generator().manual_seed(seed)
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    losses(leaves).sum().backward()
+    for name, value in values.items():
+        change = sizes[name] * torch.randn(value.shape, generator=random, dtype=torch.float64)
+        slopes = (leaves[name].grad * change).flatten(1).sum(1)
+        with torch.no_grad():
+            near = [losses({**values, name: value + factor * change}) for factor in (-2.0, -1.0, 1.0, 2.0)]
+        difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
+        error = float((slopes - difference).norm() / difference.norm())
+        assert error < 1e-6, f"{name}: {error:.1e}"
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, moves):
+    floor = HalfSpace(position=(0.0, 0.0, -1.2e-3), axis=(0.03, -0.02, 1.0), moves=moves)
+    ball = Sphere(position=(0.008, 0.012, -0.0315), radius=0.03)
+    material, steps, slip = replace(SOFT, stiffness_damping=2e-4), 14, 2e-2
+    s = simulator(
+        {"floor": floor, "ball": ball}, 0.0, material, slip_speed=slip, integrator=integrator, solver=TIGHT, time_step=1e-3
+    )
+    start, random = s.rest_state(3), torch.Generator().manual_seed(0)
+    values = {"v": start.v + vector([0.01, 0.0, -0.05], [0.4, 0.1, -0.1], [0.1, 0.0, -1.0])[:, None]}
+    zeros = torch.zeros(3, 2, 3, dtype=torch.float64)
+    values |= {"shift": zeros, "turn": zeros}
+    sizes = {"v": 1e-5, "friction": 1e-5, "stiffness": 0.5, "young": 25.0, "growth": 1e-8, "shift": 1e-8, "turn": 1e-6}
+    if moves:
+        for name, size in (("move", 2e-5), ("rotate", 2e-4)):
+            way = torch.randn(steps, 3, 2, 3, generator=random, dtype=torch.float64).cumsum(0)
+            values[name], sizes[name] = (size * way).movedim(0, 1), 1e-3 * size
+    else:
+        values |= {
+            "friction": vector([0.9, 0.8], [0.2, 0.3], [0.4, 0.4]),
+            "stiffness": KAPPA * vector([1.0, 1.2], [0.8, 1.0], [0.6, 0.7]),
+            "young": 264e3 * vector([1.0], [0.8], [1.2]),
+            "growth": zeros[..., 0],
+        }
+    names = {"friction": "contact_friction", "stiffness": "contact_stiffness", "young": "youngs_modulus"}
+    vectors = {"shift": "obstacle_", "turn": "obstacle_turn_", "move": "obstacle_move_", "rotate": "obstacle_rotate_"}
+
+    def rollout(values):
+        given = {"contact_friction": 0.4}
+        for name, value in values.items():
+            if name in vectors:
+                given |= {f"{vectors[name]}{axis}": value[..., k] for k, axis in enumerate("xyz")}
+            elif name != "v":
+                given[names.get(name, f"obstacle_{name}")] = value
+        inputs = {name: given.pop(name).movedim(1, 0) for name in list(given) if "move" in name or "rotate" in name}
+        return s.rollout(State(start.q, values["v"]), steps, Inputs(**inputs), given)
+
+    weights = torch.randn(2, *start.q.shape, generator=random, dtype=torch.float64)
+
+    def losses(values):
+        trajectory = rollout(values)
+        return (weights[0] * trajectory.q[-1] + 0.02 * weights[1] * trajectory.v[-1]).flatten(1).sum(1)
+
+    if not moves:
+        t = rollout(values)
+        gaps = torch.as_tensor(distances(floor, t.q.detach().numpy()))
+        slides = [float(v[gap < D].abs().amax()) for v, gap in zip(t.v[-1, :2, :, :2].detach(), gaps[-1, :2], strict=True)]
+        assert slides[0] < slip < 10.0 * slip < slides[1]
+        assert float(gaps[:, 2].min()) < D < float(gaps[-1, 2].min())
+    compare(losses, values, sizes)
+
+
+BEAM = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
+
+
+def leaning(mu=0.0, **options):
+    """A clamped beam that gravity bends onto a sphere below its tip."""
+    ball = Sphere(position=(0.07, 0.01, -0.0505), radius=0.05)
+    soft = Corotated(4e4, 0.4, density=DENSITY, mass_damping=20.0, stiffness_damping=2e-3)
+    return simulator(ball, mu, soft, BEAM, select_vertices(BEAM, x=0.0), solver=TIGHT, **options)
+
+
+def test_a_beam_that_leans_on_a_sphere_is_where_it_comes_to_rest():
+    s = leaning()
+    leant = s.static_equilibrium().q
+    free = Simulator(Body(BEAM, fixed=s.body.fixed), s.material, gravity=s.gravity).static_equilibrium().q
+    assert float((leant - free)[..., 2].max()) > 5e-4  # which is held up
+    rest = leaning(time_step=0.02).rollout(s.rest_state(), 150).q[-1]
+    assert leant.numpy() == pytest.approx(rest.numpy(), abs=1e-9)
+
+
+def test_gradients_of_a_leaning_beam_with_friction():
+    """Pushed aside from where it leant, which friction hinders."""
+    s = leaning(0.5)
+    push = torch.zeros(2, s.body.n_vertices, 3, dtype=torch.float64)
+    push[:, select_vertices(BEAM, x=0.08), 1] = vector([2e-3], [1e-2])
+    values = {"push": push, "friction": vector([0.5], [0.3]), "shift": torch.zeros(2, 1, 3, dtype=torch.float64)}
+    values |= {"stiffness": KAPPA * vector([1.0], [0.7]), "young": 4e4 * vector([1.0], [1.1])}
+    weights = torch.randn(push.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def solve(values):
+        given = {f"obstacle_{axis}": values["shift"][..., k] for k, axis in enumerate("xyz")}
+        given |= {"contact_stiffness": values["stiffness"], "youngs_modulus": values["young"]}
+        given |= {"contact_friction": values["friction"]}
+        before = s.static_equilibrium(None, given, batch=2)
+        return before, s.static_equilibrium(Inputs(values["push"]), given, after=before).q
+
+    aside = [(q - before.q)[..., 1].abs().amax(1).detach() for before, q in (solve(values), solve({**values, "friction": 0.0}))]
+    assert bool((aside[0] < 0.9 * aside[1]).all())
+    sizes = {"push": 1e-5, "friction": 1e-4, "shift": 1e-7, "stiffness": 1.0, "young": 1.0}
+    compare(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
+
+
+def test_refusals():
+    with pytest.raises(InputError, match=r"within the obstacle 'floor' at rest: vertex 0 by 2 mm"):
+        simulator({"ball": Sphere(radius=0.01, position=(0.1, 0.0, 0.0)), "floor": HalfSpace(position=(0.0, 0.0, 2e-3))})
+    s = simulator(HalfSpace(position=(0.0, 0.0, -1e-3), moves=True))
+    start = s.rest_state()
+    with pytest.raises(InputError, match=r"'obstacle' at the start of a step: vertex \d+ by 1.5 mm"):
+        s.step(State(start.q - vector(0.0, 0.0, 2.5e-3), start.v))
+    held = simulator(s.body.energies[0].obstacles["obstacle"], fixed=select_vertices(BLOCK, z=0.0))
+    with pytest.raises(InputError, match=r"after an obstacle has moved: vertex \d+ by 0.5 mm; .* move obstacles less"):
+        held.rollout(start, 2, Inputs(obstacle_move_z=vector(0.0, 1.5e-3)[:, None, None]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Contact({}), "needs an obstacle"),
+        (lambda: Contact({"a": HalfSpace()}, friction=-0.1), "contact_friction.* -0.1"),
+        (lambda: Contact({"a": HalfSpace()}, stiffness=0.0), "contact_stiffness.* 0"),
+        (lambda: Contact({"a": HalfSpace()}, distance=0.0), "contact.distance is 0: it must be positive"),
+        (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
+        (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be positive"),
+        (lambda: Capsule(radius=0.1, length=0.0), "Capsule.length is 0.0"),
+        (lambda: Cylinder(radius=math.inf, length=0.1), "Cylinder.radius is inf"),
+        (lambda: Box(edges=(0.1, 0.0, 0.1)), "Box.edges is"),
+        (lambda: HalfSpace(axis=(0.0, 0.0, 0.0)), "HalfSpace.axis is .* must have a length"),
+        (lambda: HalfSpace(position=(0.0, 0.0)), "HalfSpace.position is .* three finite numbers"),
+    ],
+)
+def test_values_out_of_range(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

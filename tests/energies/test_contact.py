@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from warp_resphys import (
 from warp_resphys.energies.contact import Contact, vertex_areas
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.gradient_check import central_difference
 
 CPU = torch.device("cpu")
 G, DENSITY = 9.81, 1070.0

@@ -329,11 +329,12 @@ class BoundContact(BoundEnergy):
         need, free = gaps.clamp_max(0.5 * self._contact.distance), self._free
         for _ in range(_PUSHES):
             d, n = self._shapes.distances(q[:, self._vertices], pose)
-            lack, worst = ((need - d) * free[:, None]).max(-1)
-            if not bool((lack > 1e-12).any()):
+            # Not to the last digit, which float32 does not have; nor where another environment needs another push.
+            lack, worst = (torch.where(d < 0.999 * need, need - d, 0.0) * free[:, None]).max(-1)
+            if not bool(lack.any()):
                 break
             normal = n.gather(2, worst[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
-            q = q.index_add(1, self._vertices, (lack.clamp_min(0.0))[..., None] * normal)
+            q = q.index_add(1, self._vertices, lack[..., None] * normal)
         self._check(q, pose, "after an obstacle has moved")
         return q
 

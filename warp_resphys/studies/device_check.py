@@ -110,7 +110,7 @@ def check_device(settings: DeviceCheck, folder: Path) -> None:
     if check.experiments:
         work["Experiments, one epoch and their roll-outs"] = lambda: experiment_checks(check, str(device), folder)
     with run_lock(folder):
-        sections = [_run(title, checks) for title, checks in work.items()]
+        sections = [run_checks(title, checks) for title, checks in work.items()]
         measured = run_benchmark(settings)
         write_json(folder / "benchmark.json", measured)
         sheets = benchmark_sheets(measured)
@@ -129,7 +129,7 @@ def check_device(settings: DeviceCheck, folder: Path) -> None:
         raise SystemExit(1)
 
 
-def _run(title: str, checks: Callable[[], Iterator[Check]]) -> CheckGroup:
+def run_checks(title: str, checks: Callable[[], Iterator[Check]]) -> CheckGroup:
     """Runs checks of one kind and prints them."""
     began = time.perf_counter()
     done = list(checks())

@@ -31,6 +31,7 @@ from .energies.neural import NeuralMaterial as NeuralMaterial
 from .energies.obstacles import Box as Box
 from .energies.obstacles import Capsule as Capsule
 from .energies.obstacles import Cylinder as Cylinder
+from .energies.obstacles import DistanceGrid as DistanceGrid
 from .energies.obstacles import HalfSpace as HalfSpace
 from .energies.obstacles import Sphere as Sphere
 from .energies.pointwise import PointwiseEnergy as PointwiseEnergy

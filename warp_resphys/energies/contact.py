@@ -45,7 +45,7 @@ from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
-from .obstacles import Grid, Obstacle, ObstacleSet, Pose
+from .obstacles import DistanceGrid, Obstacle, ObstacleSet, Pose
 
 log = logging.getLogger(__name__)
 
@@ -353,7 +353,7 @@ class BoundContact(BoundEnergy):
                 "hundredth to a tenth of that."
             )
         for name, obstacle in contact.obstacles.items():
-            if isinstance(obstacle, Grid) and obstacle.margin < contact.distance:
+            if isinstance(obstacle, DistanceGrid) and obstacle.margin < contact.distance:
                 raise InputError(
                     f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
                     f"{1e3 * contact.distance:g} mm: give it a larger margin."

@@ -1,7 +1,9 @@
 """Rigid obstacles of bodies: shapes at a place, which may move."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +17,8 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels import obstacles as kernels
 from ..kernels.modules import launch_stream
+from ..mesh.readers import METRES
+from ..mesh.tetrahedra import read_shells
 from .launcher import BLOCK, warp_view
 
 Vector = tuple[float, float, float]
@@ -134,7 +138,7 @@ class Box(Obstacle):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Grid(Obstacle):
+class DistanceGrid(Obstacle):
     """Any shape, by its signed distances at the nodes of a grid, interpolated by cubic B-splines.
 
     Edges are rounded over about a spacing. Around the grid, the distance is that from it and ``margin``.
@@ -154,9 +158,13 @@ class Grid(Obstacle):
         super().__post_init__()
         shape = np.shape(self.distances)
         if len(shape) != 3 or min(shape) < 8 or not np.isfinite(self.distances).all():
-            raise InputError(f"Grid.distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes.")
+            raise InputError(
+                f"DistanceGrid.distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes."
+            )
         if not self.margin > 0.0:
-            raise InputError("Grid.distances reach zero at the boundary of the grid: let it end outside of the shape.")
+            raise InputError(
+                "DistanceGrid.distances reach zero at the boundary of the grid: let it end outside of the shape."
+            )
 
     @cached_property
     def margin(self) -> float:
@@ -179,14 +187,15 @@ class Grid(Obstacle):
     @classmethod
     def of_surface(
         cls, vertices: ArrayLike, triangles: ArrayLike, spacing: float, margin: float | None = None, **pose: Any
-    ) -> "Grid":
+    ) -> "DistanceGrid":
         """Returns the grid of a closed surface.
 
         Args:
             vertices: (N, 3) in the axes of the obstacle [m].
             triangles: (T, 3) counter-clockwise seen from outside.
             spacing: of the nodes [m]: half of the smallest radius, or less.
-            margin: by which the grid is larger than the surface; four spacings if omitted [m].
+            margin: by which the grid is larger than the surface; ten spacings if omitted, as the boundary disturbs the
+                interpolation over some spacings [m].
             pose: position, axis and ``moves``.
 
         Raises:
@@ -195,7 +204,7 @@ class Grid(Obstacle):
         surface = trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles))
         if not surface.is_watertight:
             raise InputError("the surface of the obstacle is not closed, so that it has no inside: repair it.")
-        width = (4.0 * spacing if margin is None else margin) + 2.0 * spacing
+        width = (10.0 * spacing if margin is None else margin) + 2.0 * spacing
         low, high = surface.bounds + np.array([[-width], [width]])
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
@@ -209,6 +218,25 @@ class Grid(Obstacle):
         wp.launch(kernels.from_surface, out.size, [own.id, places], [out], device="cpu")
         distances = out.numpy().astype(float).reshape(nodes.shape[:3])
         return cls(distances=distances, spacing=spacing, low=(low[0], low[1], low[2]), **pose)
+
+    @classmethod
+    def from_file(
+        cls, path: str | os.PathLike[str], spacing: float, units: str = "mm", margin: float | None = None, **pose: Any
+    ) -> "DistanceGrid":
+        """Returns the grid of a closed surface in a file.
+
+        Args:
+            path: an STL, OBJ or PLY file.
+            spacing: as for `of_surface` [m].
+            units: of the file: ``m``, ``cm`` or ``mm``.
+            margin: as for `of_surface` [m].
+            pose: position, axis and ``moves``.
+
+        Raises:
+            MeshError: the file is missing or damaged, or its surface is not closed.
+        """
+        vertices, shells = read_shells(Path(path).expanduser())
+        return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
 
 
 @dataclass(frozen=True)
@@ -242,7 +270,7 @@ class ObstacleSet:
         self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
         self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
         self._reach = reach
-        grids = [o if isinstance(o, Grid) else None for o in obstacles]
+        grids = [o if isinstance(o, DistanceGrid) else None for o in obstacles]
         parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
         firsts = np.cumsum([0, *(len(part) for part in parts)])
         nodes = [

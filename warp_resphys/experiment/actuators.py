@@ -14,7 +14,7 @@ from ..energies.fibres import Fibres
 from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
-from ..energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
+from ..energies.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
@@ -32,6 +32,7 @@ _SHAPES: Final[Mapping[str, Callable[..., Obstacle]]] = {
     "capsule": Capsule,
     "cylinder": Cylinder,
     "box": Box,
+    "surface": DistanceGrid.from_file,
 }
 # Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {

@@ -97,7 +97,7 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
         raise MeshError(f"a surface in {units} filled to order {order}: units are m, cm or mm, orders 1 or 2.")
     if not (math.isfinite(size) and size > 0.0):
         raise MeshError(f"the size of tetrahedra is {size}: it must be positive, in m.")
-    vertices, shells = _read_shells(path)
+    vertices, shells = read_shells(path)
     vertices = METRES[units] * vertices
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
@@ -130,7 +130,7 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
     raise MeshError(reason)
 
 
-def _read_shells(path: Path) -> tuple[FloatArray, list[IntArray]]:
+def read_shells(path: Path) -> tuple[FloatArray, list[IntArray]]:
     """Returns the vertices (V, 3), in the file's unit, and the triangles (F, 3) of each closed surface."""
     import trimesh
 

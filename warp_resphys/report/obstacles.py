@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from ..energies.contact import GROWTH, SHIFT, TURN, Contact
-from ..energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
+from ..energies.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
 from ..fem.body import Body
 from .render import FloatArray, IntArray
 
@@ -30,7 +30,7 @@ class ObstacleSurface:
 
     @classmethod
     def of(cls, body: Body, parameters: Mapping[str, Any] | None = None) -> "ObstacleSurface":
-        """Return the obstacles of a body, none of which moves by inputs.
+        """Returns the obstacles of a body, none of which moves by inputs.
 
         Args:
             body: With or without obstacles.
@@ -42,27 +42,42 @@ class ObstacleSurface:
                 shift, turn = (
                     np.array([_value(known, q.name, name) for q in quantities]) for quantities in (SHIFT, TURN)
                 )
-                own = _solid(obstacle, body.mesh.vertices, _value(known, GROWTH.name, name))
-                matrix = Rotation.from_rotvec(turn).as_matrix() @ obstacle.turn
-                hull = ConvexHull(own)
-                triangles.append(_outwards(hull) + sum(map(len, points)))
+                growth, matrix = (
+                    _value(known, GROWTH.name, name),
+                    Rotation.from_rotvec(turn).as_matrix() @ obstacle.turn,
+                )
+                if isinstance(obstacle, DistanceGrid):
+                    own, faces = _contour(obstacle, growth)
+                else:
+                    own = _solid(obstacle, body.mesh.vertices, growth)
+                    faces = _outwards(ConvexHull(own))
+                triangles.append(faces + sum(map(len, points)))
                 points.append(own @ matrix.T + obstacle.position + shift)
         return cls(np.concatenate(points), np.concatenate(triangles))
 
     def near(self, points: FloatArray) -> FloatArray:
-        """Return corners (Q, 3) [m] of the surface within the frame of points (P, 3) of a body and a margin."""
+        """Returns corners (Q, 3) [m] of the surface within the frame of points (P, 3) of a body and a margin."""
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
         margin = _NEAR * (high - low).max()
         return np.clip(self.points, low - margin, high + margin)
 
 
 def _value(parameters: Mapping[str, Any], name: str, part: str) -> float:
-    """Value of a parameter for an obstacle."""
+    """Returns the value of a parameter for an obstacle."""
     return float(parameters.get(f"{name}_{part}", parameters.get(name, 0.0)))
 
 
+def _contour(grid: DistanceGrid, growth: float) -> tuple[FloatArray, IntArray]:
+    """Returns the points (P, 3) [m] and triangles (S, 3) at a distance from the surface of a grid."""
+    import pyvista
+
+    image = pyvista.ImageData(dimensions=grid.distances.shape, spacing=(grid.spacing,) * 3, origin=grid.low)
+    surface = image.contour([growth], scalars=grid.distances.ravel(order="F"))
+    return np.asarray(surface.points, dtype=float), np.asarray(surface.faces, dtype=np.int64).reshape(-1, 4)[:, :0:-1]
+
+
 def _outwards(hull: ConvexHull) -> IntArray:
-    """Triangles (S, 3) of a convex hull, whose corners are in the order that their normals point outwards."""
+    """Returns the triangles (S, 3) of a convex hull, with normals that point outwards."""
     triangles = np.array(hull.simplices, dtype=np.int64)
     corners = hull.points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -72,7 +87,7 @@ def _outwards(hull: ConvexHull) -> IntArray:
 
 
 def _solid(obstacle: Obstacle, vertices: FloatArray, growth: float) -> FloatArray:
-    """Points (P, 3) in the axes of an obstacle, whose convex hull it is.
+    """Returns points (P, 3) in the axes of an obstacle, whose convex hull it is.
 
     Args:
         obstacle: Its shape.

@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ..io.settings import NotNegative, Positive, Settings, Vector, setting
-from .mesh import Direction
+from ..io.settings import NotNegative, Positive, Settings, Vector, Word, setting
+from .mesh import Direction, LengthUnit
 
 
 class _Placed(Settings):
@@ -51,8 +51,17 @@ class CuboidSettings(_Placed):
     )
 
 
+class SurfaceSettings(_Placed):
+    """The interior of a closed surface, by its distances on a grid."""
+
+    shape: Literal["surface"]
+    path: Word = setting(description="of an STL, OBJ or PLY file; its z axis is along `axis`")
+    units: LengthUnit = setting("mm", "of the file")
+    spacing: Positive = setting(1.0e-3, "of the grid, over about which edges are rounded", "m")
+
+
 ObstacleSettings = Annotated[
-    HalfSpaceSettings | SphereSettings | CapsuleSettings | CylinderSettings | CuboidSettings,
+    HalfSpaceSettings | SphereSettings | CapsuleSettings | CylinderSettings | CuboidSettings | SurfaceSettings,
     Field(discriminator="shape"),
 ]
 

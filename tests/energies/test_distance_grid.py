@@ -1,0 +1,122 @@
+"""Obstacles of any shape: distances on a grid, from a surface, against closed forms."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from warp_resphys import Body, Contact, Corotated, DistanceGrid, HalfSpace, Mesh, Simulator, State, box_hexahedra
+from warp_resphys.energies.obstacles import ObstacleSet, Pose
+from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.report.obstacles import ObstacleSurface
+
+RADIUS = 0.02  # m
+CPU = torch.device("cpu")
+
+
+def exact(spacing=2e-3, **pose):
+    """A sphere by its exact distances."""
+    low = -RADIUS - 14.0 * spacing
+    axis = low + spacing * np.arange(int(np.ceil(-2.0 * low / spacing)) + 1)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return DistanceGrid(
+        distances=np.linalg.norm(places, axis=-1) - RADIUS, spacing=spacing, low=(low, low, low), **pose
+    )
+
+
+def around(seed=0, count=200):
+    ways = np.random.default_rng(seed).normal(size=(1, count, 3))
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    return torch.as_tensor(ways * (RADIUS + np.linspace(1e-4, 2e-3, count)[:, None]))
+
+
+def measured(grid, x):
+    pose = Pose(torch.zeros(1, 1, 3).double(), torch.eye(3).double()[None, None], torch.zeros(1, 1).double())
+    d, n = ObstacleSet((grid,), 1e-3, CPU).distances(x, pose)
+    return d[..., 0], n[:, :, 0]
+
+
+def test_interpolated_distances_converge_with_the_fourth_power_of_the_spacing():
+    x, errors = around(), []
+    for spacing in (4e-3, 2e-3):
+        d, n = measured(exact(spacing), x)
+        radius = x.norm(dim=-1)
+        errors.append([float((d - radius + RADIUS).abs().max()), float((n - x / radius[..., None]).norm(dim=-1).max())])
+    assert errors[1][0] < 2e-7
+    assert errors[0][0] > 10.0 * errors[1][0]
+    assert errors[0][1] > 6.0 * errors[1][1]
+
+
+def test_normals_are_slopes_of_distances_and_have_a_derivative():
+    grid, x = exact(), around(1)
+    d, n = measured(grid, x.requires_grad_())
+    (slope,) = torch.autograd.grad(d.sum(), x, retain_graph=True)
+    torch.testing.assert_close(slope, n)
+    weights, way = (torch.as_tensor(np.random.default_rng(k).normal(size=x.shape)) for k in (2, 3))
+    (slope,) = torch.autograd.grad((n * weights).sum(), x)
+    step = 1e-6
+    up, down = (float((measured(grid, x.detach() + s * step * way)[1] * weights).sum()) for s in (1, -1))
+    assert float((slope * way).sum()) == pytest.approx((up - down) / (2.0 * step), rel=1e-4)
+
+
+def test_outside_of_the_grid_it_is_further_away_than_its_boundary():
+    grid = exact()
+    d, n = measured(grid, torch.tensor([[[0.1, 0.0, 0.0], [0.0, -0.2, 0.0]]]).double())
+    assert (d > grid.margin).all()
+    torch.testing.assert_close(n, torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]]).double())
+
+
+def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
+    box = trimesh.creation.box((0.04, 0.03, 0.02))
+    box.apply_scale(1e3)
+    box.export(tmp_path / "box.stl")
+    grid = DistanceGrid.from_file(tmp_path / "box.stl", spacing=1e-3)
+    d, n = measured(grid, torch.tensor([[[0.0, 0.0, 0.011], [0.0, 0.0157, 0.0], [0.0, 0.0, 0.0]]]).double())
+    np.testing.assert_allclose(d[0], [1e-3, 0.7e-3, -1e-2], atol=2e-5)
+    np.testing.assert_allclose(n[0, :2], [[0, 0, 1], [0, 1, 0]], atol=3e-3)
+    (tmp_path / "open.stl").write_bytes(trimesh.Trimesh(box.vertices, box.faces[1:]).export(file_type="stl"))
+    with pytest.raises(MeshError, match="close the surface"):
+        DistanceGrid.from_file(tmp_path / "open.stl", spacing=1e-3)
+
+
+def test_a_body_that_is_thrown_through_a_ring_does_not_penetrate():
+    """The distance of a ring is not convex: the whole block passes through its hole or rests on it."""
+    ring = trimesh.creation.torus(0.02, 0.008, major_sections=48, minor_sections=24)
+    grid = DistanceGrid.of_surface(ring.vertices, ring.faces, 1e-3, position=(0.0, 0.0, -0.015))
+    box = box_hexahedra((0.03, 0.03, 0.01), (4, 4, 1))
+    mesh = Mesh(box.vertices + [-0.01, -0.014, 0.0], box.cells)
+    contact = Contact({"ring": grid, "floor": HalfSpace(position=(0.0, 0.0, -0.04))}, friction=0.5)
+    silicone = Corotated(1e5, 0.45, density=1070.0, stiffness_damping=2e-3)
+    simulator = Simulator(Body(mesh, energies=[contact]), silicone, 2e-3, relative_tolerance=1e-6)
+    state = simulator.rest_state()
+    state = State(state.q, state.v + torch.tensor([0.5, 0.0, -5.0]))
+    touched = False
+    for _ in range(40):
+        before, (state, _) = state, simulator.step(state)
+        forces = simulator.contacts(before, state)[""]
+        assert float(forces.gap.min()) > 0.0
+        touched |= bool((forces.normal[:, :, 0].norm(dim=-1) > 0.0).any())
+    assert touched
+
+
+def test_its_picture_is_its_surface():
+    pytest.importorskip("pyvista")
+    mesh = box_hexahedra((0.03, 0.03, 0.01), (1, 1, 1))
+    body = Body(mesh, energies=[Contact({"ball": exact(position=(0.0, 0.0, -0.05))})])
+    surface = ObstacleSurface.of(body)
+    away = np.linalg.norm(surface.points - [0.0, 0.0, -0.05], axis=1)
+    np.testing.assert_allclose(away, RADIUS, atol=2e-4)
+    assert trimesh.Trimesh(surface.points, surface.triangles).volume == pytest.approx(4.19e-6 * 8.0, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"distances": np.zeros((4, 4, 4))}, "8 nodes or more"),
+        ({"distances": -np.ones((9, 9, 9))}, "end outside of the shape"),
+        ({"spacing": 0.0}, "spacing"),
+    ],
+)
+def test_grids_that_are_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        DistanceGrid(**{"distances": np.ones((9, 9, 9)), "spacing": 1e-3, "low": (0.0, 0.0, 0.0), **change})

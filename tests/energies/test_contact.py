@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import brentq
 
 from warp_resphys import (
     Body,
@@ -23,13 +22,10 @@ from warp_resphys import (
 from warp_resphys.energies.contact import Contact, vertex_areas
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
 from warp_resphys.io.errors import InputError
+from warp_resphys.studies.contact_check import BLOCK, KAPPA, SIDE, SOFT, D, G, resting_floor, total_energy
 
 CPU = torch.device("cpu")
-G, DENSITY = 9.81, 1070.0
-SIDE = 0.02
-BLOCK = box_hexahedra((SIDE,) * 3, (2, 2, 2))
-SOFT = Corotated(264e3, 0.45, density=DENSITY, stiffness_damping=2e-3)
-KAPPA, D = 2e4, 1e-3
+DENSITY = 1070.0
 GROOVE = {"left": 0.6, "right": -0.4}
 PLACED = {"position": (0.004, -0.003, 0.002), "axis": (0.3, -0.2, 0.9)}
 SHAPES = {
@@ -133,17 +129,10 @@ def raised(mesh, *shift):
     return Mesh(mesh.vertices + np.array(shift), mesh.cells)
 
 
-def resting_gap(weight):
-    """Gap at which the vertices below the block carry its weight [N]."""
-    area = vertex_areas(BLOCK)[select_vertices(BLOCK, z=0.0)].sum()
-    pressure = weight / (KAPPA * area)
-    return D * brentq(lambda s: 2.0 * (s - 1.0) * math.log(s) + (s - 1.0) ** 2 / s - pressure, 1e-6, 1.0 - 1e-9)
-
-
-def resting(tilt=0.0, **options):
-    """A block at rest on a floor, under gravity that is tilted by an angle [degrees]."""
-    gap = resting_gap(DENSITY * SIDE**3 * G * math.cos(math.radians(tilt)))
-    return simulator(HalfSpace(position=(0.0, 0.0, -gap)), **options), gap
+def resting(tilt=0.0, moves=False, **options):
+    """A block at rest on a floor under gravity that is tilted by an angle [degrees], and its gap [m]."""
+    floor = resting_floor(DENSITY * SIDE**3 * G * math.cos(math.radians(tilt)))
+    return simulator(replace(floor, moves=moves), **options), -floor.position[2]
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
@@ -199,16 +188,6 @@ def test_a_block_that_is_thrown_at_a_shape_does_not_penetrate(shape, integrator,
     assert np.all(gaps.min(0) < 2e-4)  # they hit
 
 
-def energies(s, trajectory):
-    """Kinetic and potential energy (T + 1,) of the first environment [J], with that of the barrier."""
-    mass, values = s.prepare().mass[0, :, None], []
-    for q, v in zip(trajectory.q, trajectory.v, strict=True):
-        s.linearise(State(q, torch.zeros_like(q))).residual(q)
-        own = mass[:, 0] * (0.5 * v[0].square().sum(-1) + G * q[0, :, 2])
-        values.append(float(s.workspace(1).potential.energy) + float(own.sum()))
-    return np.array(values)
-
-
 @pytest.mark.parametrize("mu", [0.0, 0.3])
 def test_implicit_euler_gains_no_energy(mu):
     material = replace(SOFT, stiffness_damping=0.0)
@@ -216,7 +195,7 @@ def test_implicit_euler_gains_no_energy(mu):
     start = s.rest_state()
     spin = torch.linalg.cross(vector(5.0, 20.0, 3.0).expand_as(start.q), start.q)
     trajectory = s.rollout(State(start.q, spin + vector(0.4, 0.0, -1.5)), 60)
-    total = energies(s, trajectory)
+    total = total_energy(s, trajectory)
     assert np.diff(total).max() < 1e-9 * total[0]
     assert total[-1] < 0.97 * total[0]
     assert float(trajectory.v[:, 0, :, 2].mean(1).max()) > 0.1  # it rebounds
@@ -276,8 +255,7 @@ def test_a_plate_that_moves_by_more_than_a_gap_in_a_step_presses_a_block(fractio
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 def test_a_floor_that_moves_carries_a_block(integrator):
     """A conveyor at 0.05 m/s, and a table that turns: the block follows both."""
-    s, gap = resting(mu=0.5, integrator=integrator)
-    s = simulator(HalfSpace(position=(0.0, 0.0, -gap), moves=True), 0.5, integrator=integrator)
+    s, _ = resting(moves=True, mu=0.5, integrator=integrator)
     times = s.time_step * torch.arange(1, 61, dtype=torch.float64)[:, None, None]
     speed = 0.05
     carried = s.rollout(s.rest_state(), 60, Inputs(obstacle_move_x=speed * times)).v[-1, 0]

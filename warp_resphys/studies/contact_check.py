@@ -22,12 +22,13 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.optimize import brentq
 
 from ..dynamics.nonlinear_solver import SolverSettings
@@ -76,7 +77,7 @@ class ContactStudy(Settings):
     device: Word
     quick: bool
     frictions: Some[Positive]
-    degrees: Natural
+    degrees: Annotated[int, Field(ge=2)]
     throws: Natural
     speed: Positive = setting(unit="m/s")
     seed: Count
@@ -88,7 +89,7 @@ class ContactStudy(Settings):
     @property
     def chosen(self) -> "ContactStudy":
         """The settings, or their quick form."""
-        small = {"frictions": self.frictions[:1], "degrees": 1, "throws": 20, "cells": self.cells[:1]}
+        small = {"frictions": self.frictions[:1], "degrees": 2, "throws": 20, "cells": self.cells[:1]}
         return self.changed(**small, batches=self.batches[:1], repeats=1) if self.quick else self
 
 
@@ -169,7 +170,7 @@ def total_energy(simulator: Simulator, trajectory: Trajectory) -> NDArray[np.flo
 
 
 def _percent(name: str, errors: NDArray[np.float64], bound: float) -> Check:
-    largest = float(np.abs(errors).max())
+    largest = float(np.abs(errors).max(initial=0.0))
     return Check(name, f"{100.0 * largest:.2g} %", f"within {100.0 * bound:g} %", largest <= bound)
 
 

@@ -431,3 +431,13 @@ def test_refusals():
 def test_values_out_of_range(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
+    ball = Sphere(position=(0.01, 0.01, 0.04), radius=0.01, moves=True)
+    simulator = Simulator(Body(BLOCK, energies=[Contact({"ball": ball})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
+    state, down = simulator.rest_state(), torch.zeros(1, 1, dtype=torch.float64)
+    state, _ = simulator.step(state, Inputs(obstacle_move_z=down))
+    with pytest.raises(InputError, match="'ball' passes over vertices"):
+        simulator.step(state, Inputs(obstacle_move_z=down - 0.08))
+    simulator.step(state, Inputs(obstacle_move_z=down - 0.0105))

@@ -61,6 +61,7 @@ MOTION = (
 POSE: Final = ("contact_place", "contact_turn")
 FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
 _PUSHES = 50
+_SHARES = [0.125 * k for k in range(1, 9)]  # of the way of an obstacle, at which it is looked at
 _DEEP = 0.3  # share of D within which a start is warned of
 
 
@@ -258,6 +259,7 @@ class BoundContact(BoundEnergy):
             was = sum(weight * way for weight, way in zip(weights, ways, strict=False))
             reference = reference + now.world(inside) - was
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
+            self._check_way(now.world(inside).detach(), x.detach(), now, d.detach())
             start = self._pushed_out(state.q.detach(), now, d.detach())
         length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
@@ -317,6 +319,26 @@ class BoundContact(BoundEnergy):
         before, _ = self._remembered(step, now)
         poses = (now.place, now.turn, before.place, before.turn)
         return dict(zip((m.name for m in self.memory), poses, strict=True))
+
+    def _check_way(self, carried: torch.Tensor, x: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> None:
+        """Raises InputError where an obstacle passes over a vertex.
+
+        Args:
+            carried: (B, P, O, 3) vertices as if they had moved with the obstacles [m].
+            x: (B, P, 3) vertices, which have not [m].
+            pose: poses after the motion.
+            gaps: (B, P, O) distances before it [m].
+        """
+        ways = x[:, :, None] - carried
+        for k in (ways.norm(dim=-1) > gaps).any(1).any(0).nonzero().ravel().tolist():
+            places = [carried[:, :, k] + share * ways[:, :, k] for share in _SHARES]
+            *between, end = (self._shapes.distances(place, pose)[0][..., k] for place in places)
+            deepest = torch.stack(between).amin(0)
+            if bool(((deepest < 0.0) & (deepest < end)).any()):
+                raise InputError(
+                    f"the obstacle {self._contact.names[k]!r} passes over vertices of the body in a step: move it less "
+                    "in a step."
+                )
 
     def _pushed_out(self, q: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, N, 3) as far from obstacles that have moved as before, at most half of D.

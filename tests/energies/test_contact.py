@@ -12,6 +12,7 @@ from warp_resphys import (
     Corotated,
     Inputs,
     Mesh,
+    Scene,
     Simulator,
     SolverSettings,
     State,
@@ -250,6 +251,22 @@ def test_a_plate_that_moves_by_more_than_a_gap_in_a_step_presses_a_block(fractio
     gap = SIDE + 0.5 * D + way[:, 0, 0] - top
     assert bool((gap > 0.0).all())
     assert bool((gap < D).all())
+
+
+@pytest.mark.parametrize("moves", [(True, False), (False, True), (True, True)])
+def test_lifts_raise_two_bodies_of_a_scene(moves):
+    """By 2 mm a step, more than their gaps; a body whose lift stays is not moved."""
+    bodies = {}
+    for k, name in enumerate("ab"):
+        lift = HalfSpace(position=(0.0, 0.0, -0.9 * D), moves=moves[k])
+        bodies[name] = Body(raised(BLOCK, 0.1 * k, 0.0, 0.0), energies=[Contact({"lift": lift}, KAPPA, 0.0, D)])
+    s = Simulator(Scene(bodies), SOFT, 5e-3)
+    way = 2e-3 * torch.arange(4, dtype=torch.float64)[:, None, None]
+    inputs = Inputs(**{name: way for name in s.inputs if name.endswith("move_z")})
+    q = s.rollout(s.rest_state(), 4, inputs).q[1:, 0]
+    for k, z in enumerate(q[..., 2].tensor_split(2, dim=1)):
+        gap = z.min(1).values + 0.9 * D - way[:, 0, 0] * moves[k]
+        assert bool(((gap > 0.0) & (gap < 1.5 * D)).all())
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])

@@ -336,8 +336,12 @@ class Term(ABC):
         del values, positions
         return None
 
-    def feasible(self, values: Values) -> torch.Tensor | None:
-        """Returns positions (B, N, 3) of finite energy [m], if there are others; a solve does not pass by those."""
+    def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Returns positions of finite energy, if there are others; a solve does not pass by those.
+
+        Returns:
+            Positions (B, N, 3) [m], and the vertices (V,) that this term may have moved there.
+        """
         del values
         return None
 

@@ -419,6 +419,7 @@ class ContactTerm(Term):
         self._count, self._vertices, self._reach = contact.count, s.n_vertices, contact.distance
         self._shapes = ObstacleSet(tuple(contact.obstacles.values()), contact.distance, launcher.device)
         self._area = torch.as_tensor(s.source.areas, device=launcher.device)
+        self._moved = torch.as_tensor(s.source.nodes[:, 0], device=launcher.device)
 
     @property
     @override
@@ -449,8 +450,8 @@ class ContactTerm(Term):
         return [s.nodes, s.gradients, area, obstacles, stiffness, friction, s.points_per_cell, positions]
 
     @override
-    def feasible(self, values: Values) -> torch.Tensor | None:
-        return value_of(values, "contact_start")
+    def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
+        return value_of(values, "contact_start"), self._moved
 
     @override
     def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:

@@ -101,6 +101,8 @@ class IncrementalPotential(Launcher):
         shapes = {name: shape for placed, term in pairs for name, shape in placed.named(term.shapes).items()}
         values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
         self.own_values = [placed.own_values(values, term) for placed, term in pairs]
+        starts = (term.feasible(own) for term, own in zip(self.energies, self.own_values, strict=True))
+        self._feasible = [start for start in starts if start is not None]
         self.terms = StepTerms(self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3), values)
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
@@ -183,6 +185,8 @@ class IncrementalPotential(Launcher):
             value = terms.values[name]
             if value is not None and buffer is not None:
                 buffer.copy_(value.detach())
+        for positions, moved in self._feasible[1:]:
+            self._feasible[0][0][:, moved] = positions[:, moved]
         totals = [term.total_stiffness(values) for term, values in zip(self.energies, self.own_values, strict=True)]
         given = [total for total in totals if total is not None]
         if given:
@@ -229,8 +233,7 @@ class IncrementalPotential(Launcher):
     @property
     def feasible(self) -> torch.Tensor | None:
         """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
-        pairs = zip(self.energies, self.own_values, strict=True)
-        return next((x for term, values in pairs if (x := term.feasible(values)) is not None), None)
+        return self._feasible[0][0] if self._feasible else None
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""

@@ -16,10 +16,9 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels import obstacles as kernels
-from ..kernels.modules import launch_stream
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
-from .launcher import BLOCK, warp_view
+from .launcher import Launcher, warp_view
 
 Vector = tuple[float, float, float]
 
@@ -270,6 +269,7 @@ class ObstacleSet:
         self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
         self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
         self._reach = reach
+        self._measurements: dict[tuple[int, int, int], _Measurement] = {}
         grids = [o if isinstance(o, DistanceGrid) else None for o in obstacles]
         parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
         firsts = np.cumsum([0, *(len(part) for part in parts)])
@@ -292,40 +292,56 @@ class ObstacleSet:
 
     def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
-        d, n = _Distances.apply(self, x, pose.place, pose.turn, pose.growth)
+        size = batch, points, count = (*x.shape[:2], pose.place.shape[1])
+        if size not in self._measurements:
+            self._measurements[size] = _Measurement(self, batch, points, count, x.device)
+        d, n = _Distances.apply(self._measurements[size], x, pose.place, pose.turn, pose.growth)
         return d, n
 
 
+class _Measurement(Launcher):
+    """Buffers and launches of `kernels.obstacles.measure` and its adjoint for one size of a batch."""
+
+    def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
+        super().__init__(batch, device)
+        pairs = (points, count)
+        self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
+        self.results = [self.zeros(*pairs), self.zeros(*pairs, 3)]
+        self.by_results = [self.zeros(*pairs), self.zeros(*pairs, 3)]
+        self.by_position, self.by_turn = self.zeros(*pairs, 3), self.zeros(*pairs, 3, 3)
+        x, *pose = self.inputs
+        given, kinds = [shapes.at(*pose), warp_view(x, wp.vec3d)], (wp.float64, wp.vec3d)
+        results, by_results = (
+            [warp_view(value, kind) for value, kind in zip(values, kinds, strict=True)]
+            for values in (self.results, self.by_results)
+        )
+        slopes = [warp_view(self.by_position, wp.vec3d), warp_view(self.by_turn, wp.mat33d)]
+        self.measure = self.record(kernels.measure, (batch, *pairs), given, results)
+        self.differentiate = self.record(kernels.measure_adjoint, (batch, *pairs), [*given, *by_results], slopes)
+
+
 class _Distances(torch.autograd.Function):
-    """Signed distances and normals (`kernels.obstacles.measure`)."""
+    """Signed distances and normals."""
 
     @override
     @staticmethod
-    def forward(
-        ctx: Any, shapes: ObstacleSet, x: torch.Tensor, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        given = [value.detach().double().contiguous() for value in (x, place, turn, growth)]
-        size = (*x.shape[:2], place.shape[1])
-        d, n = given[0].new_zeros(size), given[0].new_zeros(*size, 3)
-        views = [warp_view(given[0], wp.vec3d), warp_view(d, wp.float64), warp_view(n, wp.vec3d)]
-        _launch(kernels.measure, size, x.device, [shapes.at(*given[1:]), *views])
-        ctx.shapes = shapes
+    def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        for buffer, value in zip(own.inputs, given, strict=True):
+            buffer.copy_(value.detach())
+        own.launch(own.measure)
+        ctx.own = own
         ctx.save_for_backward(*given)
-        return d.to(x.dtype), n.to(x.dtype)
+        d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
+        return d, n
 
     @override
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, by_d: torch.Tensor, by_n: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        given = ctx.saved_tensors
-        by = [slope.double().contiguous() for slope in (by_d, by_n)]
-        position, turn = torch.zeros_like(by[1]), by[0].new_zeros(*by[0].shape, 3, 3)
-        views = [warp_view(given[0], wp.vec3d), warp_view(by[0], wp.float64), warp_view(by[1], wp.vec3d)]
-        views += [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
-        _launch(kernels.measure_adjoint, by[0].shape, by_d.device, [ctx.shapes.at(*given[1:]), *views])
-        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -by[0].sum(1))
-        return None, *(slope.to(by_d.dtype) for slope in slopes)
-
-
-def _launch(kernel: Any, size: tuple[int, ...], device: torch.device, arguments: list[Any]) -> None:
-    wp.launch(kernel, dim=size, inputs=arguments, device=str(device), stream=launch_stream(device), block_dim=BLOCK)
+    def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        own = ctx.own
+        for buffer, value in zip((*own.inputs, *own.by_results), (*ctx.saved_tensors, *by_results), strict=True):
+            buffer.copy_(value)
+        own.launch(own.differentiate)
+        position, turn, growth = own.by_position, own.by_turn, own.by_results[0]
+        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -growth.sum(1))
+        return None, *(slope.to(by_results[0].dtype) for slope in slopes)

@@ -94,6 +94,11 @@ def test_a_run_with_control_is_refused():
         check(composed("experiment=tendon_rod_control", f"obstacles={floor}"))
 
 
+def test_the_midpoint_rule_is_refused_before_the_laboratory_runs():
+    with pytest.raises(InputError, match="identify.integrator is midpoint"):
+        check(composed("experiment=beam_obstacle", "identify.integrator=midpoint"))
+
+
 def test_parameters_have_a_name_for_each_obstacle():
     run = settings(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
     simulator = build_simulator(run, run.simulation)

@@ -78,6 +78,11 @@ def check_run(run: RunSettings) -> None:
         names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
+        if run.obstacles and run.identify.integrator == "midpoint":
+            raise InputError(
+                "identify.integrator is midpoint, which cannot keep a body out of obstacles: set it to bdf2 or "
+                "implicit_euler."
+            )
         _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
         _check_owners(run.identify, run)

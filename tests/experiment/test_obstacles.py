@@ -95,7 +95,7 @@ def test_a_run_with_control_is_refused():
 
 
 def test_the_midpoint_rule_is_refused_before_the_laboratory_runs():
-    with pytest.raises(InputError, match="identify.integrator is midpoint"):
+    with pytest.raises(InputError, match=r"identify\.integrator is midpoint"):
         check(composed("experiment=beam_obstacle", "identify.integrator=midpoint"))
 
 

@@ -9,6 +9,7 @@ import torch
 from support.configured import check, composed, settings
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
+from warp_resphys.environments.worlds import RobotWorld
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
@@ -150,6 +151,27 @@ def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
     for _ in range(12):
         state, again = robot.step(state), loaded.step(again)
     np.testing.assert_array_equal(again.q, state.q)
+
+
+def test_an_environment_steps_and_draws_with_obstacles():
+    """A rod hangs above a floor and beside a wall, to which a tendon pulls it unless it lies elsewhere."""
+    run = settings(
+        "experiment=tendon_rod",
+        "mesh.layers=4",
+        "mesh.nodes=8",
+        "obstacles={floor: {shape: half_space, position: [0, 0, -0.205]}, wall: {shape: half_space, "
+        "position: [0.02, 0, 0], axis: [-1, 0, 0]}}",
+    )
+    body = SimulatorSettings.of(run)
+    rod = Robot(Description("rod", "sysid", body, run.simulation, build_body(run).mesh))
+    furthest = []
+    for robot in (rod, rod.with_parameters(obstacle_x_wall=1.0)):
+        world = RobotWorld(robot, "tendon_tension", 1)
+        for _ in range(25):
+            assert not world.step(np.array([[1.5, 0.0, 0.0]])).any()
+        furthest.append(world.bodies()[1][..., 0].max())
+        assert world.obstacles().points.shape == (16, 3)
+    assert 0.019 < furthest[0] < 0.02 < furthest[1]
 
 
 def test_a_twin_is_refused(robot):

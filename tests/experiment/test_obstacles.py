@@ -17,6 +17,7 @@ from warp_resphys.experiment.target import target_settings
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report.identification_section import parameter_wording
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.robot.twin.full import FullEstimator
@@ -114,6 +115,19 @@ def test_the_truth_of_a_laboratory_is_by_parameter():
     truth = true_contact(settings("experiment=beam_obstacle"))
     assert truth["contact_friction"] == 0.5
     assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "unit"),
+    [
+        ("contact_friction", "Friction of the obstacles", ""),
+        ("obstacle_z_bar", "Shift along z of the obstacle 'bar'", "mm"),
+        ("obstacle_turn_x_left_wall", "Turn about x of the obstacle 'left_wall'", "°"),
+        ("contact_stiffness_bar", "Stiffness of the obstacle 'bar'", "kPa"),
+    ],
+)
+def test_parameters_have_words_in_the_report(name, words, unit):
+    assert parameter_wording(name)[:2] == (words, unit)
 
 
 @pytest.fixture(scope="module")

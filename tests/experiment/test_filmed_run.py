@@ -9,6 +9,7 @@ import pytest
 from support.command_line import outcome, refusal
 from support.main_job import IN_RUN
 from warp_resphys.pictures.reading import read_tracked
+from warp_resphys.settings.pictures import SimulatedCamera
 
 PLAYED = [
     "experiment=camera_released",
@@ -85,6 +86,16 @@ RECORDED = [*PLAYED, "data.folder=pictures", "data.simulated=null", IN_RUN]
 def test_times_that_do_not_fit_are_named(recorded, change, sentence):
     recorded(change)
     assert sentence in refusal(*RECORDED)
+
+
+def test_a_release_after_the_simulated_pictures_is_named_before_any_work(folder):
+    sentence = "data.poses.released has fewer than 3 frames after its release at 100.007 s"
+    assert sentence in refusal(*PLAYED, "data.poses.released.release.time=100", IN_RUN)
+    assert not (folder / "run" / "stages").exists()
+    camera = SimulatedCamera(place=(0, 0, 1), looks_at=(0, 0, 0), frames=24, corrections={"release_delay": 0.007})
+    camera.check_release("poses.released", 20.3 / 60.0)  # 21, 22 and 23 are later
+    with pytest.raises(ValueError, match="fewer than 3 frames"):
+        camera.check_release("poses.released", 20.7 / 60.0)  # 21 is not, with the delay
 
 
 def test_a_frame_rate_gives_times(recorded, folder):

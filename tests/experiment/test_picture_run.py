@@ -221,7 +221,7 @@ def test_tracked_points_of_a_moving_camera(recorded):
         ("data.folder=null", "folder is not set"),
         ("data.poses.beam.outline=false", "data.poses.beam has no outline, no points, no scan and no depth image"),
         ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
-        ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set it to null"),
+        ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set data.simulated to null"),
     ],
 )
 def test_bad_input_gets_a_sentence(recorded, change, sentence):

@@ -10,6 +10,8 @@ from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Set
 from .mesh import LengthUnit, PlaceSettings
 from .trials import LimitSettings, different
 
+LEAST_MOVING = 3  # frames after a release, from which its motion is seen
+
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 _Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]
 
@@ -119,6 +121,16 @@ class SimulatedCamera(Settings):
     place: Vector = setting(description="of the camera", unit="m")
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
 
+    def check_release(self, pose: str, time: float) -> None:
+        """Checks that a pose shows enough of the motion after its release at a time [s]."""
+        time += self.corrections.get("release_delay", 0.0)
+        last = (self.frames - 1) / self.frame_rate
+        if sum(n / self.frame_rate > time for n in range(self.frames)) < LEAST_MOVING:
+            raise ValueError(
+                f"{pose} has fewer than {LEAST_MOVING} frames after its release at {time:g} s, as the simulated camera "
+                f"takes its last at {last:.3g} s: set an earlier release.time, or more data.simulated.frames."
+            )
+
 
 class PictureData(Settings):
     """Bodies before a camera, at rest or released: outlines and tracked points in pictures."""
@@ -179,7 +191,10 @@ class PictureData(Settings):
         if self.folder is None and self.simulated is None:
             raise ValueError("folder is not set: give the folder of the pictures.")
         if self.folder is not None and self.simulated is not None:
-            raise ValueError("simulated is for pictures without a folder, and data.folder is set: set it to null.")
+            raise ValueError(
+                "simulated is for pictures without a folder, and data.folder is set: set data.simulated to null for the "
+                "pictures of the folder, or data.folder for those of the simulated camera."
+            )
         if self.simulated is not None:
             for name, pose in self.poses.items():
                 if pose.mesh or pose.material or pose.cloud or pose.clamp_turn:
@@ -189,6 +204,8 @@ class PictureData(Settings):
                     )
                 if pose.points is not None and not pose.points.endswith(".csv"):
                     raise ValueError(f"poses.{name}.points is {pose.points}: the simulated camera writes a .csv table.")
+                if pose.release is not None:
+                    self.simulated.check_release(f"poses.{name}", pose.release.time)
             if [*self.lenses] != [""]:
                 raise ValueError("lens must be a single one for the simulated camera.")
             if len({pose.folder for pose in self.poses.values()}) < len(self.poses):

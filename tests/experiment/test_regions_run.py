@@ -98,6 +98,27 @@ def test_positions_and_orientations_have_their_own_errors(folder):
     assert metrics["orientations_deg"]["sysid"]["plate"] < 0.3 * metrics["orientations_deg"]["simulation"]["plate"]
 
 
+def test_a_robot_counts_a_rigid_body_as_the_report_does(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    robot = warp_resphys.load(folder, "sysid")
+    assert "vertices, 1 rigid body, steps" in repr(robot)
+    trial = warp_resphys.recorded_trial(robot, "m50")
+    motion = trial.play(robot)
+    errors = trial.errors_mm(motion)
+    assert errors.shape == (len(trial.times), 1)
+    assert np.nanmean(errors) == pytest.approx(metrics["errors_mm"]["sysid"]["mean"], rel=1e-3)
+    # A twin at rest, whose rigid body is seen turned about its position: its corners are 0.9 mm off, and it is not.
+    rest = robot.observe(robot.begin())[0].double().numpy()
+    place, turn = rest.mean(axis=0), Rotation.from_rotvec([0.0, 0.0, np.radians(1.0)])
+    turned = turn.apply(rest - place) + place
+    twin = robot.twin(horizon=2 * robot.time_step, patience=robot.time_step)
+    for number in range(8):
+        twin.take(number * robot.time_step, turned)
+        twin.ahead()
+    assert 1e3 * np.linalg.norm(turned - rest, axis=1).mean() > 0.5
+    assert twin.disagreement.simulator < 0.01
+
+
 def test_a_robot_takes_its_regions_along(folder):
     described = describe(folder, "sysid")
     described.write(folder / "robot.safetensors")

@@ -49,6 +49,11 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
+def number_of(count: int, what: str) -> str:
+    """Returns a number of things: "1 trial", "2 trials", "2 rigid bodies"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what[:-1]}ies" if what.endswith("y") else f"{count} {what}s"
+
+
 def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = ()) -> str:
     """Returns ", did you mean ...?" with the names most similar to an unknown one; empty if none is similar.
 

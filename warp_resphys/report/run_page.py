@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from markupsafe import Markup
 
+from ..io.errors import number_of
 from .conclusions import OUTSIDE, conclusions, epochs_kept, errors_by_load, trial_errors, untrained
 from .control_section import control_section
 from .data import MODELS, RunReport, TrialResults
@@ -179,17 +180,17 @@ def _what_is_measured(data: RunReport) -> str:
     elif data.sees_markers:
         count, labels = len(trials.names), trials.labels
         length = f" of {trials.times.max():g} s" if not span and trials.moves else ""
-        named = f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else _count(len(labels), "marker")
+        named = f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else number_of(len(labels), "marker")
         text = (
             f"Distance of the simulated markers from the measured ones, in millimetres: mean over "
-            f"{_count(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and frames "
+            f"{number_of(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and frames "
             "of the mean over the markers. Frames in which a marker is hidden are left out for it."
         )
     else:
         steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
         text = (
             "Distance of the simulated vertices from the same points of the target, in millimetres: mean over "
-            f"{_count(len(trials.names), 'test trial')}, {_count(steps, 'step')} and {len(data.mesh.vertices)} "
+            f"{number_of(len(trials.names), 'test trial')}, {number_of(steps, 'step')} and {len(data.mesh.vertices)} "
             "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
         )
     release = data.settings.release
@@ -217,10 +218,6 @@ def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) 
     replayed = reconstructed["replayed_mm"]
     effect = "make it fail" if replayed is None else f"give an error of {mm_text(replayed)}"
     return f"{text}; replayed in the simulator, its forces {effect} on the validation trials."
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' if number != 1 else ''}"
 
 
 def _numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[str, Cell]]:
@@ -301,14 +298,14 @@ def _panels(data: RunReport, trials: TrialResults) -> dict[str, list[int]]:
     named = {
         kind: [row for row, n in enumerate(trials.names) if (n in data.others) is (kind == OUTSIDE)] for kind in kinds
     }
-    return {f"{kind} ({_count(len(rows), 'trial')})": rows for kind, rows in named.items()}
+    return {f"{kind} ({number_of(len(rows), 'trial')})": rows for kind, rows in named.items()}
 
 
 def _error_caption(data: RunReport, window: float | None) -> str:
     count = len(data.metrics["per_trajectory"])
     text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
     if window is not None:
-        text += f" and {_count(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        text += f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
         text += largest_filtered(data.metrics)
     elif count > 1:
         parted = bool(errors_by_load(data.metrics, data.others))

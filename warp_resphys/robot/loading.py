@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.rigid_bodies import as_markers
 from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
@@ -84,8 +85,13 @@ class RecordedTrial:
         return np.asarray(markers if self.shift is None else markers + self.shift)
 
     def errors_mm(self, motion: Motion) -> NDArray[np.float64]:
-        """Distances (F, M) of a motion's markers from the observed ones [mm], NaN where a marker was not seen."""
-        return np.asarray(1e3 * np.linalg.norm(self.shown(motion) - self.markers, axis=-1))
+        """Returns the distances of a motion's markers from the observed ones [mm], as the report counts them.
+
+        Returns:
+            (F, K) for K markers and rigid bodies, each of these at its position; NaN where one was not seen.
+        """
+        away = as_markers(self.shown(motion) - self.markers, motion.robot.labels)
+        return np.asarray(1e3 * np.linalg.norm(away, axis=-1))
 
 
 def trial_names(robot: Robot) -> tuple[str, ...]:

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
+from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..energies.materials import MASS_DAMPING
 from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError, InputError, number_of
 from ..learning.feedback_equilibrium import equilibrium_under_feedback
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
@@ -153,9 +154,12 @@ class Robot:
     def __repr__(self) -> str:
         """Returns a short description: vertices, markers, time step, inputs, parameters, error."""
         body, description = self.simulator.body, self.description
+        bodies = len(corners_of(self.labels))
+        counts = {"marker": len(owners(self.labels)) - bodies, "rigid body": bodies}
+        seen = [number_of(count, what) for what, count in counts.items() if count]
         lines = [
             f"Robot {description.name}, {description.model}: {body.n_vertices} vertices, "
-            f"{len(self.labels) or 'no'} markers, steps of {1e3 * self.time_step:g} ms"
+            f"{' and '.join(seen) or 'no markers'}, steps of {1e3 * self.time_step:g} ms"
         ]
         lines += [f"  input {name} [{given.unit}]: {', '.join(given.parts)}" for name, given in self.inputs.items()]
         lines += [f"  identified {name}: {value:.6g}" for name, value in description.parameters.items()]

@@ -277,7 +277,7 @@ class TwinEstimator(ABC, Generic[B]):
                 belief = replace(belief, covariance=belief.covariance + np.diag(more))
                 since = np.where(moved, 0.0, since)
         squares, worse = self._compared(belief.squares, off, apart, passed)
-        correction = Correction(seen, refused, moved, restarted, off, apart, worse)
+        correction = Correction(seen, refused, moved, restarted, off, markers - free, worse)
         belief = replace(belief, since=since, squares=squares, shaken=_shaken(belief.shaken, away))
         if worse:
             return self.without_markers(belief), correction

@@ -61,7 +61,7 @@ class Correction:
         moved: (M,) markers that have moved on the body, to where they are looked for from now on.
         restarted: whether the body has moved to where markers stayed, so that its state was unknown.
         off: (M,) distances from where the corrected simulator expected them [m], NaN where not seen.
-        free: (M,) distances from the simulator that sees no markers [m].
+        free: (M, 3) offsets from the simulator that sees no markers [m], NaN where not seen.
         worse: whether these have been much smaller for a while, so that it went on from there.
     """
 

@@ -1,12 +1,13 @@
 """Predictions of a twin, compared with the markers that come."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from ...data.rigid_bodies import as_markers
 from ..state import RobotState
 from .kalman import FloatArray
 
@@ -34,7 +35,7 @@ class Forecast:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Mean distances of markers from those measured later, over the last predictions [mm].
+    """Mean distances of markers from those measured later, over the last predictions; rigid bodies by position [mm].
 
     Attributes:
         predictions: their number.
@@ -57,19 +58,27 @@ class Disagreement:
         return min(errors, key=lambda name: np.nan_to_num(errors[name], nan=np.inf))
 
 
+def mean_mm(off: FloatArray, labels: Sequence[str]) -> float:
+    """Mean length of the offsets (M, 3) [m] of markers and of the positions of rigid bodies [mm]; NaN without one."""
+    distances = np.linalg.norm(as_markers(off, labels), axis=1)
+    seen = np.isfinite(distances)
+    return 1e3 * float(distances[seen].mean()) if seen.any() else float("nan")
+
+
 class Scores:
     """Errors of the last predictions.
 
     Args:
         noise: standard deviation of a coordinate of a marker [m].
+        labels: of the M markers; empty where every vertex is observed.
 
     Attributes:
         pending: predictions that have not come to their end, with unscaled deviations, and the markers (M, 3) that were
             last seen when they were made [m].
     """
 
-    def __init__(self, noise: float) -> None:
-        self._noise = noise
+    def __init__(self, noise: float, labels: Sequence[str]) -> None:
+        self._noise, self._labels = noise, labels
         self.pending: list[tuple[Forecast, FloatArray]] = []
         self._errors: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)
         self._ratios: deque[FloatArray] = deque(maxlen=REMEMBERED)
@@ -105,10 +114,10 @@ class Scores:
         share = (end - time) / (end - before)
         off = frame - ((1.0 - share) * forecast.markers[-1] + share * forecast.markers[-2])
         usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
-        if not usable.any():
+        twin, held = (mean_mm(np.where(usable[:, None], x, np.nan), self._labels) for x in (off, frame - seen))
+        if np.isnan(twin):
             return
         ratio = off[usable] / np.hypot(forecast.deviations[usable], self._noise)
-        twin, held = (1e3 * float(np.linalg.norm(x[usable], axis=1).mean()) for x in (off, frame - seen))
         self._errors.append((twin, held, float((np.abs(ratio) < _NINETY * self.scale).mean())))
         self._ratios.append(ratio.ravel())
 

@@ -16,7 +16,7 @@ from ..inputs import Given, InputReader
 from ..state import RobotState
 from .estimator import Belief, TwinEstimator
 from .kalman import Correction, FloatArray
-from .scores import REMEMBERED, Disagreement, Forecast, Scores
+from .scores import REMEMBERED, Disagreement, Forecast, Scores, mean_mm
 from .stream import Faults
 
 _ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
@@ -82,7 +82,7 @@ class Twin:
         names = self.labels or [f"vertex_{number}" for number in range(estimator.count)]
         self._numbers = {label: number for number, label in enumerate(names)}
         self._reader = InputReader(estimator.robot.inputs, estimator.robot.simulator)
-        self._scores = Scores(estimator.noise.markers)
+        self._scores = Scores(estimator.noise.markers, self.labels)
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
@@ -324,8 +324,8 @@ class Twin:
         """Counts what happened in a step that no packet can change any more."""
         for _, correction in interval.corrections:
             self._tell(correction, self._counts)
-            if np.isfinite(correction.free).any():
-                self._free.append(1e3 * float(np.nanmean(correction.free)))
+            if np.isfinite(free := mean_mm(correction.free, self.labels)):
+                self._free.append(free)
 
     def _tell(self, correction: Correction, counts: Faults) -> None:
         for word, chosen in (("jumps", correction.refused), ("has moved on the body", correction.moved)):

@@ -180,11 +180,13 @@ def _what_is_measured(data: RunReport) -> str:
     elif data.sees_markers:
         count, labels = len(trials.names), trials.labels
         length = f" of {trials.times.max():g} s" if not span and trials.moves else ""
-        named = f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else number_of(len(labels), "marker")
+        named = (
+            f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else number_of(len(labels), "marker")
+        )
         text = (
             f"Distance of the simulated markers from the measured ones, in millimetres: mean over "
-            f"{number_of(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and frames "
-            "of the mean over the markers. Frames in which a marker is hidden are left out for it."
+            f"{number_of(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and "
+            "frames of the mean over the markers. Frames in which a marker is hidden are left out for it."
         )
     else:
         steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
@@ -305,7 +307,9 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     count = len(data.metrics["per_trajectory"])
     text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
     if window is not None:
-        text += f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        text += (
+            f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        )
         text += largest_filtered(data.metrics)
     elif count > 1:
         parted = bool(errors_by_load(data.metrics, data.others))

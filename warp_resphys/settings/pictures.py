@@ -192,8 +192,8 @@ class PictureData(Settings):
             raise ValueError("folder is not set: give the folder of the pictures.")
         if self.folder is not None and self.simulated is not None:
             raise ValueError(
-                "simulated is for pictures without a folder, and data.folder is set: set data.simulated to null for the "
-                "pictures of the folder, or data.folder for those of the simulated camera."
+                "simulated is for pictures without a folder, and data.folder is set: set data.simulated to null for "
+                "the pictures of the folder, or data.folder for those of the simulated camera."
             )
         if self.simulated is not None:
             for name, pose in self.poses.items():

@@ -201,13 +201,10 @@ def _read_columns(
         grid = np.arange(frames[-1] + 1)
         actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
     start = float(stamps[0]) if timed else 0.0
-    quaternions = np.full((len(values), len(labels), len(_QUATERNION)), np.nan)
-    for marker, numbers in turns.items():
-        quaternions[:, marker] = values[:, numbers]
     return RawRecording(
         *(_positions(frames, values[:, chosen]), labels, next(iter(units), None), rate, actuation),
         start=start,
-        turns=_spread(frames, quaternions) if turns else None,
+        turns=_turns(frames, values, turns, len(labels)),
     )
 
 
@@ -221,6 +218,16 @@ def _quaternions(turned: dict[tuple[str, str], int], labels: Sequence[str], path
             raise DataFileError(f"{path}: the rigid body {label} has no {lacks}: it needs x, y, z, qw, qx, qy and qz.")
         columns[labels.index(label)] = [turned[label, axis] for axis in _QUATERNION]
     return columns
+
+
+def _turns(
+    frames: NDArray[np.int64], values: FloatArray, columns: dict[int, list[int]], markers: int
+) -> FloatArray | None:
+    """Quaternions (T, M, 4) from rows (R, C) with those of some markers, NaN for others; None without any."""
+    quaternions = np.full((len(values), markers, len(_QUATERNION)), np.nan)
+    for marker, numbers in columns.items():
+        quaternions[:, marker] = values[:, numbers]
+    return _spread(frames, quaternions) if columns else None
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -271,26 +278,46 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
 def _read_motive(rows: Rows, path: Path) -> RawRecording:
     """Reads a line of keys and values, lines of Type, Name and others, a line of axes, and one line for every frame.
 
-    Only columns of Type Marker are read: measured markers, not those of a solved rigid body.
+    Columns of Type Marker are read, measured markers and not those of a solved rigid body, and of Type Rigid Body,
+    where rotations are quaternions.
     """
     keys = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     axes_line = next((number for number, row in enumerate(rows) if row[:1] == ["Frame"]), None)
     if axes_line is None:
         raise DataFileError(f"{path} has no line that begins with 'Frame': export it from Motive with its header.")
     head = [row for row in rows[1:axes_line] if any(row)]
-    at = next((number for number, row in enumerate(head[:-1]) if "Marker" in row), None)
+    at = next((number for number, row in enumerate(head[:-1]) if {"Marker", "Rigid Body"} & {*row}), None)
     if at is None:
         raise DataFileError(f"{path} holds no markers: export it from Motive with its markers.")
-    axes = [cell.lower() for cell in rows[axes_line]]
-    cells = enumerate(zip(head[at], head[at + 1], axes, strict=False))
-    labels, chosen = _markers(
-        ((name, axis, number) for number, (kind, name, axis) in cells if kind == "Marker" and axis in _AXES), path
-    )
-    values, lines = _numbers(rows, axes_line + 1, [0, *chosen], len(axes), path)
+    axes, turned = [cell.lower() for cell in rows[axes_line]], dict[tuple[str, str], int]()
+    places: dict[str, list[tuple[str, str, int]]] = {"Marker": [], "Rigid Body": []}
+    for number, (kind, name, part, axis) in enumerate(zip(head[at], head[at + 1], head[-1], axes, strict=False)):
+        if kind == "Rigid Body" and part == "Rotation":
+            turned[name, f"q{axis}"] = number
+        elif kind in places and axis in _AXES:
+            places[kind].append((name, axis, number))
+    bodies = [place for place in places["Rigid Body"] if (place[0], "qw") in turned]
+    whole = {name for name, *_ in bodies}
+    if left := {name for name, *_ in (*turned, *places["Rigid Body"])} - whole:
+        log.warning(
+            "%s: rigid bodies without a position and a quaternion are not read (%s): let Motive export both.",
+            *(path.name, listed(sorted(left))),
+        )
+    labels, chosen = _markers([*places["Marker"], *bodies], path)
+    if not labels:
+        raise DataFileError(f"{path} holds no markers: export it from Motive with its markers.")
+    turns = _quaternions({key: number for key, number in turned.items() if key[0] in whole}, labels, path)
+    known = [0, *chosen, *(number for columns in turns.values() for number in columns)]
+    read, lines = _numbers(rows, axes_line + 1, known, len(axes), path)
+    values = np.zeros((len(read), len(axes)))
+    values[:, known] = read
     frames, _ = _frames(values[:, 0], False, lines, path)
     rate = _number(keys.get("Export Frame Rate") or keys.get("Capture Frame Rate") or "")
     unit = keys.get("Length Units") or None
-    return RawRecording(_positions(frames, values[:, 1:]), labels, _MOTIVE_UNITS.get((unit or "").lower(), unit), rate)
+    return RawRecording(
+        *(_positions(frames, values[:, chosen]), labels, _MOTIVE_UNITS.get((unit or "").lower(), unit), rate),
+        turns=_turns(frames, values, turns, len(labels)),
+    )
 
 
 def _markers(named: Iterable[tuple[str, str, int]], path: Path, planar: bool = False) -> tuple[list[str], list[int]]:

@@ -38,6 +38,7 @@ from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.studies.gradient_check import central_difference
 from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.studies.run_speed import command_sheet, time_commands
+from warp_resphys.studies.twin_study import twin_sheet
 
 CONTROL = [
     "experiment=tendon_rod_control",
@@ -346,15 +347,30 @@ class TestReducedTwin:
         assert reduced_of(corrected).modes == 4
         assert fails.called
         assert "not kept" in caplog.text
+        monkeypatch.undo()
+        caplog.clear()
+        kept = ReducedModel.restored
+        worse = {"window_error_mm": 0.34, "window_motion_mm": 2.6}
+        monkeypatch.setattr(
+            ReducedModel, "restored", lambda *read: replace(own := kept(*read), quality={**own.quality, **worse})
+        )
+        reduced_of(corrected)
+        assert "The reduced model is 0.34 mm off in motions of 2.6 mm" in caplog.text  # of a kept one as well
 
     def test_it_is_a_setting(self, folder):
         settings = TwinSettings(
             horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"
         )
-        twin = settings.twin_of(warp_resphys.load(folder))
+        make = settings.twins_of(warp_resphys.load(folder))
+        twin = make()
         assert isinstance(twin.estimator, ReducedEstimator)
+        assert make().estimator.model is twin.estimator.model
+        assert ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet yet" in repr(twin)
+        assert "reduced model without markers, mm" in twin_sheet([], twin).headings
         with pytest.raises(InputError, match="no youngs_modulus to refine"):
-            settings.changed(refine={"youngs_modulus": 1e3}).twin_of(twin.estimator.robot)
+            settings.changed(refine={"youngs_modulus": 1e3}).twins_of(twin.estimator.robot)
+        with pytest.raises(InputError, match=r"robot is '.*': give the robot of a run, as warp_resphys\.load"):
+            reduced_twin(str(folder))
 
 
 class TestPlans:

@@ -34,4 +34,12 @@ def test_a_study_has_a_row_for_a_trial(finished, folder):
     assert row["twin_mm"] < row["held_mm"]
     code, err = end_of(cli.main, "warp-resphys", *arguments[:3], "trials=[none]", "hydra.run.dir=study")
     assert code == 2
-    assert "the trial is 'none'" in err
+    assert "trials names 'none'" in err
+    code, err = end_of(cli.main, "warp-resphys", *arguments[:3], "trials=[175]", "hydra.run.dir=study")
+    assert "trials names '175'" in err
+    assert "'150 g'" in err
+    # The beam has no markers, either, but a driven input is what makes another run the right one.
+    code, err = end_of(cli.main, "warp-resphys", *arguments, "twin.engine=reduced", "hydra.run.dir=study")
+    assert code == 2
+    assert "driven by one input" in err
+    assert "samples" not in err

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from .files import read_reduced, reduced_file, write_reduced
 from .polynomials import Monomials
 from .reduced import ReducedModel, ReducedState
 from .reduction import fingerprint, reduce
-from .sampling import Sampling
+from .sampling import Sampling, check_reducible
 from .world import FloatArray
 
 log = logging.getLogger(__name__)
@@ -39,22 +40,33 @@ def reduced_of(robot: Robot) -> ReducedModel:
         InputError: the robot cannot be reduced.
         ConvergenceError: it has no equilibrium for inputs in the range of its trials.
     """
-    own = fingerprint(robot)
+    check_reducible(robot)
     path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
-    if path is not None and path.exists():
-        with suppress(DataFileError):  # Damaged, or of an earlier version: it is computed again.
-            model = read_reduced(path, robot.description.learned)
-            if model.robot == own:
-                return model
-    sampling = Sampling()
-    with Progress("reduced model", sampling.total, "samples") as progress:
-        model = reduce(robot, sampling, progress.advance)
+    model = _kept(path, robot) or _computed(path, robot)
     off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
     if off > _MUCH * moved:
         log.warning(
             "The reduced model is %.2g mm off in motions of %.2g mm: compare it with twin.engine=full.", off, moved
         )
-    if path is not None and own == fingerprint(robot.with_parameters(**robot.description.parameters)):
+    return model
+
+
+def _kept(path: Path | None, robot: Robot) -> ReducedModel | None:
+    """The reduced model in a file; None if that is missing, damaged, of an earlier version, or of another robot."""
+    if path is not None and path.exists():
+        with suppress(DataFileError):
+            model = read_reduced(path, robot.description.learned)
+            if model.robot == fingerprint(robot):
+                return model
+    return None
+
+
+def _computed(path: Path | None, robot: Robot) -> ReducedModel:
+    """The reduced model, kept in a file if the robot has the parameters that its run has identified."""
+    sampling = Sampling()
+    with Progress("reduced model", sampling.total, "samples") as progress:
+        model = reduce(robot, sampling, progress.advance)
+    if path is not None and fingerprint(robot) == fingerprint(robot.with_parameters(**robot.description.parameters)):
         try:
             write_reduced(path, model)
         except DataFileError as error:
@@ -68,6 +80,7 @@ def reduced_twin(
     patience: float = 0.3,
     noise: TwinNoise | None = None,
     gate: Gate | None = None,
+    refine: Mapping[str, float] | None = None,
     **inputs: Given,
 ) -> Twin:
     """Returns a twin like `Robot.twin`, on the reduced model of a robot (`reduced_of`).
@@ -78,12 +91,20 @@ def reduced_twin(
         patience: how late packets may come [s].
         noise: of markers and simulator.
         gate: for markers that jump.
+        refine: none, as a reduced model has no parameters.
         inputs: commands before the first packet, as for `Robot.step`.
 
     Raises:
-        InputError: the robot cannot be reduced; an unknown input, or one that the reduced model does not have.
+        InputError: the robot cannot be reduced; a parameter to refine, an unknown input, or one that the reduced model
+            does not have.
         ConvergenceError: there is no equilibrium.
     """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is {robot!r}: give the robot of a run, as warp_resphys.load returns it.")
+    if refine:
+        raise InputError(
+            f"a reduced model has no {next(iter(refine))} to refine: set twin.engine=full, or use Robot.twin in Python."
+        )
     robot = robot.without_midpoint()
     return Twin(ReducedEstimator(robot, reduced_of(robot), inputs, noise, gate), horizon, patience)
 
@@ -115,6 +136,8 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         InputError: an input that the model does not have.
         ConvergenceError: there is no equilibrium.
     """
+
+    engine = "reduced model"
 
     def __init__(
         self,

@@ -135,12 +135,14 @@ def check_reducible(robot: Robot) -> None:
     """Refuses a robot that cannot be reduced.
 
     Raises:
-        InputError: a data-driven robot, one without markers, with a moving base, friction, a medium or obstacles, that
-            is stepped by the midpoint rule, or whose network is recurrent or nodal.
+        InputError: a data-driven robot, one that is not driven by exactly one input, without markers, with a moving
+            base, friction, a medium or obstacles, that is stepped by the midpoint rule, or whose network is recurrent
+            or nodal.
     """
     description = robot.description
     if robot.is_data_driven:
         raise InputError("a data-driven model has no stiffness to reduce: choose resphys or sysid.")
+    driven_input(robot)
     if not robot.labels:
         raise InputError(f"{description.name} has no markers: a reduced model predicts markers.")
     if description.told_of_base is not None:

@@ -30,7 +30,7 @@ _LOST: Final = 5  # jumps of the whole body that hint at another frame or unit
 _ADVICE: Final = {
     "twin": "the twin is the best",
     "held": "the twin is no better than markers held: rely on these",
-    "simulator": "the twin is no better: rely on the simulator",
+    "simulator": "the twin is no better: rely on the {}",
 }
 _BEHIND: Final = 1.0  # time since packets were last taken, after which the twin starts again [s]
 _EVERY: Final = 0.1  # between predictions [s]
@@ -47,18 +47,18 @@ class TwinSettings(Settings):
     planned: bool
     engine: Literal["full", "reduced"]
 
-    def twin_of(self, robot: Robot) -> Twin:
-        """Returns a twin with these settings.
+    def twins_of(self, robot: Robot) -> Callable[[], Twin]:
+        """Returns a function that makes twins with these settings, all on one reduced model where they are reduced.
 
         Raises:
-            InputError: the robot has no such parameter, or no simulator, or cannot be reduced.
+            InputError: the robot cannot be reduced; the function raises it where the robot has no such parameter, or no
+                simulator.
         """
         noise = TwinNoise(markers=self.noise)
         if self.engine == "full":
-            return robot.twin(self.refine, self.horizon, self.patience, noise=noise)
-        if self.refine:
-            raise InputError(f"a reduced model has no {next(iter(self.refine))} to refine: set twin.engine=full.")
-        return reduced_twin(robot, self.horizon, self.patience, noise)
+            return lambda: robot.twin(self.refine, self.horizon, self.patience, noise=noise)
+        estimator = reduced_twin(robot, self.horizon, self.patience, noise, refine=self.refine).estimator
+        return lambda: Twin(estimator, self.horizon, self.patience)
 
 
 def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
@@ -113,6 +113,7 @@ class LiveTwin:
         self.faces = np.searchsorted(self.surface, boundary_triangles(mesh))
         self._listener = Listener(source) if "://" in source else None
         self.seconds: deque[float] = deque(maxlen=_REMEMBERED)
+        self._made = settings.twins_of(robot)
         self.reset()
 
     @property
@@ -122,10 +123,9 @@ class LiveTwin:
 
     def reset(self) -> None:
         """Starts the recording again, or forgets what was estimated."""
-        settings, robot = self._settings, self.robot
-        self.twin = settings.twin_of(robot)
+        self.twin = self._made()
         self._recorded = self._packets_of_recording()
-        if self._recorded is not None and settings.planned:
+        if self._recorded is not None and self._settings.planned:
             self._recorded = planned_packets(self._recorded)
         self._next = None if self._recorded is None else next(self._recorded, None)
         self._clock = 0.0 if self._next is None else self._next.time
@@ -190,7 +190,8 @@ class LiveTwin:
                 f"{self.twin.horizon:g} s ahead: {off.twin:.2f} mm off; markers held {off.held:.2f} mm; "
                 f"{100 * off.covered:.0f} % in intervals of 90 %"
             )
-            lines.append(f"simulator without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best]}")
+            engine = self.twin.estimator.engine
+            lines.append(f"{engine} without markers: {off.simulator:.2f} mm off; {_ADVICE[off.best].format(engine)}")
         if self.twin.counts.get(JUMPS, 0) > _LOST:
             lines.append("Many jumps of the whole body: are packets in metres, in the robot's frame? (twin.align=true)")
         faults = self.twin.counts | (self._listener.refused if self._listener is not None else {})

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, InputError, listed
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..linalg.threads import threads_for
 from ..robot.loading import load, trial_names
 from ..robot.robot import Robot
+from ..robot.twin.twin import Twin
 from .live_twin import TwinSettings, trial_packets
 from .tables import Sheet, show
 
@@ -25,7 +26,7 @@ class TwinStudy(Settings):
     run: Word
     model: Word
     device: Word
-    trials: Many[Word]
+    trials: Many[Word | int]
     every: Positive = setting(unit="s")
     twin: TwinSettings
 
@@ -38,33 +39,38 @@ def twin_study(settings: TwinStudy, folder: Path) -> None:
         DataFileError: there is no finished run.
     """
     robot = load(Path(settings.run).expanduser(), settings.model, device=settings.device)
-    rows, names = [], settings.trials or trial_names(robot)
+    rows, known = list[dict[str, Any]](), trial_names(robot)
+    names = [str(name) for name in settings.trials or known]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"trials names {unknown[0]!r}: {settings.run} has {listed(known)}.")
+    made = settings.twin.twins_of(robot)
     with threads_for(1), Progress("twin", len(names), "trials") as progress:
         for name in names:
-            rows.append(followed(robot, name, settings.twin, settings.every))
+            twin = made()
+            rows.append(followed(robot, name, twin, settings))
             progress.advance()
     write_json(folder / "twin.json", {"run": settings.run, "twin": settings.twin.plain(), "trials": rows})
-    show(twin_sheet(rows, robot, settings.twin.horizon), f"Written: {folder / 'twin.json'}")
+    show(twin_sheet(rows, twin), f"Written: {folder / 'twin.json'}")
 
 
-def followed(robot: Robot, name: str, settings: TwinSettings, every: float) -> dict[str, Any]:
+def followed(robot: Robot, name: str, twin: Twin, settings: TwinStudy) -> dict[str, Any]:
     """Lets a twin follow a trial, packet by packet, as fast as it can.
 
     Args:
         robot: that the run has learned.
         name: of the trial.
-        settings: of the twin.
-        every: time between two predictions [s].
+        twin: of the robot, which has seen no packet.
+        settings: time between two predictions, and whether the twin knows the commands to come.
 
     Returns:
         ``trial``; ``ms`` and ``ms_99``, median and 99th percentile of the time of an estimate; ``ahead_ms``, median
         time of a prediction; mean errors [mm] at the horizon of the twin (``twin_mm``), of markers that are held
-        (``held_mm``), and of the simulator without markers (``simulator_mm``), with every command at its time; the
-        share ``covered`` by intervals of 90 %, the number of ``predictions``, the ``best`` of the three, and
-        ``counts`` of what was wrong.
+        (``held_mm``), and of the twin's simulator or reduced model without markers (``simulator_mm``), with every
+        command at its time; the share ``covered`` by intervals of 90 %, the number of ``predictions``, the ``best`` of
+        the three, and ``counts`` of what was wrong.
     """
-    twin, packets = settings.twin_of(robot), list(trial_packets(robot, name))
-    if settings.planned:
+    packets = list(trial_packets(robot, name))
+    if settings.twin.planned:
         twin.plan((packet.time, packet.inputs) for packet in packets)
     seconds, ahead, next_one = list[float](), list[float](), 0.0
     for packet in packets:
@@ -73,7 +79,7 @@ def followed(robot: Robot, name: str, settings: TwinSettings, every: float) -> d
         now = twin.now
         seconds.append(time.perf_counter() - began)
         if now.time >= next_one:
-            began, next_one = time.perf_counter(), now.time + every
+            began, next_one = time.perf_counter(), now.time + settings.every
             with suppress(ConvergenceError):  # The twin counts it.
                 twin.ahead()
             ahead.append(time.perf_counter() - began)
@@ -92,14 +98,16 @@ def followed(robot: Robot, name: str, settings: TwinSettings, every: float) -> d
     }
 
 
-def twin_sheet(rows: Sequence[dict[str, Any]], robot: Robot, horizon: float) -> Sheet:
-    """The table of `followed` trials."""
+def twin_sheet(rows: Sequence[dict[str, Any]], twin: Twin) -> Sheet:
+    """The table of trials that twins like this one `followed`."""
+    engine, robot = twin.estimator.engine, twin.estimator.robot
     columns = (
         "trial {trial} | estimate, ms {ms:.1f} | 99th percentile {ms_99:.1f} | prediction, ms {ahead_ms:.0f} | "
-        "twin, mm {twin_mm:.2f} | markers held, mm {held_mm:.2f} | simulator without markers, mm {simulator_mm:.2f} | "
+        "twin, mm {twin_mm:.2f} | markers held, mm {held_mm:.2f} | "
+        f"{engine} without markers, mm {{simulator_mm:.2f}} | "
         "in intervals of 90 % {covered:.0%} | predictions {predictions} | best {best}"
     )
-    scored = [row for row in rows if row["predictions"]]
+    scored = [{**row, "best": row["best"].replace("simulator", engine)} for row in rows if row["predictions"]]
     about = robot.description
-    title = f"{about.name}, {about.model}: steps of {1e3 * robot.time_step:g} ms, {horizon:g} s ahead"
+    title = f"{about.name}, {about.model}: steps of {1e3 * robot.time_step:g} ms, {twin.horizon:g} s ahead"
     return Sheet.of(title, columns, scored)

@@ -13,7 +13,7 @@ of (z, w, b, theta, o): an extended Kalman filter of reduced rank (Pham, Verron 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Generic, TypeVar
+from typing import ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
@@ -107,7 +107,10 @@ class TwinEstimator(ABC, Generic[B]):
     Attributes:
         count: number M of markers.
         size: of the body [m].
+        engine: name of its kind of simulator.
     """
+
+    engine: ClassVar[str] = "simulator"
 
     def __init__(
         self,

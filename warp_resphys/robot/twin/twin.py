@@ -95,6 +95,14 @@ class Twin:
         self._again = self._framed = False
         self._origin: float | None = None
 
+    def __repr__(self) -> str:
+        """Returns a short description: robot, kind of simulator, steps, and times of predictions and packets."""
+        about, engine = self.estimator.robot.description, self.estimator.engine
+        return (
+            f"Twin of {about.name}, {about.model}, by its {engine}: steps of {1e3 * self._h:g} ms, predictions "
+            f"{self.horizon:g} s ahead, {f'last packet at {self._latest:g} s' if self.has_begun else 'no packet yet'}"
+        )
+
     def _start(self, time: float, commands: dict[str, Given], frame: FloatArray | None) -> None:
         belief = self.estimator.begin(commands, self._refined)
         if frame is not None:

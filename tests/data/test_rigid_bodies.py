@@ -87,8 +87,10 @@ def test_a_marker_is_no_rigid_body(tmp_path):
     recording = recorded(tmp_path)
     with pytest.raises(DataFileError, match=r"'tip' is a marker without an orientation: export it as a rigid body"):
         with_corners(recording, {"tip": LENGTH})
-    with pytest.raises(DataFileError, match=r"no marker named 'cap', 'cap \+x', 'cap \+y', 'cap \+z'"):
+    with pytest.raises(DataFileError, match=r"has no rigid body 'cap': it has 'plate'; name it in markers\.rigid"):
         with_corners(recording, {"cap": LENGTH})
+    with pytest.raises(DataFileError, match=r"has no rigid body 'Plate', did you mean 'plate'\?"):
+        with_corners(recording, {"Plate": LENGTH})
     still = replace(recording, rest=recording.positions[0])
     np.testing.assert_allclose(
         with_corners(still, {"plate": LENGTH}).select(LABELS).rest, corners(PLACES, TURNS)[0], atol=1e-9

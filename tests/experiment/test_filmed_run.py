@@ -1,6 +1,7 @@
 """Stiffness, density and damping of a body that is released before a simulated camera with a rolling shutter."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -29,6 +30,9 @@ PLAYED = [
 ]
 
 
+NAMES = ("Delay of the release, released [ms]", "First tilt of gravity, released [°]")
+
+
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
     """Folder of a run before a simulated camera, by outlines and tracked points."""
@@ -49,6 +53,9 @@ def test_stiffness_density_and_damping_come_back(played):
     assert row["pictures"] == 24
     assert row["outline_mm"]["sysid"] < 0.5 * row["outline_mm"]["simulation"]
     assert row["points_mm"]["sysid"] < 0.5 * row["points_mm"]["undeformed"]
+    page = (folder / "report.html").read_text()
+    rows = {own: re.sub(r"<[^>]*>", " ", page.partition(own)[2].partition("</tr>")[0]).split() for own in NAMES}
+    assert [own[-1] for own in rows.values()] == ["7", "0"]  # true values
     assert "Damping by stiffness [ms]: " in result.out
     law = json.loads((folder / "law.json").read_text())
     assert law["constants"]["stiffness_damping"] == identified["stiffness_damping"]

@@ -91,7 +91,7 @@ class TestSentences:
 
     def test_of_an_unknown_kind(self):
         assert refused(shape={"kind": "bal"}) == "shape.kind is 'bal': it must be one of ball, brick."
-        assert refused(shape={}) == "shape.kind is None: it must be one of ball, brick."
+        assert refused(shape={}) == "shape.kind is null: it must be one of ball, brick."
         assert refused(shape=3) == "shape is 3: it must be a group of settings."
 
     def test_of_a_missing_key(self):

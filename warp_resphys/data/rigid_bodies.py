@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..io.errors import DataFileError
+from ..io.errors import DataFileError, did_you_mean, listed
 from ..settings.trials import CORNERS
 from .recordings.recording import ARM, Recording
 from .rigid import FloatArray, RigidTransform, fit
@@ -45,7 +45,14 @@ def with_corners(recording: Recording, lengths: Mapping[str, float]) -> Recordin
     labels, positions, rest = recording.labels, recording.positions, recording.rest
     for name, length in lengths.items():
         axes = [f"{name} +{axis}" for axis in "xyz"]
-        if name in labels and not {*axes} <= {*labels}:
+        if name not in labels:
+            known = [label for label in recording.labels if f"{label} +x" in recording.labels]
+            hint = did_you_mean(name, known) or (
+                f": it has {listed(known)}; name it in markers.rigid_bodies as the recording does, or name the markers "
+                "that it has in data.trials.NAME.labels."
+            )
+            raise DataFileError(f"{recording.source} has no rigid body {name!r}{hint}")
+        if not {*axes} <= {*labels}:
             raise DataFileError(
                 f"{recording.source}: {name!r} is a marker without an orientation: export it as a rigid body with its "
                 "quaternion (docs/recordings.md), or track it as a marker in markers.tracked."

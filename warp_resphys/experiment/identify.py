@@ -67,18 +67,21 @@ def identify(context: StageContext) -> None:
             known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
             guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
             found = search_parameters(wanted, settings.seed, identifier, guess, kept[model], progress, wanted.starts)
+            history = [[*records] for records in found["history"]]
+            best = min((records for records in history if records), key=lambda own: min(one["loss"] for one in own))
             for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
                 found = search_parameters(wanted, settings.seed, identifier, values, kept[again], progress, 1)
+                best.extend(found["history"][0])
                 if not changes(before, found["loss"]):
                     break
             if sessions := (found["placement"] or {}).get("sessions"):
                 like = torch.zeros(len(experiment.dataset.labels), 3, dtype=torch.float64)
                 expected = nuisances["accuracy"].of_new_session(like, len(sessions)).tolist()
                 found = {**found, "placement": {**found["placement"], "new_session": expected}}
-            identified[model] = _separated(found, searches[model]) | {"first_guess": guess}
+            identified[model] = _separated(found, searches[model]) | {"history": history, "first_guess": guess}
     if wanted.landscape and wanted.grid is not None:
         seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
         grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}

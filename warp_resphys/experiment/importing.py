@@ -20,7 +20,7 @@ from ..data.recordings.quality import quality
 from ..data.registration import Registration
 from ..data.rigid import root_mean_square
 from ..data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
-from ..io.errors import DataFileError, InputError
+from ..io.errors import DataFileError, InputError, number_of
 from ..io.files import write_json
 from ..io.stages import StageContext
 from ..settings.stages import ImportStage
@@ -353,8 +353,8 @@ def _write_quality(
             for warning in measured.warnings:
                 log.warning("%s: %s", measured.source.name, warning)
         elif measured.warnings:
-            count = len(measured.warnings)
-            log.info("import: %s: %d remarks on its quality in the report", measured.source.name, count)
+            remarks = number_of(len(measured.warnings), "remark")
+            log.info("import: %s: %s on its quality in the report", measured.source.name, remarks)
         # Residuals of the tracked markers of a loaded body do not concern the registration.
         fitted = [*settings.markers.tracked, *reference] if trial.shows_places else reference
         moved = {tracked[n]: -shifts[row, n] for n in trial.columns if tracked[n] in settings.markers.tracked}

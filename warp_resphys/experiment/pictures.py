@@ -29,7 +29,7 @@ from ..learning.parameters import TILTS, configured_parameters, own_name, split_
 from ..pictures.camera import CORRECTIONS, PlacedCamera
 from ..pictures.misfit import PictureMisfit, values_of
 from ..pictures.motion import OF_RELEASE
-from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, SeenPose, Shape
+from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
 from ..report.identification_section import parameter_rows
 from ..report.page import NONE, number_text
 from ..report.pictures_page import PictureResult, picture_verdict, write_pictures_report
@@ -178,8 +178,6 @@ class _Plan:
     def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:
         """First guesses: as given, the configured turn of a clamp, the mean of the prior, or as configured."""
         wanted, result = self.settings.identify, Values()
-        neutral = dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True))
-        neutral |= dict.fromkeys((CLAMP_SHIFT, *OF_RELEASE), 0.0)
         for name in names:
             parameter, owner = split_name(name)
             pose = next(pose for pose in poses if owner in (*pose.owners, *pose.lenses))
@@ -190,8 +188,8 @@ class _Plan:
                 result[name] = math.radians(self.data.poses[pose.name].clamp_turn)
             elif prior is not None:
                 result[name] = prior.mean
-            elif parameter in neutral:
-                result[name] = neutral[parameter]
+            elif parameter in NEUTRAL:
+                result[name] = NEUTRAL[parameter]
             else:
                 result[name] = configured_parameters(pose.simulator, [parameter])[parameter]
         return result

@@ -9,7 +9,7 @@ from ..data.markers import follow_vertices
 from ..data.registration import axes_rotation
 from ..data.rigid_bodies import owners
 from ..fem.body import Body
-from ..io.errors import InputError, listed
+from ..io.errors import InputError, listed, number_of
 from ..mesh.mesh import select_vertices
 from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
@@ -76,7 +76,8 @@ def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings
     enough = standing_enough(data, run.gravity)
     if count < enough:
         raise InputError(
-            f"markers names {count} in total: registration needs at least 3, or 2 with data.up, or 1 with data.axes."
+            f"markers.tracked and markers.reference name {number_of(count, 'marker')}: registration needs at least 3, "
+            "or 2 with data.up, or 1 with data.axes."
         )
     if markers.labels == "assigned" and STATIC in begins and standing < enough:
         raise InputError(

@@ -3,6 +3,7 @@
 Types, ranges and units come from the JSON Schema of the settings class.
 """
 
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -43,14 +44,19 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         tag = str(context.get("discriminator", "")).strip("'")
         kinds = [str(word) for option in options(schema, node) for word in _words_of(option["properties"][tag])]
         if not isinstance(value, Mapping):
-            return f"{key} is {value!r}: it must be a group of settings."
-        return f"{_dotted([tag], key)} is {value.get(tag)!r}: it must be one of {', '.join(kinds)}."
+            return f"{key} is {_shown(value)}: it must be a group of settings."
+        return f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of {', '.join(kinds)}."
     if kind == "value_error":
         message = str(context["error"])
         if not isinstance(value, Mapping):
-            return f"{key} is {value!r}: {message}"
+            return f"{key} is {_shown(value)}: {message}"
         return f"{key}.{message}" if key else message
-    return f"{key} is {value!r}: it must be {in_words(node, schema)}."
+    return f"{key} is {_shown(value)}: it must be {in_words(node, schema)}."
+
+
+def _shown(value: Any) -> str:
+    """A value as YAML has it, where Python has other words."""
+    return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
 
 
 def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:

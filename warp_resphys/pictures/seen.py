@@ -22,6 +22,10 @@ from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, 
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
 CLAMP_SHIFT: Final = "clamp_shift"  # m
+NEUTRAL: Final[Mapping[str, float]] = {  # parameters of a picture or a release, where these are as configured
+    **dict(zip(CORRECTIONS, PlacedCamera.corrections({}).tolist(), strict=True)),
+    **dict.fromkeys((CLAMP_SHIFT, *OF_RELEASE), 0.0),
+}
 # Values of parameters, and with them the vertices (N, 3) at rest, or (K + 1, N, 3) at the steps of a motion [m].
 Shape = tuple[Mapping[str, float], torch.Tensor]
 

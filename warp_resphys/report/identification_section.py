@@ -13,6 +13,7 @@ from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
 from .data import MODELS, FloatArray, RunReport
+from .notes import material_words
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 
 # Name, unit on the page, and its number in an SI unit.
@@ -37,6 +38,8 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     **{f"obstacle_turn_{axis}": (f"Turn about {axis} of the obstacles", "°", 180.0 / np.pi) for axis in "xyz"},
     "clamp_turn": ("Turn of the second clamp", "°", 180.0 / np.pi),
     "clamp_shift": ("Shift of the second clamp", "mm", 1e3),
+    "release_delay": ("Delay of the release", "ms", 1e3),
+    **{f"release_force_{axis}": (f"Added held force along {'xyz'[axis - 1]}", "N", 1.0) for axis in (1, 2, 3)},
     "focal_factor": ("Factor of the focal length", "", 1.0),
     **{f"camera_shift_{axis}": (f"Shift before the camera along {'xyz'[axis - 1]}", "mm", 1e3) for axis in (1, 2, 3)},
     **{
@@ -89,7 +92,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     if uncertain:
         notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
     if data.truth:
-        model = data.truth.get("model", "corotated").replace("_", " ")
+        model = material_words(data.truth.get("model", "corotated"))
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(text) for text in uncertain]
@@ -159,7 +162,7 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
         deviation = deviations.get(parameter)
         beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
         cells = [Cell(digits(start.get(parameter), factor)), Cell(digits(value, factor, deviation), beside=beside)]
-        cells += [Cell(digits(truth.get(parameter), factor))] if truth else []
+        cells += [Cell(digits(truth.get(parameter, truth.get(whole)), factor))] if truth else []
         cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
         rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
     return rows

@@ -85,7 +85,7 @@ def error_notes(sideways: Mapping[str, float], truth: Mapping[str, Any], mesh_ch
     """
     notes = []
     if sideways:
-        distances = ", ".join(f"{distance:.1f} mm ({trial})" for trial, distance in sideways.items())
+        distances = ", ".join(f"{number_text(distance)} mm ({trial})" for trial, distance in sideways.items())
         notes.append(
             "The sideways displacement of the held body is estimated from the first frames of a trial: with the "
             f"identified simulator, the markers by {distances}. Every simulator starts from its own estimate."
@@ -168,7 +168,12 @@ def material_note(material: MaterialSettings) -> str:
     else:
         moduli = {name: constants[name] for name, quantity in own.quantities.items() if quantity.unit == "Pa"}
         words = ", ".join(f"{name.replace('_', ' ')} {value / 1e3:g} kPa" for name, value in moduli.items() if value)
-    return words if model == "corotated" else f"{words}, {model.replace('_', ' ')}"
+    return words if model == "corotated" else f"{words}, {material_words(model)}"
+
+
+def material_words(model: str) -> str:
+    """Return the name of a material's model in words."""
+    return model.replace("_", " ").replace("neo hookean", "neo-Hookean")
 
 
 def small_strain_of(material: MaterialSettings) -> SmallStrain | None:

@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..io.files import read_array, read_hdf5
+from ..learning.parameters import TILTS
+from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings
 from .figures import TONES, FloatArray, in_style
 from .identification_section import parameter_rows
@@ -152,7 +154,8 @@ def write_pictures_report(
     results = [PictureResult(**row) for row in metrics["poses"]]
     assert run.pictures is not None
     played = run.pictures.simulated
-    truth = {} if played is None else {**start, **played.material, **played.corrections}
+    as_played = dict.fromkeys(TILTS, 0.0) | NEUTRAL
+    truth = {} if played is None else {**as_played, **start, **played.material, **played.corrections}
     parameters = PageTable(
         "Parameter",
         ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"],

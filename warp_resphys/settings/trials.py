@@ -335,8 +335,10 @@ class RigidBodySettings(Settings):
 
     part: Word | None = setting(None, "rigid part that it is mounted on")
     at: PlaceSettings | None = setting(None, "vertices of a stiff plate that it is mounted on instead")
-    position_deviation: Positive = setting(1.0e-3, "expected error of a position", "m")
-    orientation_deviation: Positive = setting(1.0, "expected error of an orientation", "degrees")
+    position_deviation: Annotated[float, Field(gt=0.0, le=0.05)] = setting(1.0e-3, "expected error of a position", "m")
+    orientation_deviation: Annotated[float, Field(gt=0.0, le=45.0)] = setting(
+        1.0, "expected error of an orientation", "degrees"
+    )
 
     @model_validator(mode="after")
     def _is_mounted(self) -> Self:
@@ -433,7 +435,9 @@ class PlaySettings(TargetSettings):
     rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
     noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")
     placement_noise: NotNegative = setting(description="of each coordinate of a marker's place", unit="m")
-    orientation_noise: NotNegative = setting(0.0, "of each component of a rigid body's rotation", unit="degrees")
+    orientation_noise: Annotated[float, Field(ge=0.0, le=45.0)] = setting(
+        0.0, "of each component of a rigid body's rotation", unit="degrees"
+    )
     zero_noise: NotNegative = setting(0.0, "of the zero of a trial's recorded inputs, in the unit of the input")
     tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "of the body from level", "degrees")
     held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "before the release", "s")

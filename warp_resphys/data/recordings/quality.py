@@ -259,8 +259,8 @@ def check_base(
         if largest > largest_distortion:
             raise DataFileError(
                 f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * largest:.2f} mm "
-                f"against the other base markers since {recordings[0].source}; put it back, leave it out, or raise "
-                f"the limit of {_MILLI * largest_distortion:g} mm."
+                f"against the other base markers since {recordings[0].source}; put it back, check the unit, leave "
+                f"it out, or raise the limit of {_MILLI * largest_distortion:g} mm."
             )
         worst = int(np.argmax(motion.shift))
         if largest_shift is not None and motion.shift[worst] > largest_shift:

@@ -134,8 +134,9 @@ class TestCompleteRun:
         assert list(results["sysid_elastic"]["parameters"]) == ["youngs_modulus", "poissons_ratio"]
         for search in (results["sysid"], results["sysid_elastic"]):
             losses = [record["loss"] for record in search["history"][0]]
-            assert search["loss"] == min(losses) < losses[0]
-            assert len(losses) <= 6
+            assert search["loss"] < losses[0]
+            assert search["loss"] in losses
+            assert len(losses) <= 4 * 6  # The release was estimated again, up to three times.
         assert np.isfinite(results["landscape"]["loss"]).all()
         assert np.shape(results["landscape"]["loss"]) == (2, 1)
         assert np.shape(results["sysid"]["uncertainty"]["correlation"]) == (2, 2)

@@ -1,3 +1,4 @@
+import json
 from typing import Annotated, Literal, Self
 
 import pytest
@@ -61,6 +62,11 @@ def refused(**values: object) -> str:
     return str(caught.value)
 
 
+def shown(value):
+    """A value as YAML has it."""
+    return json.dumps(value) if value is None or value is True else repr(value)
+
+
 class TestTypes:
     def test_a_whole_number_stands_for_a_number_and_a_list_becomes_a_tuple(self):
         world = parse(World, {"shape": {"kind": "brick", "size": [1, 2, 3], "divisions": [4, 5]}, "share": 1})
@@ -70,11 +76,11 @@ class TestTypes:
 
     @pytest.mark.parametrize("value", [True, "0.5", None, float("nan"), float("inf"), [0.5], 0.0, 1.5])
     def test_an_invalid_share_is_refused(self, value):
-        assert refused(share=value).startswith(f"share is {value!r}: it must be a number above 0")
+        assert refused(share=value).startswith(f"share is {shown(value)}: it must be a number above 0")
 
     @pytest.mark.parametrize("value", [2.0, True, "2", -1])
     def test_an_invalid_count_is_refused(self, value):
-        assert refused(count=value) == f"count is {value!r}: it must be a whole number, zero or more."
+        assert refused(count=value) == f"count is {shown(value)}: it must be a whole number, zero or more."
 
     def test_a_setting_does_not_change(self):
         with pytest.raises(ValueError, match="frozen"):

@@ -68,9 +68,11 @@ _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do 
 _DASHED: Final = {
     **dict.fromkeys(BASELINES, (0, (2, 1))),
     "published": (0, (1, 1.2)),
+    "sysid": (0, (4, 4)),
     "sysid_elastic": (0, (4, 2)),
     "resphys_uncorrected": (0, (4, 2)),
 }
+_LEAST_SPAN: Final = 5.0  # Of a logarithmic axis, end over end: at least two of its ticks.
 STYLE: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -169,7 +171,7 @@ def _error_lines(
             shown = positive(median_filter(mean, float(time[1] - time[0]), window))
             settled = shown[len(shown) // 10 :]
             lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
-        elif len(rows) > 1 and model not in _DASHED:
+        elif len(rows) > 1 and (model == "sysid" or model not in _DASHED):
             low, high = (positive(extreme.reduce(rows, axis=0)) for extreme in (np.fmin, np.fmax))
             axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
         axes.plot(time, shown, **line)
@@ -233,9 +235,9 @@ def settle(figure: Figure) -> None:
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
-    """Return style and label of a model's line; that of ResPhys is thicker."""
+    """Return style and label of a model's line; that of ResPhys is thicker, and dashed ones are drawn over it."""
     width += 0.5 if model == "resphys" else 0.0
-    look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-")}
+    look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-"), "zorder": 2.1 if model in _DASHED else 2}
     return {**look, "linewidth": width, "label": LABELS[model]}
 
 
@@ -258,7 +260,7 @@ def positive(values: FloatArray) -> FloatArray:
 
 
 def use_logarithm(axes: Axes, least: float = 0.0) -> None:
-    """Make the y axis logarithmic, over at least a decade and from a least value; call it after drawing.
+    """Make the y axis logarithmic, over at least a factor of five and from a least value; call it after drawing.
 
     Labels are 0.1, 1, 10 or, on long axes, powers of ten; on short axes 2 and 5 are labelled too. Where no value can be
     shown, such as errors that are all zero, a sentence is written instead.
@@ -269,8 +271,9 @@ def use_logarithm(axes: Axes, least: float = 0.0) -> None:
         return
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    if high < 10.0 * low:
-        low, high = 10.0 ** math.floor(math.log10(low)), 10.0 ** math.ceil(math.log10(high) + 1e-9)
+    if high < _LEAST_SPAN * low:
+        middle, reach = math.sqrt(low * high), math.sqrt(_LEAST_SPAN)
+        low, high = middle / reach, middle * reach
     low = max(low, least)
     axes.set_ylim(low, high)
     plain = low >= 5e-5 and high <= 2e4

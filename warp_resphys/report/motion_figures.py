@@ -64,7 +64,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
         motion.plot(time, _MILLI * moved[:, axis], **model_line(model))
         with np.errstate(over="ignore", invalid="ignore"):
             gap = _MILLI * np.linalg.norm(moved - target, axis=1)
-        distance.plot(time, positive(gap), color=TONES[model].light)
+        distance.plot(time, positive(gap), **model_line(model))
     _keep_in_view(motion, _MILLI * target[:, axis], 0.8)
     motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
     motion.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))

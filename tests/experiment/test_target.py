@@ -74,7 +74,7 @@ def test_a_law_of_the_material_is_a_model_as_any_other():
 def test_the_report_tells_how_the_target_differs():
     run = settings(*OWN, "target.material.stiffness_damping=0.01")
     words = "another mesh, muscle fibres, time steps of 0.005 s, the integrator bdf2 and other damping"
-    assert target_note(run) == f"E 264 kPa, ν 0.45, stable neo hookean; with {words}"  # noqa: RUF001
+    assert target_note(run) == f"E 264 kPa, ν 0.45, stable neo-Hookean; with {words}"  # noqa: RUF001
     assert "this run's also has another model of the material, another mesh" in published_note(run)
     assert "this run's" not in published_note(settings())
 

@@ -225,7 +225,7 @@ class TestBeams:
         assert "No recordings are configured" not in page.text
         for said in (
             "On 2 trials, held out from training and identification, the simulated markers are",
-            *("5.46 ± 1.78", "251.3 ± 2.5", "stable neo hookean", "left out", "1 min 35 s", "no OpenGL here"),
+            *("5.46 ± 1.78", "251.3 ± 2.5", "stable neo-Hookean", "left out", "1 min 35 s", "no OpenGL here"),
             "Young's modulus and Poisson's ratio (correlation \N{MINUS SIGN}0.96)",
             "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
             "Trial load52, in which the last model of the table has its largest error",

@@ -192,6 +192,7 @@ def adjoint(
 
 @wp.kernel
 def bound(
+    active: wp.array[int],  # (B) zero: skip the environment
     nodes: wp.array2d[int],
     weights: wp.array2d[wp.float64],
     o: Obstacles,
@@ -206,6 +207,8 @@ def bound(
     on as far as the largest slope of its distance allows, several times.
     """
     b, p, k = wp.tid()
+    if active[b] == 0:
+        return
     cell = p / points_per_cell
     x = line_at(origin, nodes, weights, b, p, cell)
     way = line_at(positions, nodes, weights, b, p, cell) - x

@@ -16,6 +16,7 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
+    SymmetryPlane,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -314,7 +315,7 @@ def compare(losses, values, sizes, seed=3):
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, moves):
     floor = HalfSpace(position=(0.0, 0.0, -1.2e-3), axis=(0.03, -0.02, 1.0), moves=moves)
-    ball = Sphere(position=(0.008, 0.012, -0.0315), radius=0.03)
+    ball = Sphere(position=(0.008, 0.012, -0.0315), radius=0.03, moves=moves)
     material, steps, slip = replace(SOFT, stiffness_damping=2e-4), 14, 2e-2
     s = simulator(
         {"floor": floor, "ball": ball},
@@ -450,11 +451,39 @@ def test_values_out_of_range(make, message):
         make()
 
 
-def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
-    ball = Sphere(position=(0.01, 0.01, 0.04), radius=0.01, moves=True)
-    simulator = Simulator(Body(BLOCK, energies=[Contact({"ball": ball})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
-    state, down = simulator.rest_state(), torch.zeros(1, 1, dtype=torch.float64)
-    state, _ = simulator.step(state, Inputs(obstacle_move_z=down))
-    with pytest.raises(InputError, match="'ball' passes over vertices"):
-        simulator.step(state, Inputs(obstacle_move_z=down - 0.08))
-    simulator.step(state, Inputs(obstacle_move_z=down - 0.0105))
+@pytest.mark.parametrize("thickness", [0.002, 0.008])
+def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused(thickness):
+    plate = Box(position=(0.01, 0.01, SIDE + 0.01), edges=(0.05, 0.05, thickness), moves=True)
+    simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
+    still = torch.zeros(1, 1, dtype=torch.float64)
+    state, _ = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
+    for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 30):
+        with pytest.raises(InputError, match="'plate' pass through one another"):
+            simulator.step(state, Inputs(obstacle_move_z=still - way))
+    simulator.step(state, Inputs(obstacle_move_z=still - 0.0105 + 0.5 * thickness))
+    with pytest.raises(InputError, match="more than 90 degrees"):
+        simulator.step(state, Inputs(obstacle_move_z=still, obstacle_rotate_z=still + 2.0))
+
+
+def test_a_clamp_that_moves_through_an_obstacle_is_refused():
+    plate = Box(position=(0.01, 0.01, -0.003), edges=(0.05, 0.05, 0.002))
+    body = Body(BLOCK, fixed=select_vertices(BLOCK, z=0.0), energies=[Contact({"plate": plate})])
+    simulator = Simulator(body, gravity=(0.0, 0.0, 0.0), time_step=0.01)
+    clamp = simulator.rest_positions[simulator.fixed]
+    for way in (0.004, 0.008, 0.05):
+        inputs = Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, way]))
+        with pytest.raises(InputError, match="'plate'"):
+            simulator.step(simulator.rest_state(), inputs)
+        with pytest.raises(InputError, match="'plate'"):
+            simulator.static_equilibrium(inputs)
+    simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015])))
+
+
+def test_bodies_and_inputs_that_contact_refuses():
+    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
+    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
+    with pytest.raises(InputError, match="symmetry planes has no contact"):
+        Simulator(half)
+    simulator = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
+    with pytest.raises(InputError, match="without moves=True"):
+        simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))

@@ -34,6 +34,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import InputError
 from ..kernels import contact as kernels
@@ -61,7 +62,7 @@ MOTION = (
 POSE: Final = ("contact_place", "contact_turn")
 FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
 _PUSHES = 50
-_SHARES = [0.125 * k for k in range(1, 9)]  # of the way of an obstacle, at which it is looked at
+_ADVANCES = 100
 _DEEP = 0.3  # share of D within which a start is warned of
 
 
@@ -211,6 +212,11 @@ class BoundContact(BoundEnergy):
             sizes = (("contact_place", "m", (3,)), ("contact_turn", "rotation", (3, 3)))
             names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
+        self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
+        self._free = (~torch.isin(self._vertices, self._fixed)).to(
+            self._area
+        )  # (P,) one at vertices that are not fixed
+        self._check_body(site.body)
         self._check_start(like)
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
@@ -228,6 +234,13 @@ class BoundContact(BoundEnergy):
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
         values = self.energy.prepare(parameters)
         pose = self.pose(values, {})
+        for k, (name, obstacle) in enumerate(self._contact.obstacles.items()):
+            most = float(pose.growth.detach()[:, k].max()) + self._contact.distance
+            if isinstance(obstacle, DistanceGrid) and obstacle.margin < most:
+                raise InputError(
+                    f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
+                    f"{1e3 * most:.3g} mm, with obstacle_growth: give it a larger margin."
+                )
         return {**values, "contact_place": pose.place, "contact_turn": pose.turn}
 
     def _pose(self, inputs: Inputs, constants: Constants, batch: int) -> Pose:
@@ -250,17 +263,21 @@ class BoundContact(BoundEnergy):
         if x.device.type == "cpu":  # On a GPU the host would wait.
             self._check(state.q, before, "at the start of a step", d)
         reference = stage.velocity_reference[:, self._vertices, None].expand(-1, -1, self._contact.count, -1)
-        start = state.q
+        start, here = state.q, x[:, :, None].expand_as(reference)
         if self._contact.moves:
             # Where an obstacle was at a point, it moves with the obstacle; so do the normals.
-            here = x[:, :, None].expand_as(reference)
             inside = before.local(here)
             ways, weights = (here, earlier.world(inside)), [weight for _, weight in stage.strain_weights] or [1.0]
             was = sum(weight * way for weight, way in zip(weights, ways, strict=False))
             reference = reference + now.world(inside) - was
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
-            self._check_way(now.world(inside).detach(), x.detach(), now, d.detach())
-            start = self._pushed_out(state.q.detach(), now, d.detach())
+            self._check_motion(step.inputs, before, now)
+            here = now.world(inside)
+            start = state.q.detach()
+        if self._contact.moves or step.inputs.fixed_positions is not None:
+            self._check_way(here.detach(), self._ends(x, step.inputs), now, d.detach())
+        if self._contact.moves:
+            start = self._pushed_out(start, now, d.detach())
         length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {
@@ -320,24 +337,58 @@ class BoundContact(BoundEnergy):
         poses = (now.place, now.turn, before.place, before.turn)
         return dict(zip((m.name for m in self.memory), poses, strict=True))
 
-    def _check_way(self, carried: torch.Tensor, x: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> None:
-        """Raises InputError where an obstacle passes over a vertex.
+    def _ends(self, x: torch.Tensor, inputs: Inputs) -> torch.Tensor:
+        """Returns the vertices of the surface (B, P, 3), the fixed ones where they are at the end of a step [m]."""
+        given, x = inputs.fixed_positions, x.detach()
+        if given is None:
+            return x
+        whole = x.new_zeros(len(x), len(self.site.rest_positions), 3).index_copy(1, self._vertices, x)
+        whole[:, self._fixed] = given.detach()
+        x = whole[:, self._vertices]
+        return x
+
+    def _check_motion(self, inputs: Inputs, before: Pose, now: Pose) -> None:
+        """Raises InputError where an obstacle that does not move has an input, or one turns too far in a step."""
+        still = self._moving == 0.0
+        for quantity in MOTION:
+            value = inputs.actuation.get(quantity.name)
+            if value is not None and bool((value[..., still] != 0.0).any()):
+                raise InputError(f"{quantity.name} is not zero for an obstacle without moves=True: set it there.")
+        if bool((torch.einsum("boij,boij->bo", before.turn, now.turn) < 1.0).any()):
+            raise InputError("an obstacle turns by more than 90 degrees in a step: turn it less in a step.")
+
+    def _check_way(self, carried: torch.Tensor, ends: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> None:
+        """Raises InputError where an obstacle passes over a vertex, or a fixed vertex through an obstacle.
+
+        A way is followed to its first place on an obstacle: by the tangential planes of a convex one, which are
+        never beyond it, and by the largest slope of the distance from another.
 
         Args:
             carried: (B, P, O, 3) vertices as if they had moved with the obstacles [m].
-            x: (B, P, 3) vertices, which have not [m].
+            ends: (B, P, 3) where they are before the solve, fixed vertices at the end of the step [m].
             pose: poses after the motion.
             gaps: (B, P, O) distances before it [m].
         """
-        ways = x[:, :, None] - carried
+        ways = ends[:, :, None] - carried
         for k in (ways.norm(dim=-1) > gaps).any(1).any(0).nonzero().ravel().tolist():
-            places = [carried[:, :, k] + share * ways[:, :, k] for share in _SHARES]
-            *between, end = (self._shapes.distances(place, pose)[0][..., k] for place in places)
-            deepest = torch.stack(between).amin(0)
-            if bool(((deepest < 0.0) & (deepest < end)).any()):
+            obstacle, way = tuple(self._contact.obstacles.values())[k], ways[:, :, k]
+            end, side = (value[:, :, k] for value in self._shapes.distances(ends, pose))
+            share, most = torch.zeros_like(end), torch.full_like(end, obstacle.size[1]) * way.norm(dim=-1)
+            for _ in range(_ADVANCES):
+                d, n = (
+                    value[:, :, k] for value in self._shapes.distances(carried[:, :, k] + share[..., None] * way, pose)
+                )
+                slope = most if isinstance(obstacle, DistanceGrid) else -(n * way).sum(-1)
+                further = torch.where(slope > 0.0, d / slope.clamp_min(torch.finfo(d.dtype).tiny), 2.0)
+                share = (share + further.clamp_min(0.0)).clamp_max(2.0)
+                if bool(((share >= 1.0) | (further < 1e-6)).all()):
+                    break
+            passes = (share < 1.0) & ((end > 0.0) | ((n * side).sum(-1) < 0.0))
+            if bool(passes.any()):
+                vertex = int(self._vertices[passes.any(0).nonzero()[0]])
                 raise InputError(
-                    f"the obstacle {self._contact.names[k]!r} passes over vertices of the body in a step: move it less "
-                    "in a step."
+                    f"vertex {vertex} of the body and the obstacle {self._contact.names[k]!r} pass through one another "
+                    "in a step: move the obstacle, or the fixed vertices, less in a step."
                 )
 
     def _pushed_out(self, q: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> torch.Tensor:
@@ -360,26 +411,23 @@ class BoundContact(BoundEnergy):
         self._check(q, pose, "after an obstacle has moved")
         return q
 
-    @property
-    def _free(self) -> torch.Tensor:
-        """(P,) one at vertices that are not fixed."""
-        fixed = torch.as_tensor(self.site.body.fixed_vertices + self.site.first, device=self._vertices.device)
-        return (~torch.isin(self._vertices, fixed)).to(self._area)
+    def _check_body(self, body: Body) -> None:
+        """Raises InputError for a body whose vertices contact cannot move on their own."""
+        if len(body.symmetry) or len(body.glued):
+            what = "symmetry planes" if len(body.symmetry) else "glued vertices"
+            raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
+        if self._contact.moves and body.rigid:
+            raise InputError("obstacles that move do not push rigid parts: let the body move, or make the parts stiff.")
 
     def _check_start(self, rest: torch.Tensor) -> None:
         """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""
-        contact, thickness = self._contact, float((rest.amax(0) - rest.amin(0)).min())
+        contact, own = self._contact, rest[self._vertices]
+        thickness = float((own.amax(0) - own.amin(0)).min())
         if contact.distance > thickness:
             raise InputError(
                 f"contact.distance is {1e3 * contact.distance:g} mm and the body {1e3 * thickness:g} mm thick: take a "
                 "hundredth to a tenth of that."
             )
-        for name, obstacle in contact.obstacles.items():
-            if isinstance(obstacle, DistanceGrid) and obstacle.margin < contact.distance:
-                raise InputError(
-                    f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
-                    f"{1e3 * contact.distance:g} mm: give it a larger margin."
-                )
         pose = self.pose(contact.constants, {})
         d, _ = self._shapes.distances(rest[None, self._vertices], pose)
         self._check(rest[None], pose, "at rest", d)
@@ -456,7 +504,8 @@ class ContactTerm(Term):
     @override
     def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
         own, (s,) = self.launcher, self.sets
-        inputs = [s.nodes, s.gradients, self._obstacles(values), s.points_per_cell, origin, positions]
+        inputs = [warp_view(own.active, wp.int32), s.nodes, s.gradients, self._obstacles(values), s.points_per_cell]
+        inputs += [origin, positions]
         return [own.record(kernels.bound, (own.batch, s.n_points, self._count), inputs, [share])]
 
     @override

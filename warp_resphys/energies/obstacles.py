@@ -304,20 +304,31 @@ class _Measurement(Launcher):
 
     def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
         super().__init__(batch, device)
-        pairs = (points, count)
+        self._size = (points, count)
         self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
-        self.results = [self.zeros(*pairs), self.zeros(*pairs, 3)]
-        self.by_results = [self.zeros(*pairs), self.zeros(*pairs, 3)]
-        self.by_position, self.by_turn = self.zeros(*pairs, 3), self.zeros(*pairs, 3, 3)
         x, *pose = self.inputs
-        given, kinds = [shapes.at(*pose), warp_view(x, wp.vec3d)], (wp.float64, wp.vec3d)
-        results, by_results = (
-            [warp_view(value, kind) for value, kind in zip(values, kinds, strict=True)]
-            for values in (self.results, self.by_results)
+        self._given = [shapes.at(*pose), warp_view(x, wp.vec3d)]
+        self.results, views = self._pair()
+        self.measure = self.record(kernels.measure, (batch, *self._size), self._given, views)
+
+    def _pair(self) -> tuple[list[torch.Tensor], list[Any]]:
+        """Returns buffers of distances and normals, and Warp's views of them."""
+        buffers = [self.zeros(*self._size), self.zeros(*self._size, 3)]
+        return buffers, [warp_view(buffer, kind) for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)]
+
+    @cached_property
+    def adjoint(self) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, Any]:
+        """Buffers of derivatives by the results, by positions and by rotations, and the launch; made when needed."""
+        by_results, views = self._pair()
+        position, turn = self.zeros(*self._size, 3), self.zeros(*self._size, 3, 3)
+        slopes = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
+        inputs = [*self._given, *views]
+        return (
+            by_results,
+            position,
+            turn,
+            self.record(kernels.measure_adjoint, (self.batch, *self._size), inputs, slopes),
         )
-        slopes = [warp_view(self.by_position, wp.vec3d), warp_view(self.by_turn, wp.mat33d)]
-        self.measure = self.record(kernels.measure, (batch, *pairs), given, results)
-        self.differentiate = self.record(kernels.measure_adjoint, (batch, *pairs), [*given, *by_results], slopes)
 
 
 class _Distances(torch.autograd.Function):
@@ -339,9 +350,9 @@ class _Distances(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         own = ctx.own
-        for buffer, value in zip((*own.inputs, *own.by_results), (*ctx.saved_tensors, *by_results), strict=True):
+        buffers, position, turn, command = own.adjoint
+        for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
             buffer.copy_(value)
-        own.launch(own.differentiate)
-        position, turn, growth = own.by_position, own.by_turn, own.by_results[0]
-        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -growth.sum(1))
+        own.launch(command)
+        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -buffers[0].sum(1))
         return None, *(slope.to(by_results[0].dtype) for slope in slopes)

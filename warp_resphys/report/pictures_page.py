@@ -154,7 +154,7 @@ def write_pictures_report(
     results = [PictureResult(**row) for row in metrics["poses"]]
     assert run.pictures is not None
     played = run.pictures.simulated
-    as_played = dict.fromkeys(TILTS, 0.0) | NEUTRAL
+    as_played = {**dict.fromkeys(TILTS, 0.0), **NEUTRAL}
     truth = {} if played is None else {**as_played, **start, **played.material, **played.corrections}
     parameters = PageTable(
         "Parameter",

@@ -301,7 +301,7 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
     if left := {name for name, *_ in (*turned, *places["Rigid Body"])} - whole:
         log.warning(
             "%s: rigid bodies without a position and a quaternion are not read (%s): let Motive export both.",
-            *(path.name, listed(sorted(left))),
+            *(path.name, listed(sorted(map(str, left)))),
         )
     labels, chosen = _markers([*places["Marker"], *bodies], path)
     if not labels:

@@ -298,7 +298,7 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
             places[kind].append((name, axis, number))
     bodies = [place for place in places["Rigid Body"] if (place[0], "qw") in turned]
     whole = {name for name, *_ in bodies}
-    if left := {name for name, *_ in (*turned, *places["Rigid Body"])} - whole:
+    if left := {name for name, _ in turned}.union(name for name, *_ in places["Rigid Body"]) - whole:
         log.warning(
             "%s: rigid bodies without a position and a quaternion are not read (%s): let Motive export both.",
             *(path.name, listed(sorted(map(str, left)))),

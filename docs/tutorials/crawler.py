@@ -127,6 +127,7 @@ for _ in range(14):
     optimiser.step()
     reached.append(1e3 * abs(way.item()))
 print("mm:", " ".join(f"{way:.1f}" for way in reached))
+assert reached[-1] > 1.3e3 * float(ways[best])
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")

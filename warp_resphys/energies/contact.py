@@ -213,9 +213,7 @@ class BoundContact(BoundEnergy):
             names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
-        self._free = (~torch.isin(self._vertices, self._fixed)).to(
-            self._area
-        )  # (P,) one at vertices that are not fixed
+        self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
         self._check_body(site.body)
         self._check_start(like)
 
@@ -235,8 +233,10 @@ class BoundContact(BoundEnergy):
         values = self.energy.prepare(parameters)
         pose = self.pose(values, {})
         for k, (name, obstacle) in enumerate(self._contact.obstacles.items()):
+            if not isinstance(obstacle, DistanceGrid):
+                continue
             most = float(pose.growth.detach()[:, k].max()) + self._contact.distance
-            if isinstance(obstacle, DistanceGrid) and obstacle.margin < most:
+            if obstacle.margin < most:
                 raise InputError(
                     f"the grid of {name!r} ends {1e3 * obstacle.margin:.3g} mm outside of it, and contact begins at "
                     f"{1e3 * most:.3g} mm, with obstacle_growth: give it a larger margin."
@@ -344,8 +344,7 @@ class BoundContact(BoundEnergy):
             return x
         whole = x.new_zeros(len(x), len(self.site.rest_positions), 3).index_copy(1, self._vertices, x)
         whole[:, self._fixed] = given.detach()
-        x = whole[:, self._vertices]
-        return x
+        return whole[:, self._vertices]
 
     def _check_motion(self, inputs: Inputs, before: Pose, now: Pose) -> None:
         """Raises InputError where an obstacle that does not move has an input, or one turns too far in a step."""
@@ -417,7 +416,9 @@ class BoundContact(BoundEnergy):
             what = "symmetry planes" if len(body.symmetry) else "glued vertices"
             raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
         if self._contact.moves and body.rigid:
-            raise InputError("obstacles that move do not push rigid parts: let the body move, or make the parts stiff.")
+            raise InputError(
+                "obstacles that move do not push rigid parts: move the body instead, or give the part a stiff material."
+            )
 
     def _check_start(self, rest: torch.Tensor) -> None:
         """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""

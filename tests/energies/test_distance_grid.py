@@ -1,5 +1,7 @@
 """Obstacles of any shape: distances on a grid, from a surface, against closed forms."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.report.obstacles import ObstacleSurface
 
 RADIUS = 0.02  # m
+RING, TUBE = 0.02, 0.008  # m, radii of a torus and of its section
 CPU = torch.device("cpu")
 
 
@@ -59,11 +62,38 @@ def test_normals_are_slopes_of_distances_and_have_a_derivative():
     assert float((slope * way).sum()) == pytest.approx((up - down) / (2.0 * step), rel=1e-4)
 
 
-def test_outside_of_the_grid_it_is_further_away_than_its_boundary():
-    grid = exact()
-    d, n = measured(grid, torch.tensor([[[0.1, 0.0, 0.0], [0.0, -0.2, 0.0]]]).double())
-    assert (d > grid.margin).all()
-    torch.testing.assert_close(n, torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]]).double())
+def test_outside_of_the_grid_its_distance_is_added_to_the_least_one_at_its_boundary():
+    """The interpolation ends one node within the grid, 13 spacings from the sphere in the direction of an axis."""
+    spacing, x = 2e-3, np.array([[[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.09, -0.07, 0.001]]])
+    grid = exact(spacing)
+    end = RADIUS + 13.0 * spacing
+    away = x - np.clip(x, -end, end)
+    length = np.linalg.norm(away, axis=-1)
+    d, n = measured(grid, torch.as_tensor(x))
+    np.testing.assert_allclose(d, 13.0 * spacing + length, rtol=1e-12)
+    np.testing.assert_allclose(n, away / length[..., None], atol=1e-12)
+
+
+def ring(**pose):
+    surface = torus()
+    return DistanceGrid.of_surface(surface.vertices, surface.faces, 1e-3, **pose)
+
+
+def torus():
+    return trimesh.creation.torus(RING, TUBE, major_sections=48, minor_sections=24)
+
+
+def test_no_slope_is_larger_than_the_bound_of_slopes():
+    """Also at the centre of a hole and in the middle of a plate as thick as a spacing, where distances have kinks."""
+    plate = trimesh.creation.box((0.04, 0.04, 1e-3))
+    for grid in (ring(), DistanceGrid.of_surface(plate.vertices, plate.faces, 1e-3)):
+        axes = [low + 2.5e-4 * np.arange(4, 4 * n - 7) for low, n in zip(grid.low, grid.distances.shape, strict=True)]
+        within = [axis[np.abs(axis) < 6e-3] for axis in axes]
+        most = 0.0
+        for places in (within, [axes[0], within[1], within[2]]):
+            x = torch.as_tensor(np.stack(np.meshgrid(*places, indexing="ij"), -1).reshape(1, -1, 3))
+            most = max(most, float(measured(grid, x)[1].norm(dim=-1).max()))
+        assert 1.2 < most < grid.largest_slope < 1.5 * most
 
 
 def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
@@ -77,12 +107,23 @@ def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
     (tmp_path / "open.stl").write_bytes(trimesh.Trimesh(box.vertices, box.faces[1:]).export(file_type="stl"))
     with pytest.raises(MeshError, match="close the surface"):
         DistanceGrid.from_file(tmp_path / "open.stl", spacing=1e-3)
+    with pytest.raises(MeshError, match="one of m, cm, mm, not inch"):
+        DistanceGrid.from_file(tmp_path / "box.stl", spacing=1e-3, units="inch")
+    for faces in (box.faces[:, ::-1], np.concatenate([box.faces[:1, ::-1], box.faces[1:]])):
+        with pytest.raises(InputError, match="counter-clockwise"):
+            DistanceGrid.of_surface(1e-3 * box.vertices, faces, 1e-3)
+
+
+def test_distances_may_be_a_list():
+    grid = exact(4e-3)
+    same = DistanceGrid(distances=grid.distances.tolist(), spacing=grid.spacing, low=grid.low)
+    np.testing.assert_array_equal(same.coefficients, grid.coefficients)
 
 
 def test_a_body_that_is_thrown_through_a_ring_does_not_penetrate():
     """The distance of a ring is not convex: the whole block passes through its hole or rests on it."""
-    ring = trimesh.creation.torus(0.02, 0.008, major_sections=48, minor_sections=24)
-    grid = DistanceGrid.of_surface(ring.vertices, ring.faces, 1e-3, position=(0.0, 0.0, -0.015))
+    height = -0.015
+    grid = ring(position=(0.0, 0.0, height))
     box = box_hexahedra((0.03, 0.03, 0.01), (4, 4, 1))
     mesh = Mesh(box.vertices + [-0.01, -0.014, 0.0], box.cells)
     contact = Contact({"ring": grid, "floor": HalfSpace(position=(0.0, 0.0, -0.04))}, friction=0.5)
@@ -94,6 +135,9 @@ def test_a_body_that_is_thrown_through_a_ring_does_not_penetrate():
     for _ in range(40):
         before, (state, _) = state, simulator.step(state)
         forces = simulator.contacts(before, state)[""]
+        x = state.q[0, forces.vertices].numpy() - [0.0, 0.0, height]
+        gaps = np.hypot(np.hypot(x[:, 0], x[:, 1]) - RING, x[:, 2]) - TUBE
+        assert gaps.min() > 0.0
         assert float(forces.gap.min()) > 0.0
         touched |= bool((forces.normal[:, :, 0].norm(dim=-1) > 0.0).any())
     assert touched
@@ -115,6 +159,8 @@ def test_its_picture_is_its_surface():
         ({"distances": np.zeros((4, 4, 4))}, "8 nodes or more"),
         ({"distances": -np.ones((9, 9, 9))}, "end outside of the shape"),
         ({"spacing": 0.0}, "spacing"),
+        ({"low": (0.0, 0.0)}, "DistanceGrid.low is .* three finite numbers"),
+        ({"low": (0.0, math.nan, 0.0)}, "DistanceGrid.low is .* three finite numbers"),
     ],
 )
 def test_grids_that_are_refused(change, words):

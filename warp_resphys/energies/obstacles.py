@@ -1,5 +1,6 @@
 """Rigid obstacles of bodies: shapes at a place, which may move."""
 
+import itertools
 import os
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +15,17 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..io.errors import InputError
+from ..io.errors import InputError, MeshError
 from ..kernels import obstacles as kernels
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
 from .launcher import Launcher, warp_view
 
 Vector = tuple[float, float, float]
+# Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
+# it, and a third above, from the coefficients of the node before, itself and the one behind.
+_VALUES = np.array([[2.0, 4.0, 0.0], [1.0, 4.0, 1.0], [0.0, 4.0, 2.0]]) / 6.0
+_SLOPES = np.array([[-5.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [-1.0, -4.0, 5.0]]) / 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +42,7 @@ class Obstacle:
     """
 
     kind: ClassVar[int]
+    vectors: ClassVar[tuple[str, ...]] = ("position", "axis")  # fields that are three numbers
     lengths: ClassVar[tuple[str, ...]] = ()  # fields that are lengths
 
     position: Vector = (0.0, 0.0, 0.0)
@@ -46,7 +52,7 @@ class Obstacle:
     def __post_init__(self) -> None:
         """Checks the numbers."""
         name = type(self).__name__
-        for key in ("position", "axis"):
+        for key in self.vectors:
             value = getattr(self, key)
             if np.shape(value) != (3,) or not np.isfinite(np.asarray(value, dtype=float)).all():
                 raise InputError(f"{name}.{key} is {value}: it must be three finite numbers.")
@@ -143,10 +149,12 @@ class DistanceGrid(Obstacle):
     Edges are rounded over about a spacing. Around the grid, the distance is that from it and ``margin``.
 
     Raises:
-        InputError: fewer than four nodes along an axis, or distances at the boundary that are not positive.
+        InputError: fewer than eight nodes along an axis, values that are not finite, or distances at the boundary that
+            are not positive.
     """
 
     kind: ClassVar[int] = int(kernels.GRID)
+    vectors: ClassVar[tuple[str, ...]] = (*Obstacle.vectors, "low")
     lengths: ClassVar[tuple[str, ...]] = ("spacing",)
     distances: NDArray[np.float64]  # (I, J, K) [m]
     spacing: float  # of the nodes [m]
@@ -155,7 +163,8 @@ class DistanceGrid(Obstacle):
     def __post_init__(self) -> None:
         """Checks the grid."""
         super().__post_init__()
-        shape = np.shape(self.distances)
+        object.__setattr__(self, "distances", np.asarray(self.distances, dtype=np.float64))
+        shape = self.distances.shape
         if len(shape) != 3 or min(shape) < 8 or not np.isfinite(self.distances).all():
             raise InputError(
                 f"DistanceGrid.distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes."
@@ -177,11 +186,25 @@ class DistanceGrid(Obstacle):
         """(I, J, K) coefficients of the B-splines [m]."""
         return np.asarray(scipy.ndimage.spline_filter(self.distances, 3, output=np.float64, mode="mirror"))
 
+    @cached_property
+    def largest_slope(self) -> float:
+        """Upper bound of the slope, by the convex hull of the Bezier points of the gradient."""
+        largest = self.spacing  # outside of the grid
+        for points in itertools.product(range(3), repeat=3):
+            gradient = []
+            for along in range(3):
+                values = self.coefficients
+                for axis, point in enumerate(points):
+                    weights = (_SLOPES if axis == along else _VALUES)[point]
+                    values = scipy.ndimage.correlate1d(values, weights, axis)
+                gradient.append(values[1:-1, 1:-1, 1:-1])
+            largest = max(largest, float(np.linalg.norm(gradient, axis=0).max()))
+        return largest / self.spacing
+
     @property
     @override
     def size(self) -> Vector:
-        slopes = np.gradient(self.distances, self.spacing)
-        return (self.spacing, 1.2 * float(np.sqrt(sum(slope**2 for slope in slopes)).max()), self.margin)
+        return (self.spacing, self.largest_slope, self.margin)
 
     @classmethod
     def of_surface(
@@ -198,11 +221,16 @@ class DistanceGrid(Obstacle):
             pose: position, axis and ``moves``.
 
         Raises:
-            InputError: a surface that is not closed.
+            InputError: a surface that is not closed, or whose triangles are seen from inside.
         """
         surface = trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles))
         if not surface.is_watertight:
             raise InputError("the surface of the obstacle is not closed, so that it has no inside: repair it.")
+        if not (surface.is_winding_consistent and surface.volume > 0.0):
+            raise InputError(
+                "the triangles of the obstacle are not all counter-clockwise seen from outside: reverse those that are "
+                "not."
+            )
         width = (10.0 * spacing if margin is None else margin) + 2.0 * spacing
         low, high = surface.bounds + np.array([[-width], [width]])
         shape = np.ceil((high - low) / spacing).astype(int) + 1
@@ -232,8 +260,10 @@ class DistanceGrid(Obstacle):
             pose: position, axis and ``moves``.
 
         Raises:
-            MeshError: the file is missing or damaged, or its surface is not closed.
+            MeshError: other units, or a file that is missing or damaged, or whose surface is not closed.
         """
+        if units not in METRES:
+            raise MeshError(f"the units of an obstacle's surface must be one of {', '.join(METRES)}, not {units}")
         vertices, shells = read_shells(Path(path).expanduser())
         return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
 

@@ -430,12 +430,29 @@ def test_refusals():
         held.rollout(start, 2, Inputs(obstacle_move_z=vector(0.0, 1.5e-3)[:, None, None]))
 
 
+TWO = {"a": HalfSpace(position=(0.0, 0.0, -0.1)), "b": HalfSpace(position=(0.0, 0.0, -0.2))}
+
+
+def test_values_by_the_name_of_an_obstacle():
+    contact = Contact(TWO, stiffness=2e4, friction={"b": 0.2, "a": 0.1})
+    constants = Simulator(Body(BLOCK, energies=[contact])).prepare()
+    assert constants.value("contact_friction").tolist() == [[0.1, 0.2]]
+    assert constants.value("contact_stiffness").unique().tolist() == [2e4]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Contact({}), "needs an obstacle"),
         (lambda: Contact({"a": HalfSpace()}, friction=-0.1), "contact_friction.* -0.1"),
         (lambda: Contact({"a": HalfSpace()}, stiffness=0.0), "contact_stiffness.* 0"),
+        (lambda: Contact({"a": HalfSpace()}, friction=[0.1, 0.2]), "contact_friction has 2 values for 1 obstacle"),
+        (lambda: Contact(TWO, stiffness=np.ones((4, 3))), "contact_stiffness has 3 values for 2 obstacles"),
+        (
+            lambda: Contact(TWO, friction={"a": 0.1, "c": 0.2}),
+            "friction has values for 'a', 'c', but the obstacles are",
+        ),
+        (lambda: Contact(TWO, friction={"a": 0.1, "b": -0.2}), "contact_friction is -0.2"),
         (lambda: Contact({"a": HalfSpace()}, distance=0.0), "contact.distance is 0: it must be positive"),
         (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
         (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be positive"),

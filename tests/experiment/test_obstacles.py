@@ -52,7 +52,7 @@ def test_every_shape_is_built_with_its_own_friction():
         "bar": Cylinder(radius=0.02, length=0.04, axis=(0.0, 1.0, 0.0)),
         "block": Box(edges=(0.1, 0.2, 0.3)),
     }
-    assert contact.friction == [0.1, 0.2, 0.3, 0.4, 0.5]
+    assert contact.constants["contact_friction"] == [0.1, 0.2, 0.3, 0.4, 0.5]
     assert (contact.stiffness, contact.distance, contact.slip_speed) == (5e4, 2e-3, 1e-3)
 
 

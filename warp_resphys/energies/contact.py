@@ -36,7 +36,7 @@ from typing_extensions import override
 
 from ..fem.body import Body
 from ..fem.elements import Points
-from ..io.errors import InputError
+from ..io.errors import InputError, listed
 from ..kernels import contact as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces, face_triangles
@@ -83,14 +83,14 @@ class Contact(Energy):
     are `MOTION`, which add to the last six. The points are the vertices of the surface.
 
     Raises:
-        InputError: no obstacle, or a value out of range.
+        InputError: no obstacle, a value out of range, or values that do not fit the obstacles.
     """
 
     is_barrier: ClassVar[bool] = True
 
     obstacles: Mapping[str, Obstacle]
-    stiffness: Parameter = 1e5  # kappa [Pa], a number or one for each obstacle
-    friction: Parameter = 0.0  # mu
+    stiffness: Parameter | Mapping[str, float] = 1e5  # kappa [Pa], a number or one by obstacle, in order or by name
+    friction: Parameter | Mapping[str, float] = 0.0  # mu, likewise
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
 
@@ -101,8 +101,22 @@ class Contact(Energy):
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")
-        STIFFNESS.check(self.stiffness)
-        FRICTION.check(self.friction)
+        for name, quantity in (("stiffness", STIFFNESS), ("friction", FRICTION)):
+            values = self._by_obstacle(name)
+            quantity.check(values)
+            self.per_part(quantity, quantity.shaped(torch.as_tensor(values)))
+
+    def _by_obstacle(self, name: str) -> Parameter:
+        """Returns a number, or values in the order of the obstacles."""
+        values: Parameter | Mapping[str, float] = getattr(self, name)
+        if not isinstance(values, Mapping):
+            return values
+        if values.keys() != self.obstacles.keys():
+            raise InputError(
+                f"contact.{name} has values for {listed([*values])}, but the obstacles are {listed(self.names)}: give "
+                "one for each."
+            )
+        return [values[obstacle] for obstacle in self.obstacles]
 
     @property
     @override
@@ -133,7 +147,8 @@ class Contact(Energy):
     @override
     def constants(self) -> Mapping[str, Parameter]:
         zeros = {quantity.name: 0.0 for quantity in (GROWTH, *SHIFT, *TURN)}
-        return {STIFFNESS.name: self.stiffness, FRICTION.name: self.friction, **zeros}
+        own = {STIFFNESS.name: self._by_obstacle("stiffness"), FRICTION.name: self._by_obstacle("friction")}
+        return {**own, **zeros}
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:

@@ -189,8 +189,4 @@ def build_contact(settings: BodySettings) -> Contact:
     for name, obstacle in settings.obstacles.items():
         own = dict(obstacle)
         obstacles[name] = _SHAPES[own.pop("shape")](**own)
-    values = dict(settings.contact)
-    for key in ("stiffness", "friction"):
-        if isinstance(values[key], dict):
-            values[key] = [values[key][name] for name in obstacles]
-    return Contact(obstacles, **values)
+    return Contact(obstacles, **dict(settings.contact))

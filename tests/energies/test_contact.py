@@ -163,6 +163,42 @@ def test_a_block_on_an_incline_sticks_and_slides(integrator, device):
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
+    """On inclines of half a degree less and more than arctan mu, the second of which begins beyond the slip speed."""
+    mu, h = vector([0.3], [0.3]), 5e-3
+    radians = math.atan(0.3) + np.radians([-0.5, 0.5])
+    gravity = torch.as_tensor(G * np.stack([np.sin(radians), 0.0 * radians, -np.cos(radians)], 1))
+    s, _ = resting(20.0, integrator=integrator, time_step=h, solver=TIGHT)
+    given, start = {"contact_friction": mu, "gravity": gravity}, s.rest_state(2)
+    start = State(start.q, start.v + vector([0.0, 0.0, 0.0], [0.02, 0.0, 0.0])[:, None])
+    states = [start]
+    for _ in range(30):
+        states.append(s.step(states[-1], None, given)[0])
+    earlier, before, after = states[-3:]
+    old, new = (s.contacts(*pair, None, given)[""] for pair in ((earlier, before), (before, after)))
+    assert new.obstacles == ("obstacle",)
+    weights = {"implicit_euler": (1.0, -1.0, 0.0), "bdf2": (1.5, -2.0, 0.5)}[integrator]
+    v = [state.v for state in (after, before, earlier)]
+    acceleration = sum(w * value for w, value in zip(weights, v, strict=True)) / h
+    force = (s.prepare().mass[..., None] * (acceleration - gravity[:, None])).sum(1)
+    acting = (new.normal + new.friction).sum((1, 2))
+    assert acting.numpy() == pytest.approx(force.numpy(), abs=1e-6 * float(force.norm(dim=-1).min()))
+    pressed = old.normal.norm(dim=-1) > 0.0
+    assert bool((new.normal[..., 2] >= 0.0).all())
+    # Coulomb's law with the normal force at the start of the step; the slide is that of the velocity at its end.
+    slide, at = after.v[:, new.vertices, None, :2], pressed[1]
+    full = mu[1] * old.normal[1].norm(dim=-1)
+    assert new.friction[1].norm(dim=-1).numpy() == pytest.approx(full.numpy(), rel=1e-6)
+    assert new.friction[1, ..., :2][at].numpy() == pytest.approx(
+        (-full[..., None] * slide[1] / slide[1].norm(dim=-1, keepdim=True))[at].numpy(), rel=1e-6, abs=1e-9
+    )
+    assert bool(((new.friction[..., :2] * slide).sum(-1)[pressed] < 0.0).all())
+    assert new.slide.numpy() == pytest.approx(h / weights[0] * slide.norm(dim=-1).numpy(), rel=1e-6)
+    assert torch.equal(new.sticks[0], pressed[0])
+    assert not bool(new.sticks[1].any())
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_block_that_is_thrown_at_a_shape_does_not_penetrate(shape, integrator, device):
     """Three throws at 5 m/s with a spin: at a face, an edge and past the centre."""

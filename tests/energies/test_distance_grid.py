@@ -7,7 +7,18 @@ import pytest
 import torch
 import trimesh
 
-from warp_resphys import Body, Contact, Corotated, DistanceGrid, HalfSpace, Mesh, Simulator, State, box_hexahedra
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    DistanceGrid,
+    HalfSpace,
+    Mesh,
+    Simulator,
+    SolverSettings,
+    State,
+    box_hexahedra,
+)
 from warp_resphys.energies.obstacles import ObstacleSet, Pose
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.report.obstacles import ObstacleSurface
@@ -141,6 +152,38 @@ def test_a_body_that_is_thrown_through_a_ring_does_not_penetrate():
         assert float(forces.gap.min()) > 0.0
         touched |= bool((forces.normal[:, :, 0].norm(dim=-1) > 0.0).any())
     assert touched
+
+
+def test_gradients_of_a_block_that_slides_over_a_ring():
+    """By its velocity, friction, stiffness and the pose of the ring."""
+    box = box_hexahedra((0.03, 0.03, 0.01), (3, 3, 1))
+    mesh = Mesh(box.vertices + [-0.0103, -0.0144, 0.0], box.cells)  # between the nodes of the grid
+    contact = Contact({"ring": ring(position=(0.0, 0.0, -0.0088))}, stiffness=2e4, friction=0.3, slip_speed=2e-2)
+    silicone = Corotated(1e5, 0.45, density=1070.0, stiffness_damping=2e-3)
+    tight = SolverSettings("newton", relative_tolerance=1e-13)
+    simulator = Simulator(Body(mesh, energies=[contact]), silicone, 1e-3, solver=tight)
+    start, random = simulator.rest_state(), torch.Generator().manual_seed(0)
+    weights = torch.randn(start.q.shape, generator=random, dtype=torch.float64)
+    values = {"v": start.v + torch.tensor([0.3, 0.1, -0.1]), "contact_friction": 0.3, "contact_stiffness": 2e4}
+    values |= {"obstacle_y": 0.0, "obstacle_z": 0.0, "obstacle_turn_x": 0.0, "obstacle_growth": 0.0}
+    values = {
+        name: torch.as_tensor(value).double().reshape(1, -1, 3 if name == "v" else 1) for name, value in values.items()
+    }
+    sizes = {"v": 1e-5, "contact_friction": 1e-5, "contact_stiffness": 0.5, "obstacle_turn_x": 1e-6}
+
+    def loss(values):
+        given = {name: value.reshape(1, 1) for name, value in values.items() if name != "v"}
+        trajectory = simulator.rollout(State(start.q, values["v"]), 8, None, given)
+        return (weights * trajectory.q[-1]).sum()
+
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    loss(leaves).backward()
+    for name, value in values.items():
+        change = sizes.get(name, 1e-7) * torch.randn(value.shape, generator=random, dtype=torch.float64)
+        with torch.no_grad():
+            near = [float(loss({**values, name: value + k * change})) for k in (-2.0, -1.0, 1.0, 2.0)]
+        difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
+        assert float((leaves[name].grad * change).sum()) == pytest.approx(difference, rel=1e-6), name
 
 
 def test_its_picture_is_its_surface():

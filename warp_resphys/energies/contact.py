@@ -189,7 +189,8 @@ class ContactForces:
         gap: (B, P, O) distances [m].
         normal: (B, P, O, 3) forces of the barrier on the vertices [N].
         friction: (B, P, O, 3) forces of friction on them [N].
-        slide: (B, P, O) slide in the step [m].
+        slide: (B, P, O) size of the velocity of sliding at the end of the step, times the effective step h_e [m]: for
+            implicit Euler the slide in the step, for BDF2 not, whose h_e is two thirds of a step.
         sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
             fully developed.
     """

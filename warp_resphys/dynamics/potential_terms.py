@@ -82,7 +82,7 @@ class PotentialTerms:
         """Returns the terms of a static equilibrium after a state, under a fraction of all loads.
 
         Args:
-            state: the state before, whose positions matter only to its memory.
+            state: the state before, whose memory friction continues, and whose positions and forces that of contact.
             inputs: constant inputs.
             constants: prepared constants.
             terms: the energies' kernels for the batch.

@@ -344,8 +344,8 @@ class Simulator:
     ) -> State:
         """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
 
-        Friction without rate, as of `energies.hysteresis`, makes it depend on the poses before. The state that is
-        returned has the memory of such energies; that of others is of a body long at rest.
+        Friction without rate, as of `energies.hysteresis` and `energies.contact`, makes it depend on the poses before.
+        The state that is returned has the memory of such energies; that of others is of a body long at rest.
 
         Args:
             inputs: constant inputs.
@@ -353,8 +353,9 @@ class Simulator:
             start: (B, N, 3) initial guess [m]; the rest shape if omitted. If Newton's method does not converge from it
                 in 100 iterations, loads, inputs and motion of the fixed vertices are increased in steps.
             batch: number of environments, if no other argument implies it.
-            after: state whose memory of friction without rate the equilibrium continues, of the batch or of one
-                environment; the undeformed body if omitted.
+            after: state that friction without rate continues, of the batch or of one environment; the undeformed body
+                if omitted. Friction of contact acts against the slide since its positions, with the normal forces that
+                it has there: to press a body and shear it, press first, then shear after that equilibrium.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body without fixed vertices.

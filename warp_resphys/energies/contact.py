@@ -6,7 +6,8 @@ A point of the surface, which stands for the area a, has with the distance d fro
 
 so that the pressure -kappa B'(d / D) begins at the distance D, has a continuous derivative, and grows without bound
 towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness kappa [Pa] is a constant: the gap of a
-resting body follows from it and is part of the geometry, about D (1 - sqrt(p / 3 kappa)) under a small pressure p.
+resting body follows from it and is part of the geometry, about D (1 - sqrt(p / 3 kappa)) under a small pressure p
+within a face. At edges, a point also stands for its part of the side walls.
 
 Friction of the coefficient mu, with the normal force lambda and the normal n of the start of a step, and the slide
 u = (1 - n n^T)(x - r) relative to the obstacle since then, has the energy
@@ -17,7 +18,8 @@ with the slip speed v_s at which it is fully developed. A body that should stick
 can hold, with the speed v_s (1 - sqrt(1 - c)). As lambda and n depend on the state at the start of the step, gradients
 by it include them.
 
-In a static equilibrium after a state, friction acts against the slide since that state, with its normal forces.
+In a static equilibrium after a state, friction acts against the slide since that state, with the normal forces of that
+state: there is none where the body was not pressed against the obstacle before.
 
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
@@ -80,7 +82,8 @@ class Contact(Energy):
     Parameters, one for each obstacle: ``contact_stiffness`` [Pa], ``contact_friction``, ``obstacle_growth``, by which
     its surface lies further out [m], ``obstacle_x``, ``_y`` and ``_z``, by which it lies elsewhere [m], and
     ``obstacle_turn_x``, ``_y`` and ``_z``, a rotation vector about its position [rad]. Inputs, if an obstacle moves,
-    are `MOTION`, which add to the last six. The points are the vertices of the surface.
+    are `MOTION`, its pose at the end of a step relative to the configured one, which add to the last six. The points
+    are the vertices of the surface.
 
     Raises:
         InputError: no obstacle, a value out of range, or values that do not fit the obstacles.

@@ -190,3 +190,9 @@ plt.show()
 # %% [markdown]
 # One half holds while the other slides; over a period the sum is about zero. The weight of the slab is
 # 0.6 N, so that friction could hold 0.36 N.
+
+# %%
+assert abs(1e3 * ways[best] - 14.6) < 0.5
+assert reached[-1] > 1.5e3 * ways[best]
+assert abs(forces[-50:].sum(1).mean()) < 0.05 * 360
+assert np.abs(forces[-50:]).max() < 360

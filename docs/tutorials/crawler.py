@@ -127,7 +127,6 @@ for _ in range(14):
     optimiser.step()
     reached.append(1e3 * abs(way.item()))
 print("mm:", " ".join(f"{way:.1f}" for way in reached))
-assert reached[-1] > 1.3e3 * float(ways[best])
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
@@ -192,7 +191,6 @@ plt.show()
 # 0.6 N, so that friction could hold 0.36 N.
 
 # %%
-assert abs(1e3 * ways[best] - 14.6) < 0.5
 assert reached[-1] > 1.5e3 * ways[best]
 assert abs(forces[-50:].sum(1).mean()) < 0.05 * 360
 assert np.abs(forces[-50:]).max() < 360

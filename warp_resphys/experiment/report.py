@@ -103,7 +103,7 @@ def make_report(context: StageContext) -> None:
         law=law,
         **(read_stretches(folder, mesh, trials, film) if law else {}),
         start=data_sheet(run, identification),
-        truth={**truth.get("material", {}), **(true_contact(run) if truth else {})},
+        truth={**truth.get("material", {}), **true_contact(run)},
         training=_histories(folder, False),
         refinement=_histories(folder, True),
         network_note=network_note(run, on_law=bool(law.get("accepted"))) if learned else "",
@@ -207,7 +207,8 @@ def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str,
 
 def true_contact(run: RunSettings) -> dict[str, float]:
     """Constants of the simulated laboratory's contact and shifts of its obstacles, by parameter."""
-    assert run.laboratory is not None
+    if run.laboratory is None:
+        return {}
     truth, obstacles = dict[str, float](), run.laboratory.obstacles
     for name, obstacle in obstacles.items():
         part = f"_{name}" if len(obstacles) > 1 else ""

@@ -10,10 +10,10 @@ from .points import line_at
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO, HALF, ONE, TWO, FOUR = (wp.float64(v) for v in (0.0, 0.5, 1.0, 2.0, 4.0))
+ZERO, ONE, TWO, FOUR = (wp.float64(v) for v in (0.0, 1.0, 2.0, 4.0))
 THIRD = wp.float64(1.0 / 3.0)
 INFINITE, UNDEFINED = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("nan")))
-ADVANCES = wp.constant(100)
+ADVANCES = wp.constant(100)  # along a way beside an obstacle that is not convex
 KEPT = wp.constant(wp.float64(0.1))  # share of a gap that one iterate leaves at least
 
 
@@ -141,7 +141,7 @@ def tangent(
 
 @wp.struct
 class Slopes:
-    """Derivatives of a loss, (B, P, O) each: those of a point and an obstacle."""
+    """Derivatives of a loss by the values of an obstacle and of its friction: parts of the points, (B, P, O)."""
 
     place: wp.array3d[wp.vec3d]
     turn: wp.array3d[wp.mat33d]

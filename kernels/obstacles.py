@@ -49,12 +49,6 @@ class Distance:
 
 
 @wp.func
-def identity() -> wp.mat33d:
-    """Returns the identity."""
-    return wp.mat33d(ONE, ZERO, ZERO, ZERO, ONE, ZERO, ZERO, ZERO, ONE)
-
-
-@wp.func
 def from_line(y: wp.vec3d, half: wp.float64) -> Distance:
     """Returns the distance from a segment of the z axis; half its length may be zero."""
     out = Distance()
@@ -62,7 +56,7 @@ def from_line(y: wp.vec3d, half: wp.float64) -> Distance:
     out.d = wp.length(q)
     size = wp.max(out.d, LEAST)
     out.n = q / size
-    h = identity() - wp.outer(out.n, out.n)
+    h = wp.identity(n=3, dtype=wp.float64) - wp.outer(out.n, out.n)
     if wp.abs(y[2]) < half:
         h[2, 2] = ZERO
     out.h = h / size

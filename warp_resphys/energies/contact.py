@@ -63,8 +63,8 @@ MOTION = (
 )
 POSE: Final = ("contact_place", "contact_turn")
 FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
-_PUSHES = 50
-_ADVANCES = 100
+_PUSHES = 50  # of vertices out of obstacles that have moved
+_ADVANCES = 100  # along the way of an obstacle in a step
 _DEEP = 0.3  # share of D within which a start is warned of
 
 
@@ -117,7 +117,7 @@ class Contact(Energy):
         if values.keys() != self.obstacles.keys():
             raise InputError(
                 f"contact.{name} has values for {listed([*values])}, but the obstacles are {listed(self.names)}: give "
-                "one for each."
+                "a value to every one."
             )
         return [values[obstacle] for obstacle in self.obstacles]
 
@@ -292,11 +292,10 @@ class BoundContact(BoundEnergy):
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
             self._check_motion(step.inputs, before, now)
             here = now.world(inside)
-            start = state.q.detach()
         if self._contact.moves or step.inputs.fixed_positions is not None:
             self._check_way(here.detach(), self._ends(x, step.inputs), now, d.detach())
         if self._contact.moves:
-            start = self._pushed_out(start, now, d.detach())
+            start = self._pushed_out(state.q.detach(), now, d.detach())
         length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {

@@ -1,4 +1,4 @@
-"""What acts on a body by its configuration: actuators, the input that drives them, a fluid, and obstacles."""
+"""Energies of a configured body: actuators, the input that drives them, a fluid, and contact with obstacles."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -267,7 +267,7 @@ class BodySettings(Settings):
             if isinstance(values, dict) and values.keys() != self.obstacles.keys():
                 raise ValueError(
                     f"contact.{key} has values for {listed([*values])}, but the obstacles are "
-                    f"{listed([*self.obstacles])}: give one for each."
+                    f"{listed([*self.obstacles])}: give a value to every one."
                 )
         return self
 

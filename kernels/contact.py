@@ -96,14 +96,19 @@ def local_step(
 
 
 @wp.func
-def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat33d:
-    """Second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
-    m, u = f.normal[b, p, k], slide(f, b, p, k, x)
-    v = smoothed(wp.length(u), f.slip[b, 0])
+def slide_tangent(m: wp.vec3d, u: wp.vec3d, slip: wp.float64) -> wp.mat33d:
+    """Second derivative of f(|u|) by the position, with the normal m."""
+    v = smoothed(wp.length(u), slip)
     flat = -wp.outer(m, m)
     for i in range(3):
         flat[i, i] = flat[i, i] + ONE
     return v[1] * flat + v[2] * wp.outer(u, u)
+
+
+@wp.func
+def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat33d:
+    """Second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
+    return slide_tangent(f.normal[b, p, k], slide(f, b, p, k, x), f.slip[b, 0])
 
 
 @wp.kernel

@@ -9,6 +9,7 @@ from typing_extensions import override
 
 from ..energies.base import PointSet
 from ..energies.potential import IncrementalPotential
+from ..linalg.coupling import Coupling, CouplingSolver
 from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
@@ -65,6 +66,11 @@ class ExactHessian(HessianApproximation):
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
         self.vertex_at = pattern.free[linear.order]
+        self._coupled: CouplingSolver | None = None
+        self._place = torch.full((potential.n_vertices,), -1, device=potential.device)
+        self._place[torch.as_tensor(pattern.free, device=potential.device)] = torch.arange(
+            len(pattern.free), device=potential.device
+        )
 
     @override
     def ready(self) -> bool:
@@ -87,6 +93,9 @@ class ExactHessian(HessianApproximation):
     def _factorise(self, active: torch.Tensor | None) -> None:
         self._potential.update_tangent(self.clamped, active)
         self._factor = self._factor_of(self.assembly(), active=active)
+        if self._coupled is not None:
+            changed = range(self._potential.batch) if active is None else active.nonzero().ravel().tolist()
+            self._coupled.forget(changed)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
         """Factorises assembled values, with the low-rank correction of the potential."""
@@ -101,19 +110,58 @@ class ExactHessian(HessianApproximation):
         self._factor = self._factor_of(self.assembly())
         if self._factor.failed.any():
             self._factor = self._factor_of(self.assembly(), definite=False)
+        if self._coupled is not None:
+            self._coupled.forget(range(self._potential.batch))
 
     @override
     def solve_in_place(self, right: torch.Tensor) -> None:
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         self._factor.solve_in_place(right.flatten(1))
+        if self._potential.couples_cells:
+            self._correct(right.flatten(1)[:, :, None], self.linear.dofs, clamp=True)
+
+    def _correct(self, x: torch.Tensor, order: torch.Tensor, clamp: bool) -> None:
+        """Adds the coupling of pairs at the potential's positions to solutions (B, n, k) without it."""
+        couplings = self._couplings(clamp)
+        if not couplings:
+            return
+        if self._coupled is None:
+            self._coupled = CouplingSolver(x.shape[1], x)
+        assert self._factor is not None
+        self._coupled.correct(self._factor, couplings, x, order)
+
+    def _couplings(self, clamp: bool) -> list[Coupling]:
+        """Returns the coupling of pairs by environment."""
+        parts = self._potential.pair_tangents(clamp)
+        if not parts:
+            return []
+        environment = torch.cat([part.environment for part in parts])
+        nodes = self._place[torch.cat([part.nodes for part in parts])]
+        blocks = torch.cat([part.blocks for part in parts])
+        out = []
+        for b in environment.unique().tolist():
+            own = environment == b
+            vertices, local = nodes[own].unique(return_inverse=True)
+            axes = torch.arange(3, device=nodes.device)
+            at = (3 * local[..., None] + axes).flatten(1)
+            size = 3 * len(vertices)
+            matrix = blocks.new_zeros(size, size)
+            matrix.index_put_((at[:, :, None], at[:, None, :]), blocks[own], accumulate=True)
+            free = (vertices >= 0).repeat_interleave(3)
+            unknowns = (3 * vertices[:, None] + axes).ravel()[free]
+            out.append(Coupling(b, unknowns, matrix[free][:, free]))
+        return out
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m), zero at fixed vertices."""
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
-        out[:, self._dofs] = self._factor.solve(right[:, self._dofs].to(self.linear.dtype)).to(right.dtype)
+        x = self._factor.solve(right[:, self._dofs].to(self.linear.dtype))
+        if self._potential.couples_cells:
+            self._correct(x, torch.arange(x.shape[1], device=x.device), clamp=False)
+        out[:, self._dofs] = x.to(right.dtype)
         return out
 
 

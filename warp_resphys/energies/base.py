@@ -65,6 +65,21 @@ class Memory:
 
 
 @dataclass(frozen=True)
+class PairTangents:
+    """Second derivatives of energies of four vertices each.
+
+    Attributes:
+        environment: (A,) environments.
+        nodes: (A, 4) vertices.
+        blocks: (A, 12, 12) second derivatives by the 12 coordinates [N/m].
+    """
+
+    environment: torch.Tensor
+    nodes: torch.Tensor
+    blocks: torch.Tensor
+
+
+@dataclass(frozen=True)
 class EnergySite:
     """The simulator as an energy sees it; its vertices may belong to several bodies."""
 
@@ -306,7 +321,7 @@ class Term(ABC):
         sets: points of the energy.
 
     Attributes:
-        couples_cells: whether the term may have `low_rank` columns.
+        couples_cells: whether the term may have `low_rank` columns or `pair_tangents`.
     """
 
     couples_cells = False
@@ -335,6 +350,21 @@ class Term(ABC):
         """Returns columns C (B, 3 N, r) of the part C C^T of the Hessian that couples many cells, or None."""
         del values, positions
         return None
+
+    def pair_tangents(self, values: Values, positions: Any, clamp: bool) -> PairTangents | None:
+        """Returns the part of the Hessian that couples vertices of different cells, or None.
+
+        Args:
+            values: buffers of the values.
+            positions: Warp array (B, N) of the positions [m].
+            clamp: whether negative eigenvalues are left out.
+        """
+        del values, positions, clamp
+        return None
+
+    def set_step(self, values: Values) -> None:
+        """Prepares a step, after its values have been copied to the buffers."""
+        del values
 
     def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Returns positions of finite energy, if there are others; a solve does not pass by those.

@@ -1,6 +1,7 @@
 """Recorded Warp launches on torch's memory."""
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from threading import Lock
 from typing import Any
 
@@ -84,9 +85,16 @@ class Launcher:
         kernel = points.line_tangent_product if s.width == 1 else points.tangent_product
         return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 
-    def capture(self, *commands: Any) -> "CapturedGraph":
-        """Returns recorded launches as one graph, also on a CPU, where it costs a sixth of the single launches."""
-        return self.capture_calls(lambda: issue(*commands), commands)
+    def capture(self, *commands: Any) -> "CapturedGraph | LaunchSequence":
+        """Returns recorded launches as one graph, also on a CPU, where it costs a sixth of the single launches.
+
+        Between those that the host makes (`HostLaunches`) there are several graphs.
+        """
+        if not any(isinstance(command, HostLaunches) for command in commands):
+            return self.capture_calls(lambda: issue(*commands), commands)
+        groups = itertools.groupby(commands, lambda command: isinstance(command, HostLaunches))
+        parts = [own if by_host else [self.capture(*own)] for by_host, own in ((k, list(g)) for k, g in groups)]
+        return LaunchSequence(*itertools.chain(*parts))
 
     def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "CapturedGraph":
         """Returns a graph of the launches that a function makes.
@@ -124,6 +132,22 @@ class CapturedGraph:
     def launch(self, stream: Any = None) -> None:
         """Launches the graph."""
         wp.capture_launch(self._graph, stream)
+
+
+class HostLaunches:
+    """Launches that the host makes anew every time, with the interface of a recorded launch.
+
+    Args:
+        commands: returns recorded launches.
+    """
+
+    def __init__(self, commands: Callable[[], Sequence[Any]]) -> None:
+        self._commands = commands
+
+    def launch(self, stream: Any = None) -> None:
+        """Launches them in order."""
+        for command in self._commands():
+            command.launch(stream)
 
 
 class LaunchSequence:

@@ -50,6 +50,8 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
         given = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
         items += [(energy, points, prefix) for energy, points in given]
         placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
+    if (contact := getattr(whole, "contact", None)) is not None:
+        placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
     if whole.coordinates:
         placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), DEPENDENT))
     return placed

@@ -19,7 +19,7 @@ import warp as wp
 from ..fem.coordinates import Coordinates, DeviceCoordinates
 from ..kernels import points as kernels
 from ..kernels import reductions
-from .base import PointSet, Term
+from .base import PairTangents, PointSet, Term
 from .launcher import CapturedGraph, Launcher, warp_view
 from .placed import PlacedEnergy
 
@@ -84,6 +84,7 @@ class IncrementalPotential(Launcher):
         self._loads: list[bool] = []
         first = 0
         self._placed = tuple(energies)
+        self._pair_tangents: list[PairTangents] = []
         for placed in energies:
             energy, start, sets = placed.energy, first, list[PointSet]()
             for points in placed.points:
@@ -187,6 +188,8 @@ class IncrementalPotential(Launcher):
                 buffer.copy_(value.detach())
         for positions, moved in self._feasible[1:]:
             self._feasible[0][0][:, moved] = positions[:, moved]
+        for term, values in zip(self.energies, self.own_values, strict=True):
+            term.set_step(values)
         totals = [term.total_stiffness(values) for term, values in zip(self.energies, self.own_values, strict=True)]
         given = [total for total in totals if total is not None]
         if given:
@@ -222,6 +225,7 @@ class IncrementalPotential(Launcher):
         self.clamp.zero_() if clamp is None else self.clamp.copy_(clamp)
         self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
+        self._pair_tangents = self.pair_tangents()
         pairs = zip(self.energies, self.own_values, strict=True)
         parts = (term.low_rank(values, self._position_view) for term, values in pairs)
         columns = [part for part in parts if part is not None]
@@ -229,6 +233,16 @@ class IncrementalPotential(Launcher):
         if self.low_rank is not None and self.coordinates.slides:
             whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
+
+    def pair_tangents(self, clamp: bool = False) -> list[PairTangents]:
+        """Returns the parts of the Hessian at ``positions`` that couple vertices of different cells.
+
+        Args:
+            clamp: whether negative eigenvalues are left out.
+        """
+        pairs = zip(self.energies, self.own_values, strict=True)
+        parts = (term.pair_tangents(values, self._position_view, clamp) for term, values in pairs)
+        return [part for part in parts if part is not None]
 
     @property
     def feasible(self) -> torch.Tensor | None:
@@ -242,7 +256,7 @@ class IncrementalPotential(Launcher):
 
     @property
     def couples_cells(self) -> bool:
-        """Whether there may be `low_rank` columns."""
+        """Whether there may be `low_rank` columns or `pair_tangents`."""
         return any(term.couples_cells for term in self.energies)
 
     @property
@@ -287,6 +301,11 @@ class IncrementalPotential(Launcher):
         if self.low_rank is not None:
             along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
             product += torch.einsum("bnr,br->bn", self.low_rank, along).view_as(product)
+        for part in self._pair_tangents:
+            row = part.environment[:, None].expand_as(part.nodes)
+            ways = self._direction[row, part.nodes]
+            forces = torch.einsum("aij,aj->ai", part.blocks, ways.flatten(1)).view_as(ways)
+            product.index_put_((row, part.nodes), forces, accumulate=True)
         return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,25 +18,29 @@ _FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with 
 
 
 class Scene(Body):
-    """Bodies in one simulator, with their vertices concatenated; there is no contact between them, only with obstacles.
+    """Bodies in one simulator, with their vertices concatenated.
 
     Names of parameters, inputs and memory variables are prefixed with the body's name, as in ``finger_tension``.
 
     Args:
         bodies: bodies by name.
+        contact: contact of the bodies with one another and with themselves (`energies.surfaces.SurfaceContact`), or
+            None.
 
     Raises:
         InputError: no body.
     """
 
-    def __init__(self, bodies: Mapping[str, Body]) -> None:
+    def __init__(self, bodies: Mapping[str, Body], contact: Any = None) -> None:
         if not bodies:
             raise InputError("a scene needs one or more bodies: give them by name.")
         object.__setattr__(self, "bodies", dict(bodies))
         object.__setattr__(self, "energies", ())
         object.__setattr__(self, "energy_points", ())
+        object.__setattr__(self, "contact", contact)
 
     bodies: Mapping[str, Body]
+    contact: Any
 
     @cached_property
     def mesh(self) -> Mesh:

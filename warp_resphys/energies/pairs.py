@@ -1,0 +1,239 @@
+"""Pairs of vertices and triangles, and of edges, that may come near one another in a batch."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from ..kernels import broad_phase
+from ..kernels import surfaces as kernels
+from ..mesh.mesh import Mesh, boundary_triangles
+from .launcher import Launcher, warp_view
+
+_FIRST_CAPACITY = 4096
+_SPARE = 1.5  # radius within which pairs are sought, over the way of a vertex
+_PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface of bodies, as triangles.
+
+    Attributes:
+        vertices: (P,) vertices of the surface, in ascending order.
+        triangles: (T, 3) their vertices, counter-clockwise seen from outside.
+        edges: (E, 2) vertices of the edges.
+        degree: (N,) triangles at every vertex.
+        pieces: (N,) number of the piece that a vertex belongs to.
+        rest: (N, 3) positions at rest [m].
+        areas: (T,) areas of the triangles at rest [m^2].
+    """
+
+    vertices: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    degree: NDArray[np.int64]
+    pieces: NDArray[np.int64]
+    rest: NDArray[np.float64]
+    areas: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> "Surface":
+        """Returns the surface of a mesh."""
+        triangles, x = boundary_triangles(mesh).astype(np.int64), mesh.vertices
+        edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        areas = 0.5 * np.linalg.norm(
+            np.cross(x[triangles[:, 1]] - x[triangles[:, 0]], x[triangles[:, 2]] - x[triangles[:, 0]]), axis=1
+        )
+        cells = np.repeat(mesh.cells[:, :1], mesh.cells.shape[1], axis=1)
+        graph = scipy.sparse.coo_array((np.ones(cells.size), (cells.ravel(), mesh.cells.ravel())), (len(x), len(x)))
+        _, pieces = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        degree = np.bincount(triangles.ravel(), minlength=len(x))
+        return cls(np.unique(triangles), triangles, edges, degree, pieces.astype(np.int64), x, areas)
+
+    def within(self, first: int, count: int) -> "Surface":
+        """Returns the surface with its body's vertices from `first` on among `count`."""
+        after = count - first - len(self.rest)
+
+        def pad(values: NDArray[Any]) -> NDArray[Any]:
+            return np.pad(values, [(first, after), *[(0, 0)] * (values.ndim - 1)])
+
+        own = (self.vertices + first, self.triangles + first, self.edges + first)
+        return Surface(*own, pad(self.degree), pad(self.pieces), pad(self.rest), self.areas)
+
+    def vertex_areas(self) -> NDArray[np.float64]:
+        """Returns the area (N,) of every vertex, a third of its triangles' [m^2]."""
+        out = np.zeros(len(self.rest))
+        np.add.at(out, self.triangles, self.areas[:, None] / 3.0)
+        return out
+
+    def edge_areas(self) -> NDArray[np.float64]:
+        """Returns the area (E,) of every edge, a third of its triangles' [m^2]."""
+        n = len(self.rest)
+        sides = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+        place = np.searchsorted(self.edges @ [n, 1], sides @ [n, 1])
+        out = np.zeros(len(self.edges))
+        np.add.at(out, place, self.areas[:, None] / 3.0)
+        return out
+
+
+class PairList:
+    """Pairs of a batch that may come within reach, with the positions and radii for which that holds.
+
+    Args:
+        launcher: launcher of the potential.
+        surface: the surface.
+        reach: distance within which pairs count [m].
+
+    Attributes:
+        count: number of pairs C.
+        version: number of lists so far.
+        pairs: the pairs, a ``kernels.surfaces.Pairs``.
+        environment: (C,) environments of the pairs.
+        nodes: (C, 4) vertices.
+        kind: (C,) kind.
+        start: (B P + 1) first entry of every vertex of the surface in `incident`, for ``kernels.surfaces.gather``.
+        incident: pair 4 + number of the vertex in it.
+    """
+
+    def __init__(self, launcher: Launcher, surface: Surface, reach: float) -> None:
+        self._launcher, self.surface, self.reach = launcher, surface, reach
+        device, n = launcher.device, len(surface.rest)
+
+        def tensor(values: Any, dtype: torch.dtype = torch.int64) -> torch.Tensor:
+            return torch.as_tensor(values, device=device, dtype=dtype)
+
+        self.vertices = tensor(surface.vertices)
+        self._triangles, self._edges = tensor(surface.triangles), tensor(surface.edges)
+        self._pieces = tensor(surface.pieces)
+        self._per_piece = torch.zeros(int(surface.pieces.max()) + 1, n, device=device, dtype=torch.float64)
+        own = self._pieces[self.vertices]
+        self._per_piece[own, self.vertices] = 1.0 / torch.bincount(own, minlength=len(self._per_piece))[own].double()
+        self._degree = tensor(surface.degree, torch.float64)
+        # Half of the surface is that of the other part of a pair; edges are added at half weight.
+        self._vertex_area = tensor(0.5 * surface.vertex_areas(), torch.float64)
+        self._edge_area = tensor(0.125 * surface.edge_areas(), torch.float64)
+        self._rest = tensor(surface.rest, torch.float64)
+        self._triangle_array, self._edge_array = (
+            launcher.upload(part.astype(np.int32), int) for part in (surface.triangles, surface.edges)
+        )
+        self._vertex_array = launcher.upload(surface.vertices.astype(np.int32), int)
+        self._local = torch.full((n,), -1, device=device)
+        self._local[self.vertices] = torch.arange(len(self.vertices), device=device)
+        extent = np.ptp(surface.rest[surface.vertices], axis=0)
+        lengths = np.linalg.norm(surface.rest[surface.edges[:, 0]] - surface.rest[surface.edges[:, 1]], axis=1)
+        self.longest_way = 0.1 * float(np.linalg.norm(extent))  # of a vertex at a time [m]
+        self._least_radius = max(reach, 0.1 * float(lengths.mean()))
+        self._capacity, self.version, self.count = _FIRST_CAPACITY, 0, 0
+        self._origin: torch.Tensor | None = None
+        self._outer = self._inner = launcher.zeros(n)
+
+    def covers(self, positions: torch.Tensor) -> bool:
+        """Whether the list holds all pairs of positions (B, N, 3) that are within reach."""
+        if self._origin is None:
+            return False
+        way, relative = self._ways(positions - self._origin)
+        return bool(((way <= self._outer) & (relative <= self._inner))[:, self.vertices].all())
+
+    def _ways(self, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns lengths (B, N) of ways (B, N, 3), and of the ways relative to the mean of a piece [m]."""
+        mean = torch.einsum("cn,bnk->bck", self._per_piece, ways)
+        return ways.norm(dim=-1), (ways - mean[:, self._pieces]).norm(dim=-1)
+
+    def find(self, origin: torch.Tensor, ways: torch.Tensor) -> None:
+        """Makes the list for positions (B, N, 3) and around ways (B, N, 3) from there [m]."""
+        own, surface = self._launcher, self.surface
+        outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
+        if len(self._per_piece) == 1:
+            outer = inner
+        self._origin, self._outer, self._inner = origin.clone(), outer, inner
+        motion = self._motion()
+        triangles, edges = self._hierarchy(motion, self._triangle_array), self._hierarchy(motion, self._edge_array)
+        size = len(surface.vertices) * len(surface.triangles)
+        total = size + len(surface.edges) ** 2
+        while True:
+            found, count = broad_phase.Found(), torch.zeros(1, device=own.device, dtype=torch.int32)
+            keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
+            found.count, found.keys = warp_view(count, wp.int32), warp_view(keys, wp.int64)
+            inputs = [triangles.id, motion, self._vertex_array, self._triangle_array, wp.int64(total), found]
+            own.launch(own.record(broad_phase.vertex_triangle_pairs, (own.batch, len(surface.vertices)), inputs, []))
+            inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), found]
+            own.launch(own.record(broad_phase.edge_edge_pairs, (own.batch, len(surface.edges)), inputs, []))
+            if (needed := int(count)) <= self._capacity:
+                break
+            self._capacity = 2 * needed  # The list is made again.
+        self._set(keys[:needed].sort().values, size, total)
+
+    def _motion(self) -> Any:
+        motion = broad_phase.Motion()
+        motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
+        motion.outer, motion.inner = warp_view(self._outer, wp.float64), warp_view(self._inner, wp.float64)
+        motion.piece = self._launcher.upload(self.surface.pieces.astype(np.int32), int)
+        return motion
+
+    def _hierarchy(self, motion: Any, nodes: Any) -> Any:
+        """Returns boxes of triangles or edges of all environments."""
+        own, device = self._launcher, str(self._launcher.device)
+        size = own.batch * nodes.shape[0]
+        low, high = (wp.empty(size, dtype=wp.vec3, device=device) for _ in range(2))
+        group = wp.empty(size, dtype=int, device=device)
+        own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], [low, high, group]))
+        return wp.Bvh(low, high, groups=group)
+
+    def _set(self, keys: torch.Tensor, size: int, total: int) -> None:
+        """Decodes the keys of pairs in ascending order."""
+        environment, key = keys // total, keys % total
+        vertex = key < size
+        v, t = key // len(self._triangles), key % len(self._triangles)
+        e, f = (key - size) // len(self._edges), (key - size) % len(self._edges)
+        v, e = v.clamp_max(len(self.vertices) - 1), e.clamp_min(0)
+        first = torch.cat([self.vertices[v, None], self._triangles[t]], 1)
+        second = torch.cat([self._edges[e], self._edges[f]], 1)
+        self.nodes = torch.where(vertex[:, None], first, second)
+        self.environment, self.kind = environment, (~vertex).int()
+        self.area = torch.where(vertex, self._vertex_area[first[:, 0]], self._edge_area[e] + self._edge_area[f])
+        self.degree = self._degree[self.nodes]
+        a, b = (self._rest[self.nodes[:, k + 1]] - self._rest[self.nodes[:, k]] for k in (0, 2))
+        self.parallel = _PARALLEL * a.square().sum(1) * b.square().sum(1)
+        self.start, self.incident = self.incidence(self.environment, self.nodes)
+        self.count, self.version = len(keys), self.version + 1
+        self._kept = [x.to(torch.int32).contiguous() for x in (self.environment, self.kind, self.nodes)]
+        self.pairs = kernels.Pairs()
+        self.pairs.environment, self.pairs.kind = (warp_view(x, wp.int32) for x in self._kept[:2])
+        self.pairs.nodes, self.pairs.degree = warp_view(self._kept[2], wp.vec4i), warp_view(self.degree, wp.vec4d)
+        self.pairs.area, self.pairs.parallel = warp_view(self.area, wp.float64), warp_view(self.parallel, wp.float64)
+
+    def incidence(self, environment: torch.Tensor, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns `start` and `incident` of pairs (C,) and (C, 4)."""
+        size = len(self.vertices)
+        row = (environment[:, None] * size + self._local[nodes]).ravel()
+        order = row.argsort(stable=True)
+        ends = torch.arange(self._launcher.batch * size + 1, device=row.device)
+        return torch.searchsorted(row[order], ends).to(torch.int32), order.to(torch.int32)
+
+    def distances(self, positions: torch.Tensor) -> torch.Tensor:
+        """Returns the distances (C,) of the pairs at positions (B, N, 3) [m]."""
+        own, kept = self._launcher, positions.contiguous()
+        out = torch.zeros(self.count, device=own.device, dtype=torch.float64)
+        if self.count:
+            inputs = [self.pairs, warp_view(kept, wp.vec3d)]
+            own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
+        return out
+
+    def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
+        own = self._launcher
+        motion = broad_phase.Motion()
+        kept = positions.contiguous(), own.zeros(positions.shape[1])
+        motion.origin, motion.outer = warp_view(kept[0], wp.vec3d), warp_view(kept[1], wp.float64)
+        hierarchy = self._hierarchy(motion, self._triangle_array)
+        count, edge = (torch.full((own.batch,), k, device=own.device, dtype=torch.int32) for k in (0, 2**31 - 1))
+        inputs = [hierarchy.id, motion, self._edge_array, self._triangle_array]
+        outputs = [warp_view(count, wp.int32), warp_view(edge, wp.int32)]
+        own.launch(own.record(broad_phase.crossings, (own.batch, len(self.surface.edges)), inputs, outputs))
+        return count, edge

@@ -10,6 +10,7 @@ from .surfaces import EDGE_EDGE, VERTEX_TRIANGLE, Corners, apart, nearest
 
 wp.set_module_options({"enable_backward": False})
 
+FLAT = wp.constant(wp.float64(1e-9))  # sine of the angle below which an edge is parallel to a triangle
 SAFE = wp.constant(wp.float32(1.0 + 1e-6))  # boxes are in float32
 
 
@@ -171,8 +172,10 @@ def crossings(
         k, m, n = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         if i != k and i != m and i != n and j != k and j != m and j != n:
             p, q, r = motion.origin[b, k], motion.origin[b, m], motion.origin[b, n]
-            if side(x, p, q, r) * side(y, p, q, r) < none:
+            from_x, from_y = side(x, p, q, r), side(y, p, q, r)
+            flat = FLAT * wp.length(wp.cross(q - p, r - p)) * wp.length(y - x)
+            if from_x * from_y <= none and wp.max(wp.abs(from_x), wp.abs(from_y)) > flat:
                 u, v, w = side(p, x, y, q), side(q, x, y, r), side(r, x, y, p)
-                if (u > none and v > none and w > none) or (u < none and v < none and w < none):
+                if (u >= none and v >= none and w >= none) or (u <= none and v <= none and w <= none):
                     wp.atomic_add(count_out, b, 1)
                     wp.atomic_min(edge_out, b, e)

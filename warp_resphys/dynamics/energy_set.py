@@ -15,6 +15,7 @@ from ..energies.base import BoundEnergy, EnergySite, Memory, Term
 from ..energies.contact import BoundContact, ContactForces
 from ..energies.explicit import ExplicitEnergy
 from ..energies.placed import PlacedEnergy
+from ..energies.surfaces import BoundSurfaceContact, SurfaceForces
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..stepping.constants import Constants, Mass
@@ -173,13 +174,16 @@ class EnergySet:
         constants: Constants,
         terms: Sequence[Term],
         x: torch.Tensor,
-    ) -> dict[str, ContactForces]:
-        """Returns the contact of a step with solution x (B, N, 3), by the name of the body, if there are several."""
-        return {
-            placed.prefix.removesuffix("_"): bound.forces(placed.step(state, stage, inputs, constants, terms[i]), x)
-            for i, (placed, bound) in enumerate(self._pairs)
-            if isinstance(bound, BoundContact)
-        }
+    ) -> dict[str, ContactForces | SurfaceForces]:
+        """Returns the contact of a step with solution x (B, N, 3) by name (`Simulator.contacts`)."""
+        out: dict[str, ContactForces | SurfaceForces] = {}
+        for i, (placed, bound) in enumerate(self._pairs):
+            if isinstance(bound, BoundContact | BoundSurfaceContact):
+                name = (
+                    placed.prefix.removesuffix("_") if isinstance(bound, BoundContact) else f"{placed.prefix}surfaces"
+                )
+                out[name] = bound.forces(placed.step(state, stage, inputs, constants, terms[i]), x)
+        return out
 
     @staticmethod
     def _remembered(

@@ -12,6 +12,7 @@ from ..energies.contact import ContactForces
 from ..energies.explicit import ExplicitEnergy
 from ..energies.materials import Corotated, Material
 from ..energies.placement import Materials, joined_names, place_energies
+from ..energies.surfaces import SurfaceForces
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
@@ -295,7 +296,7 @@ class Simulator:
 
     def contacts(
         self, state: State, after: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
-    ) -> dict[str, ContactForces]:
+    ) -> dict[str, ContactForces | SurfaceForces]:
         """Returns gaps, forces, slides and sticking at the end of a step, differentiable.
 
         Args:
@@ -305,7 +306,8 @@ class Simulator:
             parameters: parameters or prepared constants (`prepare`).
 
         Returns:
-            Contact by the name of the body, which is empty for a single body.
+            Contact with obstacles by the name of the body, which is empty for a single body; that between surfaces
+            under ``surfaces``, or ``NAME_surfaces`` for the surface of one body of a scene.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.

@@ -122,6 +122,7 @@ class PairList:
         self._triangle_array, self._edge_array = (
             launcher.upload(part.astype(np.int32), int) for part in (surface.triangles, surface.edges)
         )
+        self._piece_array = launcher.upload(surface.pieces.astype(np.int32), int)
         self._vertex_array = launcher.upload(surface.vertices.astype(np.int32), int)
         self._local = torch.full((n,), -1, device=device)
         self._local[self.vertices] = torch.arange(len(self.vertices), device=device)
@@ -138,7 +139,10 @@ class PairList:
         if self._origin is None:
             return False
         way, relative = self._ways(positions - self._origin)
-        return bool(((way <= self._outer) & (relative <= self._inner))[:, self.vertices].all())
+        inside = relative <= self._inner
+        if len(self._per_piece) > 1:
+            inside &= way <= self._outer
+        return bool(inside[:, self.vertices].all())
 
     def _ways(self, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns lengths (B, N) of ways (B, N, 3), and of the ways relative to the mean of a piece [m]."""
@@ -149,10 +153,13 @@ class PairList:
         """Makes the list for positions (B, N, 3) and around ways (B, N, 3) from there [m]."""
         own, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
-        if len(self._per_piece) == 1:
+        if len(self._per_piece) == 1:  # Only motion within the piece matters.
             outer = inner
         self._origin, self._outer, self._inner = origin.clone(), outer, inner
-        motion = self._motion()
+        motion = broad_phase.Motion()
+        motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
+        motion.outer, motion.inner = warp_view(outer, wp.float64), warp_view(inner, wp.float64)
+        motion.piece = self._piece_array
         triangles, edges = self._hierarchy(motion, self._triangle_array), self._hierarchy(motion, self._edge_array)
         size = len(surface.vertices) * len(surface.triangles)
         total = size + len(surface.edges) ** 2
@@ -168,13 +175,6 @@ class PairList:
                 break
             self._capacity = 2 * needed  # The list is made again.
         self._set(keys[:needed].sort().values, size, total)
-
-    def _motion(self) -> Any:
-        motion = broad_phase.Motion()
-        motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
-        motion.outer, motion.inner = warp_view(self._outer, wp.float64), warp_view(self._inner, wp.float64)
-        motion.piece = self._launcher.upload(self.surface.pieces.astype(np.int32), int)
-        return motion
 
     def _hierarchy(self, motion: Any, nodes: Any) -> Any:
         """Returns boxes of triangles or edges of all environments."""

@@ -20,7 +20,7 @@ from ..fem.coordinates import Coordinates, DeviceCoordinates
 from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import PairTangents, PointSet, Term
-from .launcher import CapturedGraph, Launcher, warp_view
+from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
 from .placed import PlacedEnergy
 
 
@@ -66,7 +66,7 @@ class IncrementalPotential(Launcher):
         tangent_launches: launches that set `tangents`, available after their first use.
     """
 
-    tangent_launches: CapturedGraph
+    tangent_launches: CapturedGraph | LaunchSequence
 
     def __init__(
         self,

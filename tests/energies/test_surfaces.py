@@ -1,0 +1,362 @@
+"""Contact of bodies with one another and with themselves: pairs, barrier, friction, gradients, batches, refusals."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Mesh,
+    Scene,
+    Simulator,
+    SolverSettings,
+    State,
+    SurfaceContact,
+    SymmetryPlane,
+    box_hexahedra,
+    box_tetrahedra,
+    select_vertices,
+)
+from warp_resphys.energies.launcher import Launcher, warp_view
+from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.io.errors import InputError
+from warp_resphys.kernels import surfaces as kernels
+
+CPU = torch.device("cpu")
+SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)
+FINE = SolverSettings(relative_tolerance=1e-12, absolute_tolerance=1e-13)
+PLATE = box_tetrahedra((0.04, 0.04, 0.01), (4, 4, 1))
+CUBE = box_tetrahedra((0.02, 0.02, 0.02), (2, 2, 2))
+KAPPA, D, G = 1e5, 1e-3, 9.81
+
+
+def turned(mesh, angles, place):
+    """A mesh turned about its middle by angles about x and z, with its middle at a place."""
+    (cx, cz), (sx, sz) = np.cos(angles), np.sin(angles)
+    turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+    return replace(mesh, vertices=(mesh.vertices - middle) @ turn.T + place)
+
+
+def pairs_of(kind, x, area, degree, parallel):
+    """Pairs with their own vertices, and those as a batch of one."""
+    launcher, pairs = Launcher(1, CPU), kernels.Pairs()
+    pairs.environment = launcher.upload(np.zeros(len(x), np.int32), int)
+    pairs.kind = launcher.upload(kind.astype(np.int32), int)
+    pairs.nodes = launcher.upload(np.arange(4 * len(x), dtype=np.int32).reshape(-1, 4), wp.vec4i)
+    pairs.area, pairs.degree = launcher.upload(area, wp.float64), launcher.upload(degree, wp.vec4d)
+    pairs.parallel = launcher.upload(parallel, wp.float64)
+    return launcher, pairs
+
+
+def pair_forces(launcher, pairs, x, stiffness, reach):
+    """Energies (C,) and gradients (C, 4, 3) of pairs at positions (C, 4, 3)."""
+    count, at = len(x), torch.tensor(x.reshape(1, -1, 3))
+    force, energy = torch.zeros(count, 4, 3, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
+    near = torch.zeros(count, dtype=torch.int32)
+    kappa = torch.tensor([[stiffness]], dtype=torch.float64)
+    inputs = [warp_view(launcher.active, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
+    out = [warp_view(force, kernels.Corners), warp_view(energy, wp.float64), warp_view(near, wp.int32)]
+    launcher.launch(launcher.record(kernels.pair_forces, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    return energy.numpy(), force.numpy()
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_derivatives_of_pairs(kind):
+    """Vertex and triangle, and edges, also almost parallel ones, at random: gradient and Hessian are differences."""
+    random, count, reach = np.random.default_rng(kind), 400, 1.5
+    x = random.normal(size=(count, 4, 3))
+    parallel = np.where(np.arange(count) % 2 == 0, 50.0, 1e-3)
+    degree = random.integers(3, 8, (count, 4)).astype(float)
+    given = (np.full(count, kind), x, random.uniform(0.5, 2.0, count), degree, parallel)
+    launcher, pairs = pairs_of(*given)
+    energy, force = pair_forces(launcher, pairs, x, 3.0, reach)
+    hessian = torch.zeros(count, 12, 12, dtype=torch.float64)
+    chosen, kappa = torch.arange(count, dtype=torch.int32), torch.tensor([[3.0]], dtype=torch.float64)
+    at = torch.tensor(x.reshape(1, -1, 3))
+    inputs = [warp_view(chosen, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
+    out = [warp_view(hessian, wp.float64)]
+    launcher.launch(launcher.record(kernels.pair_tangents, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    slopes, curvatures, h = np.zeros((count, 12)), np.zeros((count, 12, 12)), 1e-6
+    for k in range(12):
+        way = np.zeros((count, 12))
+        way[:, k] = h
+        (e1, f1), (e0, f0) = (
+            pair_forces(launcher, pairs, x + sign * way.reshape(x.shape), 3.0, reach) for sign in (1.0, -1.0)
+        )
+        slopes[:, k], curvatures[:, :, k] = (e1 - e0) / (2 * h), ((f1 - f0) / (2 * h)).reshape(count, 12)
+    assert (energy != 0.0).sum() > 200
+    size = 1e-3 + np.abs(slopes).max(1)
+    assert (np.abs(slopes - force.reshape(count, 12)).max(1) / size).max() < 1e-6
+    errors = np.abs(hessian.numpy() - curvatures).max((1, 2)) / (1e-2 + np.abs(curvatures).max((1, 2)))
+    assert np.quantile(errors, 0.99) < 1e-6  # in between, a difference crosses a change of the nearest feature
+
+
+def joined():
+    """Two blocks, one above the other, with some disorder in three environments."""
+    upper = replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])
+    meshes = (PLATE, upper)
+    first = len(PLATE.vertices)
+    cells = np.concatenate([PLATE.cells, upper.cells + first])
+    mesh = Mesh(np.concatenate([m.vertices for m in meshes]), cells)
+    noise = np.random.default_rng(0).normal(size=(3, *mesh.vertices.shape)) * 3e-4
+    return mesh, torch.tensor(mesh.vertices + noise)
+
+
+def test_pairs_are_all_pairs_within_reach():
+    """Against the distances of all conceivable pairs; boxes along a way hold those that come within reach on it."""
+    mesh, x = joined()
+    surface, reach = Surface.of(mesh), 4e-3
+    pairs = PairList(Launcher(3, CPU), surface, reach)
+    pairs.find(x, torch.zeros_like(x))
+    vertices, triangles, edges = surface.vertices, surface.triangles, surface.edges
+    v, t = (k.ravel() for k in np.meshgrid(vertices, np.arange(len(triangles)), indexing="ij"))
+    i, j = np.triu_indices(len(edges), 1)
+    nodes = np.concatenate([np.column_stack([v, triangles[t]]), np.column_stack([edges[i], edges[j]])])
+    kind = np.repeat([0, 1], [len(v), len(i)])
+    shared = (np.sort(nodes, 1)[:, 1:] == np.sort(nodes, 1)[:, :-1]).any(1)
+    nodes, kind = nodes[~shared], kind[~shared]
+    ones = np.ones(len(nodes))
+    launcher, every = pairs_of(kind, nodes, ones, np.ones((len(nodes), 4)), ones)
+    for b in range(3):
+        d = torch.zeros(len(nodes), dtype=torch.float64)
+        at = x[b, nodes.reshape(-1)][None].contiguous()
+        launcher.launch(
+            launcher.record(
+                kernels.distances, (len(nodes),), [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
+            )
+        )
+        near = {(int(k), *map(int, n)) for k, n in zip(kind[d < reach], nodes[d < reach], strict=True)}
+        own = pairs.environment == b
+        found = pairs.distances(x)[own] < reach
+        listed = zip(pairs.kind[own][found].tolist(), pairs.nodes[own][found].tolist(), strict=True)
+        assert {(k, *n) for k, n in listed} == near
+        assert len(near) > 300
+    pairs.find(x, 1e-3 * torch.ones_like(x))
+    assert pairs.covers(x + 1e-3)
+    assert not pairs.covers(x + 1e-2)
+
+
+def test_crossings_are_seen():
+    mesh, x = joined()
+    pairs = PairList(Launcher(3, CPU), Surface.of(mesh), 1e-3)
+    assert pairs.crossings(x)[0].tolist() == [0, 0, 0]
+    x[1, len(PLATE.vertices) :, 2] -= 0.004
+    count, _ = pairs.crossings(x)
+    assert count[0] == count[2] == 0 < count[1]
+
+
+def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, **options):
+    """A cube above a plate that is held below."""
+    cube = turned(CUBE, (0.4, 0.5), (0.021, 0.0197, 0.0255))
+    plate = Body(PLATE, fixed=select_vertices(PLATE, z=0.0))
+    contact = SurfaceContact(kappa, friction, slip_speed=1e-2)
+    scene = Scene({"plate": plate, "cube": Body(cube)}, contact)
+    return Simulator(scene, SOFT, integrator=integrator, **{"time_step": 0.002, "solver": FINE, **options})
+
+
+def thrown(simulator, velocity, spin, batch=1):
+    """The state with the cube thrown with a velocity (B, 3) and a spin (B,) about z."""
+    rest, cube = simulator.rest_state(batch), simulator.body.vertex_slice("cube")
+    arm = rest.q[:, cube] - rest.q[:, cube].mean(1, keepdim=True)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    own = velocity[:, None] + spin[:, None, None] * torch.linalg.cross(axis.expand_as(arm), arm)
+    v = torch.cat([torch.zeros_like(rest.q[:, : cube.start]), own], 1)
+    return State(rest.q, v)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_gradients_of_an_oblique_impact(integrator):
+    """Four throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
+    simulator = landing(integrator=integrator)
+    random = np.random.default_rng(0)
+    velocity = torch.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (4, 3)))
+    weights = torch.tensor(random.normal(size=(2, 4, simulator.body.n_vertices, 3)))
+    values = {
+        "velocity": velocity,
+        "spin": torch.linspace(-5.0, 5.0, 4, dtype=torch.float64),
+        "surface_friction": torch.linspace(0.1, 0.9, 4, dtype=torch.float64)[:, None],
+        "surface_stiffness": torch.full((4, 1), KAPPA, dtype=torch.float64),
+        "plate_youngs_modulus": torch.full((4, 1), 2.5e5, dtype=torch.float64),
+    }
+
+    def loss(given):
+        parameters = {name: given[name] for name in given if name not in ("velocity", "spin")}
+        start = thrown(simulator, given["velocity"], given["spin"], 4)
+        path = simulator.rollout(start, 7, parameters=parameters)
+        return (1e2 * path.q[-1] * weights[0]).sum((1, 2)) + (path.v[-1] * weights[1]).sum((1, 2))
+
+    given = {name: value.clone().requires_grad_() for name, value in values.items()}
+    slopes = dict(zip(given, torch.autograd.grad(loss(given).sum(), list(given.values())), strict=True))
+    for name, value in values.items():
+        size = (1e-4 if name == "surface_stiffness" else 1e-6) * float(value.abs().max())
+        way = size * torch.ones_like(value)
+        if name == "velocity":
+            way = size * torch.tensor([0.6, -0.5, 0.6], dtype=torch.float64).expand(4, 3)
+        with torch.no_grad():
+            expected = (loss({**values, name: value + way}) - loss({**values, name: value - way})) / 2.0
+        actual = (slopes[name] * way).reshape(4, -1).sum(1)
+        assert float((actual - expected).abs().max()) < 2e-6 * float(expected.abs().max()), name
+
+
+def test_friction_sticks_and_slides_on_a_slope():
+    """A cube on a plate under gravity that is turned: it stays below the angle of friction, and slides above it."""
+    cube = replace(CUBE, vertices=CUBE.vertices + [0.0101, 0.0097, 0.0109])
+    plate = Body(PLATE, fixed=select_vertices(PLATE, z=0.0))
+    scene = Scene({"plate": plate, "cube": Body(cube)}, SurfaceContact(KAPPA, 0.5, slip_speed=1e-3))
+    moved = {}
+    for angle in (24.0, 29.0):
+        pull = (G * math.sin(math.radians(angle)), 0.0, -G * math.cos(math.radians(angle)))
+        simulator = Simulator(scene, SOFT, time_step=0.005, gravity=pull)
+        path = simulator.rollout(simulator.rest_state(), 40)
+        moved[angle] = float((path.q[-1] - path.q[20])[0, scene.vertex_slice("cube"), 0].mean())
+    slides = G * (math.sin(math.radians(29.0)) - 0.5 * math.cos(math.radians(29.0)))
+    assert abs(moved[24.0]) < 2e-4  # creep below the slip speed of 1 mm/s
+    assert moved[29.0] == pytest.approx(0.5 * slides * (0.2**2 - 0.1**2), rel=0.1)
+
+
+def test_momentum_is_conserved():
+    """Two free bodies collide with friction: the sum of momenta stays what it was."""
+    cube, other = turned(CUBE, (0.3, 0.2), (0.0, 0.0, 0.0)), turned(CUBE, (0.9, -0.4), (0.004, 0.003, 0.036))
+    scene = Scene({"one": Body(cube), "two": Body(other)}, SurfaceContact(KAPPA, 0.6))
+    simulator = Simulator(scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0), solver=FINE)
+    rest = simulator.rest_state()
+    v = torch.zeros_like(rest.v)
+    v[:, scene.vertex_slice("two")] = torch.tensor([0.2, -0.1, -2.5], dtype=torch.float64)
+    path = simulator.rollout(State(rest.q, v), 20)
+    mass = simulator.prepare().mass
+    mass = mass.reshape(-1, scene.n_vertices)[:1]
+    momenta = (mass[..., None] * torch.cat([v[None], path.v])).sum(2)
+    assert float((momenta - momenta[0]).abs().max()) < 1e-9 * float(momenta[0].norm())
+    assert float(path.v[-1][:, scene.vertex_slice("one"), 2].mean()) < -0.5  # It has been hit.
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_throws_never_cross(dtype):
+    """Three bodies thrown at one another at 5 m/s, with D of 0.2 mm: no surface ever crosses another."""
+    random = np.random.default_rng(3)
+    places = ((0.0, 0.0, 0.0), (0.003, 0.001, 0.034), (0.002, 0.036, 0.002))
+    bodies = {f"body{k}": Body(turned(CUBE, random.uniform(-1, 1, 2), place)) for k, place in enumerate(places)}
+    scene = Scene(bodies, SurfaceContact(KAPPA, 0.4, distance=2e-4))
+    simulator = Simulator(scene, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0), dtype=dtype, relative_tolerance=1e-5)
+    rest = simulator.rest_state()
+    v = torch.zeros_like(rest.v)
+    v[:, scene.vertex_slice("body1"), 2], v[:, scene.vertex_slice("body2"), 1] = -5.0, -5.0
+    path = simulator.rollout(State(rest.q, v), 25)
+    pairs = PairList(Launcher(1, CPU), Surface.of(scene.mesh), 2e-4)
+    gaps = []
+    for q in path.q.double():
+        assert int(pairs.crossings(q)[0]) == 0
+        pairs.find(q, torch.zeros_like(q))
+        gaps += [float(pairs.distances(q).min())] if pairs.count else []
+    assert 0.0 < min(gaps) < 2e-4
+    assert float((path.v[-1] - v)[:, scene.vertex_slice("body0")].norm()) > 1.0
+
+
+def clip():
+    """A U of three bars, whose ends stand 8 mm apart."""
+    mesh = box_hexahedra((0.03, 0.006, 0.028), (10, 2, 7))
+    middle = mesh.vertices[mesh.cells].mean(1)
+    kept = (middle[:, 0] < 0.006) | (np.abs(middle[:, 2] - 0.014) > 0.008)
+    used, cells = np.unique(mesh.cells[kept], return_inverse=True)
+    return Mesh(mesh.vertices[used], cells.reshape(-1, 8))
+
+
+def test_a_body_touches_itself():
+    """The ends of a clip are pressed together: without contact they pass through one another."""
+    mesh = clip()
+    ends = mesh.vertices[:, 0] > 0.029
+    force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
+    upper, lower = ends & (mesh.vertices[:, 2] > 0.014), ends & (mesh.vertices[:, 2] < 0.014)
+    force[0, upper, 2], force[0, lower, 2] = -0.06 / upper.sum(), 0.06 / lower.sum()
+    pressed = Inputs(external_force=force)
+    pairs = PairList(Launcher(1, CPU), Surface.of(mesh), D)
+    crossings = {}
+    for name, energies in (("free", []), ("touching", [SurfaceContact(KAPPA, 0.3)])):
+        body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=energies)
+        simulator = Simulator(body, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0))
+        before = simulator.rollout(simulator.rest_state(), 9, pressed).final
+        path = simulator.rollout(before, 1, pressed)
+        crossings[name] = int(pairs.crossings(path.q[-1])[0])
+    assert crossings["free"] > 0 == crossings["touching"]
+    forces = simulator.contacts(before, path.final, pressed)["surfaces"]
+    with torch.no_grad():
+        assert float(forces.normal.sum((0, 1)).norm()) < 1e-6 * float(forces.normal.norm())  # action and reaction
+        assert float(forces.friction.sum((0, 1)).norm()) < 1e-6 * float(forces.friction.norm())
+        assert 0.0 < float(forces.gap.min()) < D
+        assert float(forces.normal.norm()) > 0.01
+
+
+def test_batch_is_what_its_environments_are_alone():
+    """Environments with different contacts in one batch are bit for bit what they are alone."""
+    velocity = torch.tensor(
+        [[0.3, 0.0, -1.0], [0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [-0.4, 0.3, -1.5]], dtype=torch.float64
+    )
+    spin = torch.tensor([0.0, 3.0, 0.0, -4.0], dtype=torch.float64)
+    settings = SolverSettings(linear_solver="banded")
+    together = landing(solver=settings)
+    path = together.rollout(thrown(together, velocity, spin, 4), 12)
+    for b in range(4):
+        alone = landing(solver=settings)
+        own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
+        assert torch.equal(own.q[:, 0], path.q[:, b])
+
+
+def leaning():
+    """Two upright strips, the second of which is held slanted over the first."""
+    strip = box_hexahedra((0.006, 0.01, 0.05), (1, 2, 8))
+    other = replace(strip, vertices=strip.vertices + [0.0085, 0.0, 0.0])
+    bodies = {n: Body(m, fixed=select_vertices(m, z=0.0)) for n, m in (("first", strip), ("second", other))}
+    return Simulator(Scene(bodies, SurfaceContact(KAPPA, 0.0)), SOFT, gravity=(0.0, 0.0, 0.0), solver=FINE)
+
+
+def test_equilibrium_of_bodies_that_lean_on_one_another():
+    """A force pushes a strip against another one: both bend, and the derivative by the force is the difference."""
+    simulator = leaning()
+    force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
+    top = simulator.rest_positions[:, 2] > 0.049
+    top[: simulator.body.vertex_slice("second").start] = False
+    force[0, top, 0] = -0.15 / int(top.sum())
+
+    def first(scale):
+        q = simulator.static_equilibrium(Inputs(external_force=scale * force)).q
+        return q[0, simulator.body.vertex_slice("first"), 0].mean()
+
+    scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(first(scale), scale)
+    with torch.no_grad():
+        expected = (first(1.0 + 1e-5) - first(1.0 - 1e-5)) / 2e-5
+        moved = first(1.0) - simulator.rest_positions[simulator.body.vertex_slice("first"), 0].mean()
+    assert float(moved) < -1e-3  # The first strip is bent by the second.
+    assert float(slope) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_refusals():
+    cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
+    with pytest.raises(InputError, match="cross at rest"):
+        Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    with pytest.raises(InputError, match="mm from itself"):
+        Simulator(Body(clip(), energies=[SurfaceContact(distance=0.02)]))
+    with pytest.raises(InputError, match=r"contact\.distance"):
+        SurfaceContact(distance=0.0)
+    with pytest.raises(InputError, match="surface_friction"):
+        SurfaceContact(friction=-0.1)
+    with pytest.raises(InputError, match="symmetry planes"):
+        Simulator(Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()]))
+    with pytest.raises(InputError, match="midpoint"):
+        Simulator(Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
+    simulator = landing()
+    crossing = simulator.rest_positions.clone()
+    crossing[simulator.body.vertex_slice("cube"), 2] -= 0.008
+    with pytest.raises(InputError, match="cross at the start of a step"):
+        simulator.step(simulator.state(crossing))
+    clamped = simulator.rest_positions[simulator.fixed].clone()
+    clamped[:, 2] += 0.03
+    with pytest.raises(InputError, match="fixed vertices"):
+        simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamped[None]))

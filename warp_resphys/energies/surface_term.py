@@ -1,0 +1,397 @@
+"""Kernels of contact between surfaces, and derivatives of its friction by the state at the start of a step."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from typing_extensions import override
+
+from ..fem.elements import Points
+from ..io.errors import InputError
+from ..kernels import surfaces as kernels
+from ..stepping.quantity import Quantity
+from .base import Adjoint, PairTangents, PointSet, Term, Values, value_of
+from .launcher import HostLaunches, Launcher, warp_view
+from .pairs import PairList, Surface
+
+STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
+FRICTION = Quantity("surface_friction", "", 0.0, closed=True)
+_FEATURES = int(kernels.EDGE_FEATURES)
+_TINY = 1e-300  # keeps a division by a length defined
+
+
+@dataclass(frozen=True)
+class SurfacePoints(Points):
+    """Vertices of a surface."""
+
+    surface: Surface
+
+    def placed(self, count: int) -> Surface:
+        """Returns the surface with the vertex numbers of a simulator of `count` vertices."""
+        return self.surface.within(int(self.nodes[0, 0] - self.surface.vertices[0]), count)
+
+
+class Sliding(NamedTuple):
+    """Friction of pairs at the start of a step, differentiable."""
+
+    environment: torch.Tensor  # (G,)
+    nodes: torch.Tensor  # (G, 4)
+    weights: torch.Tensor  # (G, 4) of the nearest points
+    normal: torch.Tensor  # (G, 3)
+    load: torch.Tensor  # (G,) normal force [N]
+
+    def force(
+        self, x: torch.Tensor, reference: torch.Tensor, friction: torch.Tensor, slip: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns the forces (G, 3) on the first parts of pairs [N].
+
+        Args:
+            x: (B, N, 3) positions [m].
+            reference: (B, N, 3) positions without slide [m].
+            friction: (B, 1) coefficient.
+            slip: (B, 1) slide at which friction is fully developed [m].
+        """
+        row = self.environment[:, None]
+        way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
+        u = way - (way * self.normal).sum(-1, keepdim=True) * self.normal
+        e, square = slip[self.environment, 0], u.square().sum(-1)
+        y = torch.where(square > 0.0, square.clamp_min(_TINY).sqrt(), 0.0)
+        factor = torch.where(y < e, (2.0 - y / e) / e, 1.0 / y.clamp_min(_TINY))
+        return -(friction[self.environment, 0] * self.load * factor)[:, None] * u
+
+
+class SurfaceTerm(Term):
+    """Kernels of contact between surfaces.
+
+    Args:
+        launcher: launcher of the potential.
+        sets: the vertices of the surface.
+        reach: distance at which contact begins [m].
+    """
+
+    couples_cells = True
+    _kernels = kernels
+
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], reach: float) -> None:
+        super().__init__(launcher, sets)
+        (s,) = sets
+        assert isinstance(s.source, SurfacePoints)
+        self._vertices, self._reach = s.n_vertices, reach
+        self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
+        self._moved = torch.as_tensor(s.source.nodes[:, 0], device=launcher.device)
+        self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
+        self._grips: Grips | None = None
+        self._bounded = False
+        self._steps, self._recorded = 0, dict[int, tuple[tuple[int, int], list[Any]]]()
+        self._size(0)
+
+    def _size(self, count: int) -> None:
+        """Makes buffers for pairs."""
+        new = self._force.new_zeros
+        self._pair_force, self._pair_energy = new(count, 4, 3), new(count)
+        self._near = torch.zeros(count, device=self.launcher.device, dtype=torch.int32)
+        self._sized = self._list.version
+
+    @property
+    @override
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        n = self._vertices
+        fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (n, 3))
+        return {STIFFNESS.name: (1,), FRICTION.name: (1,), "surface_slip": (1,), **fields}
+
+    @override
+    def set_step(self, values: Values) -> None:
+        start, place = value_of(values, "surface_start"), value_of(values, "surface_place")
+        self._bounded, self._grips = False, None
+        if not self._list.covers(start):
+            count, edge = self._list.crossings(start)
+            if bool(count.any()):
+                vertex = int(self._list.surface.edges[int(edge[count > 0][0]), 0])
+                raise InputError(f"the surfaces of the bodies cross at the start of a step, near vertex {vertex}.")
+            self._list.find(start, torch.zeros_like(start))
+        if not torch.equal(start, place):
+            self._check_way(start, place)
+        slides = self.sliding(values, start, value_of(values, STIFFNESS.name))
+        self._grips = None if slides is None else Grips.of(self.launcher, self._list, slides)
+        self._steps += 1
+
+    def _check_way(self, start: torch.Tensor, place: torch.Tensor) -> None:
+        """Raises InputError where fixed vertices pass through a surface in a step."""
+        share = self.launcher.zeros() + 1.0
+        way = (warp_view(start, wp.vec3d), warp_view(place, wp.vec3d))
+        self.launcher.launch(*self._bounding(*way, warp_view(share, wp.float64)))
+        if bool((share < 1.0).any()):
+            raise InputError(
+                "fixed vertices, or an obstacle, move through the gap between surfaces in a step: move them less in a "
+                "step."
+            )
+
+    def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
+        """Returns launches of forces and energies at positions."""
+        if not self._bounded:  # by `bounds`, whose list holds all pairs up to the next step
+            x = wp.to_torch(positions)
+            if not self._list.covers(x):
+                self._list.find(x, torch.zeros_like(x))
+        now = (self._list.version, self._steps)
+        if active.ptr not in self._recorded or self._recorded[active.ptr][0] != now:
+            self._recorded[active.ptr] = now, self._record(values, positions, active)
+        return self._recorded[active.ptr][1]
+
+    def _record(self, values: Values, positions: Any, active: Any) -> list[Any]:
+        own, ours = self.launcher, self._list
+        if self._sized != ours.version:
+            self._size(ours.count)
+        stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+        inputs = [active, ours.pairs, stiffness, wp.float64(self._reach), positions]
+        pair_out = [warp_view(self._pair_force, kernels.Corners), warp_view(self._pair_energy, wp.float64)]
+        sums = [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
+        incidence = [warp_view(x, wp.int32) for x in (ours.start, ours.incident)]
+        size, near = (own.batch, self.n_points), warp_view(self._near, wp.int32)
+        commands = [own.record(kernels.pair_forces, (ours.count,), inputs, [*pair_out, near])] if ours.count else []
+        commands.append(own.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums))
+        if (grips := self._grips) is not None:
+            inputs = [active, grips.struct, *self._friction(values), positions]
+            commands.append(own.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs))
+            inputs = [*grips.incidence, *grips.outputs, self.n_points, 1]
+            commands.append(own.record(kernels.gather, size, inputs, sums))
+        return commands
+
+    def _friction(self, values: Values) -> list[Any]:
+        """Returns coefficient, slip and reference for the kernels of friction."""
+        names = ((FRICTION.name, wp.float64), ("surface_slip", wp.float64), ("surface_reference", wp.vec3d))
+        return [warp_view(value_of(values, name), kind) for name, kind in names]
+
+    @override
+    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
+        return [HostLaunches(lambda: self._commands(values, positions, active))]
+
+    @override
+    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        return [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
+
+    def _chosen(self) -> torch.Tensor:
+        """Returns the pairs that were near at the last evaluation."""
+        if self._sized != self._list.version or not self._list.count:
+            return torch.zeros(0, device=self.launcher.device, dtype=torch.int64)
+        return (self._near * self.launcher.active[self._list.environment]).nonzero().ravel()
+
+    @override
+    def pair_tangents(self, values: Values, positions: Any, clamp: bool) -> PairTangents | None:
+        own, chosen, parts = self.launcher, self._chosen(), list[PairTangents]()
+        if len(chosen):
+            indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
+            stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+            inputs = [warp_view(indices, wp.int32), self._list.pairs, stiffness, wp.float64(self._reach), positions]
+            out = [warp_view(blocks, wp.float64)]
+            own.launch(own.record(kernels.pair_tangents, (len(chosen),), inputs, out))
+            if clamp:
+                sizes, axes = torch.linalg.eigh(blocks)
+                blocks = (axes * sizes.clamp_min(0.0)[:, None]) @ axes.mT
+            parts.append(PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks))
+        if (grips := self._grips) is not None:
+            blocks = self._force.new_zeros(grips.count, 12, 12)
+            inputs = [grips.struct, *self._friction(values), positions]
+            own.launch(own.record(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)]))
+            parts.append(PairTangents(grips.environment, grips.nodes, blocks))
+        if not parts:
+            return None
+        names = ("environment", "nodes", "blocks")
+        return PairTangents(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+    @override
+    def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
+        return value_of(values, "surface_place"), self._moved[:0]
+
+    @override
+    def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
+        return [HostLaunches(lambda: self._bounding(origin, positions, share))]
+
+    def _bounding(self, origin: Any, positions: Any, share: Any) -> list[Any]:
+        """Returns the launch that bounds a way, after a search for pairs along it, and limits its length."""
+        own, ours, self._bounded = self.launcher, self._list, True
+        start, end, part = wp.to_torch(origin), wp.to_torch(positions), wp.to_torch(share)
+        start = torch.where(own.active.bool()[:, None, None], start, end)
+        ways = (end - start)[:, ours.vertices].norm(dim=-1).amax(1)
+        part.copy_(torch.minimum(part, ours.longest_way / ways.clamp_min(1e-300)))
+        way = part[:, None, None] * (end - start)
+        if not (ours.covers(start) and ours.covers(start + way)):
+            ours.find(start, way)
+        if not ours.count:
+            return []
+        inputs = [warp_view(own.active, wp.int32), ours.pairs, origin, positions]
+        return [own.record(kernels.bound, (ours.count,), inputs, [share])]
+
+    @override
+    def curvature(self, values: Values) -> torch.Tensor:
+        return value_of(values, STIFFNESS.name).new_zeros(1, self.n_points)
+
+    def _near_at(self, values: Values, positions: torch.Tensor) -> torch.Tensor:
+        """Returns the pairs within reach at positions (B, N, 3), whose forces are then those there."""
+        if not self._list.covers(positions):
+            self._list.find(positions, torch.zeros_like(positions))
+        active = warp_view(self.launcher.active, wp.int32)
+        self.launcher.launch(*self._record(values, warp_view(positions, wp.vec3d), active))
+        return self._chosen()
+
+    def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> "_Near":
+        """Returns the geometry of chosen pairs at positions (B, N, 3), differentiable."""
+        own, ours = self.launcher, self._list
+        indices, features = chosen.to(torch.int32), kernels.Features()
+        w, t, s = (self._force.new_zeros(len(chosen), _FEATURES, 4) for _ in range(3))
+        part = self._force.new_zeros(len(chosen), _FEATURES)
+        features.coefficient = warp_view(part, wp.float64)
+        features.w, features.t, features.s = (warp_view(values, wp.vec4d) for values in (w, t, s))
+        inputs = [warp_view(indices, wp.int32), ours.pairs, wp.float64(self._reach), warp_view(x, wp.vec3d), features]
+        own.launch(own.record(kernels.pair_features, (len(chosen), _FEATURES), inputs, []))
+        environment, nodes = ours.environment[chosen], ours.nodes[chosen]
+        ends = x[environment[:, None], nodes]
+        # Weights that do not change here, but whose derivatives are those of the nearest points.
+        r, e, f = w @ ends, t @ ends, s @ ends
+        ee = (e * e).sum(-1) + (t == 0.0).all(-1).double()
+        ff, ef = (f * f).sum(-1) + (s == 0.0).all(-1).double(), (e * f).sum(-1)
+        whole = torch.maximum(ee * ff - ef * ef, 1e-12 * ee * ff)
+        er, fr = (e * r).sum(-1), (f * r).sum(-1)
+        first, second = (fr * ef - er * ff) / whole, (er * ef - fr * ee) / whole
+        w = w + first[..., None] * t + second[..., None] * s
+        r = w @ ends
+        cross = torch.linalg.cross(ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]).square().sum(-1)
+        share = (cross / ours.parallel[chosen]).clamp_max(1.0)
+        factor = torch.where(ours.kind[chosen] == 0, 1.0, (2.0 - share) * share) * ours.area[chosen]
+        return _Near(environment, nodes, ends, w, r, r.norm(dim=-1), part, factor)
+
+    def sliding(self, values: Values, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
+        """Returns friction for the state at the start of a step, or None without pairs within reach."""
+        chosen = self._near_at(values, start.detach())
+        if not len(chosen):
+            return None
+        near = self._pairs(chosen, start)
+        n, s = near.r / near.d[..., None], (near.d / self._reach).clamp_max(1.0)
+        pressure = near.part * (2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s)
+        normal = n[:, 0]
+        load = near.factor * stiffness[near.environment, 0] * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
+        kept = load > 0.0
+        out = (near.environment, near.nodes, near.weights[:, 0], normal, load)
+        return Sliding(*(value[kept] for value in out)) if bool(kept.any()) else None
+
+    def forces(self, values: Values, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns gaps (B, P) [m], normal forces and friction (B, P, 3) on the vertices [N], differentiable.
+
+        Args:
+            values: the values of the step, with their gradients.
+            x: (B, N, 3) solution of the step [m].
+        """
+        normal, friction = torch.zeros_like(x), torch.zeros_like(x)
+        gap = torch.full_like(x[..., 0], self._reach)
+        start, stiffness = value_of(values, "surface_start"), value_of(values, STIFFNESS.name)
+        if (slides := self.sliding(values, start, stiffness)) is not None:
+            names = ("surface_reference", FRICTION.name, "surface_slip")
+            force = slides.force(x, *(value_of(values, name) for name in names))
+            place = (slides.environment[:, None].expand_as(slides.nodes), slides.nodes)
+            friction = friction.index_put(place, slides.weights[..., None] * force[:, None], accumulate=True)
+        if len(chosen := self._near_at(values, x.detach())):
+            differentiable = torch.is_grad_enabled()
+            with torch.enable_grad():
+                given = x if x.requires_grad else x.detach().requires_grad_()
+                near = self._pairs(chosen, given)
+                s = (near.d / self._reach).clamp_max(1.0)
+                barrier = (near.part * -(s - 1.0).square() * s.log()).sum(1) * self._reach
+                energy = (barrier * near.factor * stiffness[near.environment, 0]).sum()
+                (slope,) = torch.autograd.grad(energy, given, create_graph=differentiable)
+            normal = -slope
+            entries = near.environment[:, None] * x.shape[1] + near.nodes
+            distance = torch.where(near.weights[:, 0] == 0.0, self._reach, near.d[:, :1])
+            gap = gap.ravel().scatter_reduce(0, entries.ravel(), distance.ravel(), "amin").view_as(gap)
+        own = self._list.vertices
+        return gap[:, own], normal[:, own], friction[:, own]
+
+    @override
+    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+        own = self.launcher
+        names = ("surface_start", "surface_reference", STIFFNESS.name, FRICTION.name)
+
+        def differentiate() -> dict[str, torch.Tensor]:
+            chosen = self._near_at(values, positions)
+            environment, nodes = self._list.environment[chosen], self._list.nodes[chosen]
+            work = (self._pair_force[chosen] * direction[environment[:, None], nodes]).sum((1, 2))
+            by_stiffness = own.zeros(1).index_add_(0, environment, -work[:, None]) / value_of(values, STIFFNESS.name)
+            start, reference, stiffness, friction = given = [
+                value_of(values, name).detach().requires_grad_() for name in names
+            ]
+            slopes = tuple(torch.zeros_like(value) for value in given)
+            with torch.enable_grad():
+                if (slides := self.sliding(values, start, stiffness)) is not None:
+                    force = slides.force(positions, reference, friction, value_of(values, "surface_slip"))
+                    ways = direction[slides.environment[:, None], slides.nodes]
+                    work = (slides.weights[..., None] * ways * force[:, None]).sum()
+                    slopes = torch.autograd.grad(work, given)
+            out = dict(zip(names, slopes, strict=True))
+            return out | {STIFFNESS.name: out[STIFFNESS.name] + by_stiffness}
+
+        return differentiate
+
+
+class _Near(NamedTuple):
+    """Geometry of pairs within reach."""
+
+    environment: torch.Tensor  # (A,)
+    nodes: torch.Tensor  # (A, 4)
+    ends: torch.Tensor  # (A, 4, 3) [m]
+    weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.surfaces.nearest``)
+    r: torch.Tensor  # (A, 9, 3) from the nearest point of the second part to that of the first [m]
+    d: torch.Tensor  # (A, 9) its length [m]
+    part: torch.Tensor  # (A, 9) coefficients of the features
+    factor: torch.Tensor  # (A,) area, with the factor for almost parallel edges [m^2]
+
+
+@dataclass(frozen=True)
+class Grips:
+    """Friction of pairs in a step.
+
+    Attributes:
+        environment: (G,) environments.
+        nodes: (G, 4) vertices.
+        struct: arrays for the kernels.
+        outputs: arrays of gradients and energies.
+        incidence: for ``kernels.surfaces.gather``.
+        kept: tensors that own the memory.
+    """
+
+    environment: torch.Tensor
+    nodes: torch.Tensor
+    struct: Any
+    outputs: list[Any]
+    incidence: list[Any]
+    kept: tuple[torch.Tensor, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of pairs G."""
+        return len(self.environment)
+
+    @classmethod
+    def of(
+        cls,
+        launcher: Launcher,
+        pairs: PairList,
+        sliding: Sliding,
+    ) -> "Grips":
+        """Returns friction of pairs (G, ...) (`kernels.surfaces.Grips`)."""
+        struct = kernels.Grips()
+        environment, nodes, weights, normal, load = sliding
+        kept = [environment.to(torch.int32), nodes.to(torch.int32), weights.contiguous(), normal.contiguous(), load]
+        types = {
+            "environment": wp.int32,
+            "nodes": wp.vec4i,
+            "weights": wp.vec4d,
+            "normal": wp.vec3d,
+            "load": wp.float64,
+        }
+        for (name, kind), value in zip(types.items(), kept, strict=True):
+            setattr(struct, name, warp_view(value, kind))
+        sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
+        incidence = pairs.incidence(environment, nodes)
+        outputs = [warp_view(sums[0], kernels.Corners), warp_view(sums[1], wp.float64)]
+        own = [warp_view(x, wp.int32) for x in incidence]
+        return cls(environment, nodes, struct, outputs, own, (*kept, *sums, *incidence))

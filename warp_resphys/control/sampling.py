@@ -11,7 +11,6 @@ import torch
 
 from ..data.actuation import InputSequences
 from ..data.input_response import SLOPES, InputResponse, response_of
-from ..energies.contact import Contact
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
@@ -152,8 +151,8 @@ def check_reducible(robot: Robot) -> None:
     check_integrator(robot.simulator.integrator)
     if any(getattr(energy, "memory", ()) for energy in robot.simulator.body.energies):
         raise InputError("an energy with memory, such as friction, cannot be reduced: use the full simulator.")
-    if any(isinstance(energy, Contact) for energy in robot.simulator.body.energies):
-        raise InputError("a robot with obstacles cannot be reduced, as contact has no basis: use the full simulator.")
+    if any(getattr(energy, "is_barrier", False) for energy in robot.simulator.body.energies):
+        raise InputError("a robot in contact cannot be reduced, as contact has no basis: use the full simulator.")
     for name in (*_OF_MEDIUM, "tendon_friction"):
         if name in robot.simulator.parameters and bool((_value(robot, name) != 0.0).any()):
             raise InputError(f"{name} is no stiffness, so that this robot cannot be reduced: use the full simulator.")

@@ -17,6 +17,7 @@ from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
+from ..energies.surfaces import SurfaceContact
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -47,7 +48,8 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSettings | None) -> list[Energy]:
     """Builds the energies of a body besides its material.
 
-    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string`` and ``obstacles``.
+    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string``, ``obstacles`` and
+    ``self_contact``.
 
     Args:
         settings: of the body.
@@ -75,6 +77,8 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
         energies.append(Strings([select_vertices(mesh, **payload_at.arguments())], **dict(settings.payload_string)))
     if settings.obstacles:
         energies.append(build_contact(settings))
+    if settings.self_contact is not None:
+        energies.append(SurfaceContact(**dict(settings.self_contact)))
     return energies
 
 

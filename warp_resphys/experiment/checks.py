@@ -78,9 +78,9 @@ def check_run(run: RunSettings) -> None:
         names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
-        if run.obstacles and run.identify.integrator == "midpoint":
+        if (run.obstacles or run.self_contact) and run.identify.integrator == "midpoint":
             raise InputError(
-                "identify.integrator is midpoint, which cannot keep a body out of obstacles: set it to bdf2 or "
+                "identify.integrator is midpoint, by which bodies in contact may penetrate: set it to bdf2 or "
                 "implicit_euler."
             )
         _check_identification(run.identify, names, simulator)
@@ -133,8 +133,11 @@ def _check_control(run: RunSettings, body: Body) -> None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
     if drive_of(run, body) is None:
         raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
-    if run.obstacles:
-        raise InputError("control plans with a reduced model, which has no contact: set control=none, or obstacles={}.")
+    if run.obstacles or run.self_contact:
+        raise InputError(
+            "control plans with a reduced model, which has no contact: set control=none, or obstacles={} and "
+            "self_contact=null."
+        )
     if run.is_laboratory and any(trial.payload for trial in trials_of(run)):
         raise InputError("control does not support payloads: remove them from laboratory.trials.")
 

@@ -7,7 +7,7 @@ from pydantic import ConfigDict, Field, model_validator
 from ..io.errors import listed
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
-from .obstacles import ContactSettings, ObstacleSettings
+from .obstacles import ContactSettings, ObstacleSettings, SurfaceContactSettings
 
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
@@ -257,6 +257,9 @@ class BodySettings(Settings):
     )
     obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
     contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
+    self_contact: SurfaceContactSettings | None = setting(
+        None, "contact of the body with itself and of its parts with one another; null: they pass through one another"
+    )
 
     @model_validator(mode="after")
     def _touches(self) -> Self:

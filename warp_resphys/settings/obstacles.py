@@ -66,6 +66,15 @@ ObstacleSettings = Annotated[
 ]
 
 
+class SurfaceContactSettings(Settings):
+    """Contact of the body with itself, and of its parts with one another, by `energies.surfaces`."""
+
+    stiffness: Positive = setting(1.0e5, "of the barrier, from which the gap between resting surfaces follows", "Pa")
+    friction: NotNegative = setting(0.0, "coefficient of friction")
+    distance: Positive = setting(1.0e-3, "at which contact begins", "m")
+    slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")
+
+
 class ContactSettings(Settings):
     """Contact of the body with its obstacles, by `energies.contact`."""
 

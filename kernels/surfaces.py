@@ -385,7 +385,7 @@ def pair_tangents(
 
 
 @wp.struct
-class Grips:
+class FrictionPairs:
     """Friction of pairs in a step, of all environments."""
 
     environment: wp.array[int]
@@ -396,7 +396,9 @@ class Grips:
 
 
 @wp.func
-def grip_slide(grips: Grips, g: int, positions: wp.array2d[wp.vec3d], reference: wp.array2d[wp.vec3d]) -> wp.vec3d:
+def grip_slide(
+    grips: FrictionPairs, g: int, positions: wp.array2d[wp.vec3d], reference: wp.array2d[wp.vec3d]
+) -> wp.vec3d:
     """u, the relative way of the two parts of a pair since the start of the step, in its tangential plane."""
     b, v, w, n = grips.environment[g], grips.nodes[g], grips.weights[g], grips.normal[g]
     way = w * (corners(positions, b, v) - corners(reference, b, v))
@@ -406,7 +408,7 @@ def grip_slide(grips: Grips, g: int, positions: wp.array2d[wp.vec3d], reference:
 @wp.kernel
 def grip_forces(
     active: wp.array[int],
-    grips: Grips,
+    grips: FrictionPairs,
     coefficient: wp.array2d[wp.float64],  # (B, 1) mu
     slip: wp.array2d[wp.float64],  # (B, 1) slide at which friction is fully developed [m]
     reference: wp.array2d[wp.vec3d],  # (B, N) positions without slide [m]
@@ -427,7 +429,7 @@ def grip_forces(
 
 @wp.kernel
 def grip_tangents(
-    grips: Grips,
+    grips: FrictionPairs,
     coefficient: wp.array2d[wp.float64],
     slip: wp.array2d[wp.float64],
     reference: wp.array2d[wp.vec3d],

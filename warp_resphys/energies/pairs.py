@@ -156,7 +156,7 @@ class PairList:
         if len(self._per_piece) == 1:  # Only motion within the piece matters.
             outer = inner
         self._origin, self._outer, self._inner = origin.clone(), outer, inner
-        motion = broad_phase.Motion()
+        motion = broad_phase.Sweep()
         motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
         motion.outer, motion.inner = warp_view(outer, wp.float64), warp_view(inner, wp.float64)
         motion.piece = self._piece_array
@@ -164,12 +164,12 @@ class PairList:
         size = len(surface.vertices) * len(surface.triangles)
         total = size + len(surface.edges) ** 2
         while True:
-            found, count = broad_phase.Found(), torch.zeros(1, device=own.device, dtype=torch.int32)
+            pair_keys, count = broad_phase.PairKeys(), torch.zeros(1, device=own.device, dtype=torch.int32)
             keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
-            found.count, found.keys = warp_view(count, wp.int32), warp_view(keys, wp.int64)
-            inputs = [triangles.id, motion, self._vertex_array, self._triangle_array, wp.int64(total), found]
+            pair_keys.count, pair_keys.keys = warp_view(count, wp.int32), warp_view(keys, wp.int64)
+            inputs = [triangles.id, motion, self._vertex_array, self._triangle_array, wp.int64(total), pair_keys]
             own.launch(own.record(broad_phase.vertex_triangle_pairs, (own.batch, len(surface.vertices)), inputs, []))
-            inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), found]
+            inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), pair_keys]
             own.launch(own.record(broad_phase.edge_edge_pairs, (own.batch, len(surface.edges)), inputs, []))
             if (needed := int(count)) <= self._capacity:
                 break
@@ -228,7 +228,7 @@ class PairList:
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
         own = self._launcher
-        motion = broad_phase.Motion()
+        motion = broad_phase.Sweep()
         kept = positions.contiguous(), own.zeros(positions.shape[1])
         motion.origin, motion.outer = warp_view(kept[0], wp.vec3d), warp_view(kept[1], wp.float64)
         hierarchy = self._hierarchy(motion, self._triangle_array)

@@ -377,8 +377,8 @@ class Grips:
         pairs: PairList,
         sliding: Sliding,
     ) -> "Grips":
-        """Returns friction of pairs (G, ...) (`kernels.surfaces.Grips`)."""
-        struct = kernels.Grips()
+        """Returns friction of pairs (G, ...) (`kernels.surfaces.FrictionPairs`)."""
+        struct = kernels.FrictionPairs()
         environment, nodes, weights, normal, load = sliding
         kept = [environment.to(torch.int32), nodes.to(torch.int32), weights.contiguous(), normal.contiguous(), load]
         types = {

@@ -337,6 +337,23 @@ def test_equilibrium_of_bodies_that_lean_on_one_another():
     assert float(slope) == pytest.approx(float(expected), rel=1e-6)
 
 
+def test_the_matrix_of_a_step_has_its_pairs():
+    """H of a step in contact, as a matrix, is the difference of the residual."""
+    simulator = landing()
+    velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64)
+    state = simulator.rollout(thrown(simulator, velocity, velocity[:, 0]), 5).final
+    step, x = simulator.linearise(state), simulator.step(state)[0].q
+    matrix, _ = step.matrix(x)
+    way = torch.tensor(np.random.default_rng(0).normal(size=(1, len(step.free), 3)))
+    ways = torch.zeros_like(x).index_copy(1, step.free, way)
+    expected = (step.residual(x + 1e-9 * ways) - step.residual(x - 1e-9 * ways))[:, step.free] / 2e-9
+    step.update(x)
+    close = pytest.approx(expected.numpy(), abs=1e-5 * float(expected.norm()))
+    assert step.product(ways)[:, step.free].numpy() == close
+    assert (matrix @ way.numpy().ravel()).reshape(expected.shape) == close
+    assert float(simulator.contacts(state, State(x, state.v))["surfaces"].normal.norm()) > 0.0
+
+
 def test_refusals():
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
     with pytest.raises(InputError, match="cross at rest"):

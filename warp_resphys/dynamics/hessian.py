@@ -123,7 +123,7 @@ class ExactHessian(HessianApproximation):
 
     def _correct(self, x: torch.Tensor, order: torch.Tensor, clamp: bool) -> None:
         """Adds the coupling of pairs at the potential's positions to solutions (B, n, k) without it."""
-        couplings = self._couplings(clamp)
+        couplings = self.couplings(clamp)
         if not couplings:
             return
         if self._coupled is None:
@@ -131,8 +131,8 @@ class ExactHessian(HessianApproximation):
         assert self._factor is not None
         self._coupled.correct(self._factor, couplings, x, order)
 
-    def _couplings(self, clamp: bool) -> list[Coupling]:
-        """Returns the coupling of pairs by environment."""
+    def couplings(self, clamp: bool) -> list[Coupling]:
+        """Returns the coupling of pairs at the potential's positions, by environment."""
         parts = self._potential.pair_tangents(clamp)
         if not parts:
             return []

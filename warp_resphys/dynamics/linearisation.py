@@ -93,7 +93,10 @@ class Linearisation:
         return p.restrict(p.stiffness_product(direction) + p.inertia[..., None] * direction)
 
     def shifted(self, scale: float) -> Factor:
-        """Returns a factor of I + scale H on the free vertices; H is clamped if this is not positive definite."""
+        """Returns a factor of I + scale H on the free vertices, for preconditioning.
+
+        H is clamped if this is not positive definite, and without pairs (`Term.pair_tangents`).
+        """
         w, name = self._workspace, self._name
         shift = w.cached(("shifted", name), lambda: _ShiftedHessian(w, name))
         factor = shift(scale)
@@ -114,6 +117,11 @@ class Linearisation:
             columns = p.low_rank[0].view(p.n_vertices, 3, -1)[self.free].flatten(0, 1)
             columns = scipy.sparse.csc_array(columns.cpu().numpy())
             matrix = scipy.sparse.csc_array(matrix + columns @ columns.T)
+        for coupling in self._workspace.hessian(self._name).couplings(clamp=False):
+            if coupling.environment == 0:
+                at, block = coupling.unknowns.cpu().numpy(), coupling.matrix.cpu().numpy()
+                pairs = (block.ravel(), (np.repeat(at, len(at)), np.tile(at, len(at))))
+                matrix = scipy.sparse.csc_array(matrix + scipy.sparse.coo_array(pairs, matrix.shape))
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
     def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:

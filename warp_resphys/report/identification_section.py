@@ -33,6 +33,8 @@ _PARAMETERS: Final[Mapping[str, Wording]] = {
     "tendon_bristle_length": ("Bristle length of the tendons", "mm", 1e3),
     "contact_stiffness": ("Stiffness of the obstacles", "kPa", 1e-3),
     "contact_friction": ("Friction of the obstacles", "", 1.0),
+    "surface_stiffness": ("Stiffness between surfaces", "kPa", 1e-3),
+    "surface_friction": ("Friction between surfaces", "", 1.0),
     "obstacle_growth": ("Growth of the obstacles", "mm", 1e3),
     **{f"obstacle_{axis}": (f"Shift along {axis} of the obstacles", "mm", 1e3) for axis in "xyz"},
     **{f"obstacle_turn_{axis}": (f"Turn about {axis} of the obstacles", "°", 180.0 / np.pi) for axis in "xyz"},

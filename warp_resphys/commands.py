@@ -82,7 +82,7 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             "compare a device with the CPU, and time both: a page of results", "studies.device_check:check_device"
         ),
         "verify contact": Command(
-            "contact with obstacles beside closed forms: a page of results", "studies.contact_check:contact_check"
+            "contact with obstacles beside theory: a page of results", "studies.contact_check:contact_check"
         ),
         "train-policy": Command(
             "learn a policy on a run's robot, and try it on its laboratory",

@@ -1,17 +1,13 @@
-"""Contact with obstacles beside closed forms, and the time of a step in contact; a page of results.
+"""Contact with obstacles beside theory, and the time of a step in contact; a page of results.
 
 ==================  ==================================================================================================
 incline             a block sticks up to arctan mu, where it creeps with v_s (1 - sqrt(1 - tan a / mu)), and is
                     accelerated by g (sin a - mu cos a) beyond
 stopping            a sliding block comes to rest after v^2 / (2 mu g)
-Hertz               a sphere is pressed into a bonded layer with 4/3 E* sqrt(R) d^1.5, times the correction for the
-                    thickness of the layer (Dimitriadis et al. 2002); d includes the gap
+sphere, cylinder    are pressed into a bonded layer with the forces of theory (`indentation`)
 throws, plates      no vertex of a surface penetrates, and every solve converges
 energy              implicit Euler gains none
 ==================  ==================================================================================================
-
-E. K. Dimitriadis et al.: Determination of elastic moduli of thin layers of soft material using the atomic force
-microscope. Biophysical Journal 82, 2002.
 """
 
 import itertools
@@ -35,8 +31,8 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Trajectory
 from ..energies.contact import Contact, vertex_areas
-from ..energies.materials import Corotated, StableNeoHookean
-from ..energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Obstacle, ObstacleSet, Pose, Sphere
+from ..energies.materials import Corotated
+from ..energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
 from ..experiment.build import choose_device
 from ..fem.body import Body
 from ..io.progress import Progress
@@ -46,6 +42,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .beam import beam_mesh, clamped
 from .device_check import Check, run_checks
+from .indentation import DEPTHS, cylinder_errors, measured, pressure, sphere_error
 from .runs import Results, made
 from .tables import Sheet, show
 from .timing import TimedRollout
@@ -68,7 +65,6 @@ SHAPES: Final[Mapping[str, Obstacle]] = {
 INTEGRATORS: Final = ("implicit_euler", "bdf2")
 _STOPPING: Final = (4e-3, 2e-3, 1e-3)  # time steps [s]
 _THROWN: Final = tuple(itertools.product((1e-3, 1e-4), (torch.float64, torch.float32)))  # D [m] and dtype
-_RADIUS, _DEPTH, _POISSON = 0.02, 0.5e-3, 0.45  # of Hertz's contact [m]
 
 
 class ContactStudy(Settings):
@@ -82,6 +78,7 @@ class ContactStudy(Settings):
     speed: Positive = setting(unit="m/s")
     seed: Count
     cells: Some[Positive] = setting(unit="m")
+    cylinder_cells: Some[Positive] = setting(unit="m")
     batches: Some[Natural]
     repeats: Natural
     results: Word | None
@@ -90,6 +87,7 @@ class ContactStudy(Settings):
     def chosen(self) -> "ContactStudy":
         """The settings, or their quick form."""
         small = {"frictions": self.frictions[:1], "degrees": 2, "throws": 20, "cells": self.cells[:1]}
+        small |= {"cylinder_cells": self.cylinder_cells[:1]}
         return self.changed(**small, batches=self.batches[:1], repeats=1) if self.quick else self
 
 
@@ -105,6 +103,7 @@ def contact_check(settings: ContactStudy, folder: Path) -> None:
         "Inclined plane": incline_checks,
         "Stopping distance": stopping_checks,
         "A sphere on a block": hertz_checks,
+        "A cylinder on a block": line_checks,
         "Thrown blocks": throw_checks,
         "Closing plates": plate_checks,
         "Energy": energy_checks,
@@ -138,24 +137,11 @@ def on_obstacle(
     return Simulator(Body(mesh, fixed=fixed, energies=[contact]), material, **options)
 
 
-def pressure(s: Any) -> Any:
-    """Pressure over kappa at the distance s D, for s <= 1."""
-    return 2.0 * (s - 1.0) * np.log(s) + (s - 1.0) ** 2 / s
-
-
 def resting_floor(weight: float) -> HalfSpace:
     """A floor so far below the block that the vertices of its lower face carry its weight [N]."""
     share = weight / (KAPPA * vertex_areas(BLOCK)[select_vertices(BLOCK, z=0.0)].sum())
     s = brentq(lambda s: float(pressure(s)) - share, 1e-6, 1.0 - 1e-9)
     return HalfSpace(position=(0.0, 0.0, -D * s))
-
-
-def measured(obstacle: Obstacle, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances (B, P) [m] and normals (B, P, 3) of positions (B, P, 3) from an obstacle at its place."""
-    place, turn = x.new_tensor([obstacle.position]), x.new_tensor(obstacle.turn[None])
-    pose = Pose(*(value.expand(len(x), *value.shape) for value in (place, turn, x.new_zeros(1))))
-    d, n = ObstacleSet((obstacle,), D, x.device).distances(x, pose)
-    return d[..., 0], n[:, :, 0]
 
 
 def total_energy(simulator: Simulator, trajectory: Trajectory) -> NDArray[np.float64]:
@@ -245,52 +231,26 @@ def stopping_checks(study: ContactStudy, device: torch.device) -> Iterator[Check
 
 def hertz_checks(study: ContactStudy, device: torch.device) -> Iterator[Check]:
     """Force on a sphere of 20 mm that is pressed 0.5 mm into a block, by the size of the cells below it."""
-    errors = [100.0 * press(cell, device) for cell in study.cells]
+    errors = [100.0 * sphere_error(cell, device) for cell in study.cells]
     bound = 10.0 if study.quick else 2.0
     title = f"force, cells of {', '.join(f'{1e3 * cell:g}' for cell in study.cells)} mm"
     result = f"{', '.join(f'{error:.1f}' for error in errors)} %"
     yield Check(title, result, f"within {bound:g} % at last", abs(errors[-1]) <= bound)
 
 
-def press(cell: float, device: torch.device) -> float:
-    """Relative error of the force on a sphere, for a size of the cells below it [m], which grow with the distance."""
-    extent, ratio = 0.03, 1.4
-    n = math.ceil(math.log(1.0 + extent * (ratio - 1.0) / cell) / math.log(ratio))
-    lines = np.concatenate([[0.0], np.cumsum(cell * ratio ** np.arange(n))])
-    ways = [np.concatenate([-lines[:0:-1], lines])] * 2 + [-lines[::-1]]
-    box = box_hexahedra((1.0, 1.0, 1.0), (2 * n, 2 * n, n))
-    index = np.rint(box.vertices * [2 * n, 2 * n, n]).astype(int)
-    mesh = Mesh(np.stack([ways[k][index[:, k]] for k in range(3)], 1), box.cells)
-    deep, distance = lines[-1], 2e-5
-    ball = Sphere(radius=_RADIUS, position=(0.0, 0.0, _RADIUS + distance))
-    rubber = StableNeoHookean(youngs_modulus=264e3, poissons_ratio=_POISSON, density=1070.0)
-    fixed = np.flatnonzero(mesh.vertices[:, 2] < -deep + 1e-9)
-    s = on_obstacle(ball, 0.0, mesh, rubber, fixed, distance, gravity=(0.0, 0.0, 0.0), device=device)
-    # The start is the surface pushed clear of the sphere.
-    x, down = s.rest_positions, _DEPTH + distance
-    r2 = x[:, :2].square().sum(1).clamp_max(_RADIUS**2)
-    push = (down - _RADIUS + (_RADIUS**2 - r2).sqrt() - 0.4 * distance).clamp_min(0.0)
-    start = x.clone()
-    start[:, 2] -= push * (1.0 + x[:, 2] / deep)
-    given = {"obstacle_z": s.tensor([-down]), "contact_stiffness": 1e5}
-    with torch.no_grad():
-        q = s.static_equilibrium(None, given, after=s.state(start)).q
-    sphere = replace(ball, position=(0.0, 0.0, _RADIUS + distance - down))
-    d, normal = (value[0].cpu().numpy() for value in measured(sphere, q))
-    forces = 1e5 * vertex_areas(mesh) * pressure(np.minimum(d / distance, 1.0))
-    force, gap = float(-(forces * normal[:, 2]).sum()), float((forces * d).sum() / forces.sum())
-    return force / hertz_force(_RADIUS, _DEPTH + gap, deep, 264e3, _POISSON) - 1.0
-
-
-def hertz_force(radius: float, depth: float, thickness: float, youngs_modulus: float, poissons_ratio: float) -> float:
-    """Force [N] on a rigid sphere that is pressed into a bonded layer (Dimitriadis et al. 2002, equation 12)."""
-    nu, chi = poissons_ratio, math.sqrt(radius * depth) / thickness
-    a = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1.0 - nu)
-    b = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1.0 - nu)
-    p = math.pi
-    layer = 1.0 - 2.0 * a / p * chi + 4.0 * (a / p * chi) ** 2 - 8.0 / p**3 * (a**3 + 4.0 * p**2 / 15.0 * b) * chi**3
-    layer += 16.0 * a / p**4 * (a**3 + 3.0 * p**2 / 5.0 * b) * chi**4
-    return 4.0 / 3.0 * youngs_modulus / (1.0 - nu**2) * math.sqrt(radius) * depth**1.5 * layer
+def line_checks(study: ContactStudy, device: torch.device) -> Iterator[Check]:
+    """Force on a cylinder of 200 mm at several depths up to 0.05 mm in a layer of 10 mm, by the size of the cells."""
+    cells = study.cylinder_cells
+    errors = [100.0 * cylinder_errors(cell, device) for cell in cells]
+    means = [float(np.sqrt(np.mean(error**2))) for error in errors]
+    last, bound = float(np.abs(errors[-1]).max()), 10.0 if study.quick else 2.0
+    title = f"force at {len(DEPTHS)} depths, cells of {', '.join(f'{1e3 * cell:g}' for cell in cells)} mm"
+    result = f"{', '.join(f'{mean:.2f}' for mean in means)} % (root mean square), {last:.2f} % at most at last"
+    asked, good = f"within {bound:g} % at last", last <= bound
+    if len(cells) > 1:
+        order = float(np.polyfit(np.log(cells), np.log(means), 1)[0])
+        result, asked, good = f"{result}, order {order:.1f}", f"{asked}, order > 1.5", good and order > 1.5
+    yield Check(title, result, asked, good)
 
 
 def throw_checks(study: ContactStudy, device: torch.device) -> Iterator[Check]:

@@ -427,6 +427,15 @@ def test_a_beam_that_leans_on_a_sphere_is_where_it_comes_to_rest():
     assert leant.numpy() == pytest.approx(rest.numpy(), abs=1e-9)
 
 
+def test_sizes_of_an_obstacle_by_environment():
+    s, growth = leaning(), vector([0.0], [2e-4])
+    both = s.static_equilibrium(None, {"obstacle_growth": growth}, batch=2).q
+    for q, value in zip(both, growth, strict=True):
+        alone = s.static_equilibrium(None, {"obstacle_growth": value}).q[0]
+        assert q.numpy() == pytest.approx(alone.numpy(), abs=1e-12)
+    assert float((both[1] - both[0])[..., 2].max()) > 1e-4
+
+
 def test_gradients_of_a_leaning_beam_with_friction():
     """Pushed aside from where it leant, which friction hinders."""
     s = leaning(0.5)

@@ -5,7 +5,15 @@ import torch
 
 from support.command_line import outcome, refusal, settings_of
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.device_check import DeviceCheck, bounded, experiment_checks, trajectory_checks
+from warp_resphys.studies.device_check import (
+    DeviceCheck,
+    beam_between_obstacles,
+    bounded,
+    contact_checks,
+    experiment_checks,
+    pushed,
+    trajectory_checks,
+)
 
 
 @pytest.mark.numerics
@@ -16,6 +24,7 @@ def test_the_cpu_passes(folder):
     assert "FAILED" not in ended.out
     for solver in ("projective_dynamics", "newton", "quasi_newton, tiled, float64", "quasi_newton, auto, float32"):
         assert f"10-node tetrahedra, nu 0.499, {solver}" in ended.out
+    assert "positions, quasi_newton, tiled, float64" in ended.out
     (page,) = (folder / "pages").glob("*-check-cpu.md")
     text = page.read_text()
     assert "all passed" in text
@@ -27,6 +36,29 @@ def test_a_solver_beyond_its_bound_fails():
     bounds = {torch.float64: 0.0, torch.float32: 1e-5}
     checks = list(trajectory_checks(torch.device("cpu"), 1, bounds))
     assert {check.name.rpartition(", ")[2]: check.passed for check in checks} == {"float64": False, "float32": True}
+
+
+def test_a_contact_beyond_its_bound_fails():
+    checks = list(contact_checks(torch.device("cpu"), 1, {torch.float64: 0.0, torch.float32: 1e-5}))
+    passed = {check.name.rpartition(", ")[2]: check.passed for check in checks}
+    assert passed == {"float64": False, "float32": True, "gradients": True}
+
+
+def test_a_beam_between_obstacles_slides_on_all_of_them():
+    simulator = beam_between_obstacles(moves=False)
+    start = simulator.rest_state()
+    before, _ = simulator.step(start)
+    after, _ = simulator.step(before)
+    forces = simulator.contacts(before, after)[""]
+    assert bool((forces.normal.norm(dim=-1).sum(1) > 0.0).all())
+    assert bool((forces.friction.norm(dim=-1).sum(1) > 1e-3 * forces.normal.norm(dim=-1).sum(1)).all())
+
+
+def test_plates_push_beams_by_different_ways():
+    moved = pushed(beam_between_obstacles(moves=True), 5)
+    still = pushed(beam_between_obstacles(moves=True), 1)[-1]
+    lifts = (moved[-1] - still)[..., 2].amax(1)
+    assert 1e-5 < float(lifts[0]) < 0.9 * float(lifts[1])
 
 
 def test_an_error_in_the_place_of_a_figure_fails():

@@ -238,14 +238,13 @@ class BoundContact(BoundEnergy):
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""
-        values = [self._place.new_zeros(1, 1) + constants[q.name] for q in (*SHIFT, *TURN)]
+        values = [self._place.new_zeros(1, 1) + constants[q.name] for q in (*SHIFT, *TURN, GROWTH)]
         for number, quantity in enumerate(MOTION):
             if quantity.name in inputs:
                 values[number] = values[number] + self._moving * inputs[quantity.name]
         rows = torch.broadcast_tensors(self._place[None, :, 0], *values)[1:]
-        shift, turn = torch.stack(rows[:3], -1), rotations(torch.stack(rows[3:], -1)) @ self._turn
-        growth = (self._place.new_zeros(1, 1) + constants[GROWTH.name]).expand(len(shift), len(self._place))
-        return Pose(self._place + shift, turn, growth)
+        shift, turn = torch.stack(rows[:3], -1), rotations(torch.stack(rows[3:6], -1)) @ self._turn
+        return Pose(self._place + shift, turn, rows[6])
 
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:

@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import torch
+import trimesh
 import warp as wp
 
-from ..dynamics.nonlinear_solver import SOLVERS, SolverSettings
+from ..dynamics.nonlinear_solver import SOLVERS, SolverName, SolverSettings
 from ..dynamics.simulator import Simulator
+from ..energies.base import Energy
 from ..energies.catalogue import make_material
+from ..energies.contact import Contact
+from ..energies.obstacles import Box, Cylinder, DistanceGrid
 from ..experiment.build import choose_device
 from ..experiment.files import METRICS
 from ..io.errors import ResphysError
@@ -35,6 +39,7 @@ GRADIENT_BOUND: Final = 1e-6  # relative
 RATIOS: Final = (0.45, 0.499)
 _TOLERANCE: Final = {torch.float64: 1e-9, torch.float32: 1e-5}  # of the solvers that are compared
 _MATERIAL: Final = {"youngs_modulus": 2.64e5, "density": 1070.0, "mass_damping": 0.5, "stiffness_damping": 0.002}
+_CHANGE: Final = 1e-3  # of differences in contact, which begins and ends
 _CPU_ONLY: Final = {"banded", "bordered"}
 
 
@@ -105,6 +110,7 @@ def check_device(settings: DeviceCheck, folder: Path) -> None:
     work = {
         "Trajectories beside the CPU's": lambda: trajectory_checks(device, check.steps),
         "Gradients beside differences": lambda: gradient_checks(device),
+        "Contact with obstacles": lambda: contact_checks(device, check.steps),
         "Memory of torch and Warp": lambda: memory_checks(device, check.steps),
     }
     if check.experiments:
@@ -142,28 +148,55 @@ def trajectory_checks(
     device: torch.device, steps: int, bounds: Mapping[torch.dtype, float] = POSITION_BOUND
 ) -> Iterator[Check]:
     """Compares solvers, in float64 and float32, with Newton's method on the CPU with LAPACK's banded factors."""
-    others = [name for name in LINEAR_SOLVERS if name != "auto" and (device.type == "cpu" or name not in _CPU_ONLY)]
-    cases = [
-        *((solver, "auto", torch.float64) for solver in SOLVERS),
-        *(("quasi_newton", name, torch.float64) for name in others),
-        ("quasi_newton", "auto", torch.float32),
-    ]
-    exact = SolverSettings("newton", relative_tolerance=1e-11, linear_solver="banded")
     for element, mesh in _meshes().items():
         for ratio in RATIOS:
-            reference = _trajectory(_beam(mesh, ratio, solver=exact), steps)
-
-            for solver, linear, dtype in cases:
-                settings = SolverSettings(solver, _TOLERANCE[dtype], max_iterations=100_000, linear_solver=linear)
-                beam = partial(_beam, mesh, ratio, solver=settings, device=device, dtype=dtype)
-                name = f"{element}, nu {ratio:g}, {solver}, {linear}, {str(dtype).removeprefix('torch.')}"
-                yield bounded(name, partial(_departure, beam, reference), bounds[dtype], "m")
+            name, beam = f"{element}, nu {ratio:g}", partial(_beam, mesh, ratio)
+            yield from _compared(name, beam, partial(_trajectory, steps=steps), device, SOLVERS, bounds)
 
 
-def _departure(beam: Callable[[], Simulator], reference: torch.Tensor) -> float:
-    """Largest distance [m] of a beam's vertices from a trajectory (T + 1, 2, N, 3) [m]."""
-    positions = _trajectory(beam(), len(reference) - 1).cpu().double()
-    return float(torch.linalg.vector_norm(positions - reference, dim=-1).max())
+def contact_checks(
+    device: torch.device, steps: int, bounds: Mapping[torch.dtype, float] = POSITION_BOUND
+) -> Iterator[Check]:
+    """Compares beams between obstacles, with friction, with those on the CPU, and their gradients with differences."""
+    solvers = [name for name in SOLVERS if name != "projective_dynamics"]  # it has no contact
+    beam = partial(beam_between_obstacles, moves=True)
+    yield from _compared("positions", beam, partial(pushed, steps=steps), device, solvers, bounds)
+    solver = SolverSettings("newton", relative_tolerance=1e-12)
+    resting = beam_between_obstacles(moves=False, solver=solver, device=device)
+    own = {"q", "v", *(name for name in resting.parameters if name.startswith(("contact_", "obstacle_")))}
+    measure = partial(_largest_error, resting, "rest", steps=2, change=_CHANGE, names=own)
+    yield bounded("gradients", measure, GRADIENT_BOUND)
+
+
+def _compared(
+    name: str,
+    beam: Callable[..., Simulator],
+    positions: Callable[[Simulator], torch.Tensor],
+    device: torch.device,
+    solvers: Sequence[SolverName],
+    bounds: Mapping[torch.dtype, float],
+) -> Iterator[Check]:
+    """Compares the positions of a roll-out on a device, by solver, with those of Newton's method on the CPU."""
+    exact = SolverSettings("newton", relative_tolerance=1e-11, linear_solver="banded")
+    reference = positions(beam(solver=exact))
+    others = [name for name in LINEAR_SOLVERS if name != "auto" and (device.type == "cpu" or name not in _CPU_ONLY)]
+    cases = [
+        *((solver, "auto", torch.float64) for solver in solvers),
+        *(("quasi_newton", linear, torch.float64) for linear in others),
+        ("quasi_newton", "auto", torch.float32),
+    ]
+    for solver, linear, dtype in cases:
+        settings = SolverSettings(solver, _TOLERANCE[dtype], max_iterations=100_000, linear_solver=linear)
+        case = partial(beam, solver=settings, device=device, dtype=dtype)
+        title = f"{name}, {solver}, {linear}, {str(dtype).removeprefix('torch.')}"
+        yield bounded(title, partial(_departure, case, positions, reference), bounds[dtype], "m")
+
+
+def _departure(
+    beam: Callable[[], Simulator], positions: Callable[[Simulator], torch.Tensor], reference: torch.Tensor
+) -> float:
+    """Largest distance [m] of a beam's vertices from those of a reference (T + 1, 2, N, 3) [m]."""
+    return float(torch.linalg.vector_norm(positions(beam()).cpu().double() - reference, dim=-1).max())
 
 
 def gradient_checks(device: torch.device) -> Iterator[Check]:
@@ -175,8 +208,8 @@ def gradient_checks(device: torch.device) -> Iterator[Check]:
             yield bounded(f"nu {ratio:g}, {name}", partial(_largest_error, simulator, name), GRADIENT_BOUND)
 
 
-def _largest_error(simulator: Simulator, pose_name: str) -> float:
-    return max(row.relative_error for row in check_gradients(simulator, pose_name))
+def _largest_error(simulator: Simulator, pose_name: str, **options: Any) -> float:
+    return max(row.relative_error for row in check_gradients(simulator, pose_name, **options))
 
 
 def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
@@ -219,9 +252,32 @@ def _meshes() -> dict[str, Mesh]:
     return {ELEMENT_NAMES[element]: beam_mesh(element, size, counts) for element, counts in divisions.items()}
 
 
-def _beam(mesh: Mesh, poissons_ratio: float, **options: Any) -> Simulator:
+def _beam(mesh: Mesh, poissons_ratio: float, energies: Sequence[Energy] = (), **options: Any) -> Simulator:
     material = make_material("corotated", **_MATERIAL, poissons_ratio=poissons_ratio)
-    return Simulator(clamped(mesh), material, 0.01, **options)
+    return Simulator(clamped(mesh, energies=energies), material, 0.01, **options)
+
+
+def beam_between_obstacles(moves: bool, **options: Any) -> Simulator:
+    """A beam, 30 mm thick, between a bar, a plate and a ball on a grid, on which its weight makes it slide."""
+    ball = trimesh.creation.icosphere(radius=0.01)
+    obstacles = {
+        "bar": Cylinder(position=(0.05, 0.015, -0.0106), axis=(0.0, 1.0, 0.0), radius=0.01, length=0.06),
+        "plate": Box(position=(0.09, 0.015, -0.0107), edges=(0.04, 0.04, 0.02), moves=moves),
+        "ball": DistanceGrid.of_surface(ball.vertices, ball.faces, 1e-3, position=(0.067, 0.0163, 0.0407)),
+    }
+    contact = Contact(obstacles, stiffness=1e5, friction={"bar": 0.3, "plate": 0.6, "ball": 0.2}, slip_speed=2e-2)
+    mesh = beam_mesh("hexahedron8", (0.1, 0.03, 0.03), (6, 2, 2))
+    return _beam(mesh, 0.45, [contact], gravity=(1.0, 4.0, -9.0), **options)
+
+
+def pushed(simulator: Simulator, steps: int) -> torch.Tensor:
+    """Positions (T + 1, 2, N, 3) [m] of two beams on plates that rise and move aside at different speeds."""
+    ways = simulator.tensor([1e-4, 2e-4]) * torch.arange(1, 1 + steps, device=simulator.device)[:, None]
+    plate = simulator.tensor([0.0, 1.0, 0.0])
+    rise = ways[..., None] * plate  # (T, 2, 3)
+    with torch.no_grad():
+        inputs = Inputs(obstacle_move_z=rise, obstacle_move_y=2.0 * rise)
+        return simulator.rollout(simulator.rest_state(2), steps, inputs).q
 
 
 def _trajectory(simulator: Simulator, steps: int) -> torch.Tensor:

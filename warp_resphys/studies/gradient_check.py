@@ -1,7 +1,7 @@
 """Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -115,7 +115,13 @@ def pose(simulator: Simulator, name: str, batch: int) -> State:
 
 
 def check_gradients(
-    simulator: Simulator, pose_name: str = "bent", steps: int = 3, batch: int = 2, seed: int = 0, change: float = 1.0
+    simulator: Simulator,
+    pose_name: str = "bent",
+    steps: int = 3,
+    batch: int = 2,
+    seed: int = 0,
+    change: float = 1.0,
+    names: Container[str] | None = None,
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
@@ -129,13 +135,14 @@ def check_gradients(
         batch: number of environments.
         seed: of the random directions and functional.
         change: factor of the largest changes; less than one where second derivatives jump, as those of sliders do.
+        names: of the inputs and parameters that are compared, with `q` and `v` of the start; None for all.
 
     Returns:
         A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
         value, as one for each environment, and as one for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed, change)
-    return [problem.compare(*case) for case in problem.cases()]
+    return [problem.compare(*case) for case in problem.cases() if names is None or case[0].partition(",")[0] in names]
 
 
 class _Problem:

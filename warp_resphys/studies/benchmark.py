@@ -5,7 +5,7 @@ The cases of a refinement and the yardstick of `timing` take turns.
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from ..dynamics.assembly import HessianAssembly
 from ..dynamics.nonlinear_solver import SolverName
 from ..dynamics.simulator import Simulator
 from ..experiment.build import build_body, build_simulator, choose_device, finer
+from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.machine import hardware
@@ -29,6 +30,7 @@ from ..io.stages import package_versions
 from ..linalg.threads import threads_for
 from ..settings.body import MaterialSettings, SimulationSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
+from ..settings.obstacles import ContactSettings, ObstacleSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .run_speed import command_sheet, environment_sheet, time_commands, time_environments
@@ -43,7 +45,7 @@ ByRefinement = Annotated[dict[Natural, Natural], Field(min_length=1)]
 
 _MODULI: Final = ("youngs_modulus", "c10", "bulk_1")  # by the first of which gradients are taken
 _SHORT: Final = {"neural_law": "net"}
-_OF_LAWS: Final = "quasi_newton"  # solver with which laws are timed, in the smallest batch
+_FASTEST: Final = "quasi_newton"  # solver with which laws are timed, in the smallest batch, and contact
 
 
 class ElasticConstants(Settings):
@@ -59,6 +61,10 @@ class Batches(Settings):
     cpu: Some[Natural]
     cuda: Some[Natural]
 
+    def on(self, device: str) -> Sequence[int]:
+        """Those of a device."""
+        return self.cuda if device.startswith("cuda") else self.cpu
+
 
 class SolverLimits(Settings):
     """Refinements, batch sizes and steps of one solver, in place of those of all solvers."""
@@ -66,6 +72,14 @@ class SolverLimits(Settings):
     refinements: Some[Natural] | None = None
     batches: Some[Natural] | None = None
     steps: Natural | None = None
+
+
+class ContactRows(Settings):
+    """Obstacles of a body that is timed in contact beside the same one without."""
+
+    obstacles: dict[str, ObstacleSettings]
+    contact: ContactSettings
+    batches: Batches
 
 
 class TimedRun(Settings):
@@ -82,6 +96,7 @@ class BenchmarkSettings(Settings):
     solvers: Some[SolverName]
     materials: Some[ElasticConstants]
     laws: Many[MaterialSettings] = ()
+    contact: ContactRows | None = None
     refinements: Some[Natural]
     batches: Batches
     largest_batch: ByRefinement
@@ -106,7 +121,10 @@ class BenchmarkSettings(Settings):
         limits: SolverLimits = getattr(self, solver)
         if refinement not in (limits.refinements or [refinement]):
             return []
-        batches = limits.batches or (self.batches.cuda if device.startswith("cuda") else self.batches.cpu)
+        return self.fitting(limits.batches or self.batches.on(device), refinement)
+
+    def fitting(self, batches: Sequence[int], refinement: int) -> list[int]:
+        """Batch sizes that fit a GPU at a refinement."""
         return [batch for batch in batches if batch <= _at(self.largest_batch, refinement)]
 
     def steps_of(self, solver: str, refinement: int) -> int:
@@ -122,7 +140,8 @@ class BenchmarkRun(SimulationSettings):
 
 
 # The coarsest mesh and a single environment, twice.
-_QUICK: Final = {"refinements": (1,), "batches": Batches(cpu=(1,), cuda=(1,)), "repeats": 2, "parts_repeats": 10}
+_ONE: Final = Batches(cpu=(1,), cuda=(1,))
+_QUICK: Final = {"refinements": (1,), "batches": _ONE, "repeats": 2, "parts_repeats": 10}
 
 
 @dataclass
@@ -134,6 +153,7 @@ class BenchmarkCase:
     refinement: int  # of the configured box
     batch: int
     timed: TimedRollout
+    touches: bool = False  # whether the body has the obstacles of `ContactRows`
 
     def measure(self) -> None:
         """Times a roll-out, and its gradient with respect to start, force at every step and a modulus."""
@@ -155,6 +175,7 @@ class BenchmarkCase:
             "refinement": self.refinement,
             "unknowns": self.timed.unknowns,
             "batch": self.batch,
+            "contact": self.touches,
             "steps": self.timed.steps,
             "repeats": len(self.timed.forward),
             "plain_ms": 1e3 * plain,
@@ -191,7 +212,10 @@ def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:
     Raises:
         InputError: a configuration that cannot be simulated or refined.
     """
-    timed = settings.benchmark.changed(**_QUICK) if settings.benchmark.quick else settings.benchmark
+    timed = settings.benchmark
+    if timed.quick:
+        contact = timed.contact and timed.contact.changed(batches=_ONE)
+        timed = timed.changed(**_QUICK, contact=contact)
     settings = settings.changed(device=str(choose_device(settings.device)), benchmark=timed)
     # Runs come first: a folder without a run is an error that should not follow minutes of measurements.
     trained, driven, repeats = timed.environments, timed.control.run, timed.repeats
@@ -201,7 +225,7 @@ def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:
     steps: list[dict[str, Any]] = []
     parts: list[dict[str, Any]] = []
     for refinement in timed.refinements:
-        cases = _cases(settings, refinement)
+        cases = benchmark_cases(settings, refinement)
         _take_turns(cases, timed, yardstick)
         steps += [case.row() for case in cases]
         by_batch = {case.batch: case for case in reversed(cases)}
@@ -220,29 +244,46 @@ def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:
     }
 
 
-def _cases(settings: BenchmarkRun, refinement: int) -> list[BenchmarkCase]:
-    """Every combination of solver, material and batch size at a refinement, each warmed up."""
-    timed, body = settings.benchmark, build_body(settings.changed(mesh=_refined(settings, refinement)))
-    tolerances = {"relative_tolerance": timed.relative_tolerance, "max_iterations": timed.max_iterations}
-    cases = []
+def benchmark_cases(settings: BenchmarkRun, refinement: int) -> list[BenchmarkCase]:
+    """Every combination of solver, material and batch size at a refinement, each warmed up; and those in contact."""
+    timed, shape = settings.benchmark, settings.changed(mesh=_refined(settings, refinement))
+    body, cases = build_body(shape), []
     configured = settings.simulation
     materials = [configured.changed(**own.plain()) for own in timed.materials]
     for name in timed.solvers:
-        steps = timed.steps_of(name, refinement)
-        solved = settings.changed(solver=settings.solver.changed(name=name, **tolerances))
-        for number, material in enumerate((*materials, *(timed.laws if name == _OF_LAWS else ()))):
+        for number, material in enumerate((*materials, *(timed.laws if name == _FASTEST else ()))):
             batches = timed.batches_of(name, refinement, settings.device)
             for batch in batches[: None if number < len(materials) else 1]:
-                simulator = build_simulator(solved, material, body)
-                start, inputs = _start(simulator, timed, batch, steps)
-                simulator.rollout(start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}))
-                rollout = TimedRollout(simulator, start, steps, inputs)
-                cases.append(BenchmarkCase(name, material, refinement, batch, rollout))
+                cases.append(_case(settings, name, material, refinement, batch, body))
     if not cases:
         raise InputError(
             f"benchmark.batches and benchmark.largest_batch leave none of refinement {refinement}: name a smaller one."
         )
+    rows = timed.contact
+    if rows is not None and _FASTEST in timed.solvers and settings.chambers is None:
+        touching = build_body(shape.changed(obstacles=rows.obstacles, contact=rows.contact))
+        for batch in timed.fitting(rows.batches.on(settings.device), refinement):
+            cases.append(_case(settings, _FASTEST, materials[0], refinement, batch, touching, touches=True))
     return cases
+
+
+def _case(
+    settings: BenchmarkRun,
+    solver: SolverName,
+    material: MaterialSettings,
+    refinement: int,
+    batch: int,
+    body: Body,
+    touches: bool = False,
+) -> BenchmarkCase:
+    """A case after two steps, which compile its kernels."""
+    timed = settings.benchmark
+    tolerances = {"relative_tolerance": timed.relative_tolerance, "max_iterations": timed.max_iterations}
+    solved, steps = settings.solver.changed(name=solver, **tolerances), timed.steps_of(solver, refinement)
+    simulator = build_simulator(settings.changed(solver=solved), material, body)
+    start, inputs = _start(simulator, timed, batch, steps, touches)
+    simulator.rollout(start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}))
+    return BenchmarkCase(solver, material, refinement, batch, TimedRollout(simulator, start, steps, inputs), touches)
 
 
 def _refined(settings: BenchmarkRun, refinement: int) -> MeshSettings:
@@ -259,11 +300,16 @@ def _refined(settings: BenchmarkRun, refinement: int) -> MeshSettings:
     return settings.mesh
 
 
-def _start(simulator: Simulator, settings: BenchmarkSettings, batch: int, steps: int) -> tuple[State, Inputs]:
-    """Start and inputs of a roll-out: released from a weight or, with chambers, at rest before pressures rise."""
+def _start(
+    simulator: Simulator, settings: BenchmarkSettings, batch: int, steps: int, touches: bool
+) -> tuple[State, Inputs]:
+    """Start and inputs of a roll-out: released from a weight or, with chambers, at rest before pressures rise.
+
+    A body that touches obstacles is lifted by the weight and falls.
+    """
     chambers = simulator.counts.get("pressure", 0)
     if not chambers:
-        return released(simulator, settings.tip_mass, batch), Inputs()
+        return released(simulator, -settings.tip_mass if touches else settings.tip_mass, batch), Inputs()
     phase = simulator.tensor(np.arange(steps)[:, None, None] / steps)
     shift = simulator.tensor(np.arange(chambers) / chambers + 0.1 * np.arange(batch)[:, None])
     pressures = 0.5 * settings.pressure * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))
@@ -276,7 +322,10 @@ def _at(values: Mapping[int, int], refinement: int) -> int:
 
 
 def released(simulator: Simulator, mass: float, batch: int) -> State:
-    """Equilibrium under a mass [kg] on the face of the largest x, lighter in each further environment of a batch."""
+    """Equilibrium under a mass [kg] on the face of the largest x, lighter in each further environment of a batch.
+
+    A negative mass lifts it.
+    """
     x = simulator.rest_positions[:, 0]
     tip = x >= x.max() - 1e-9 * (x.max() - x.min())
     share = tip.to(simulator.dtype) / tip.sum()  # (N,)
@@ -363,12 +412,13 @@ def benchmark_sheets(result: Mapping[str, Any]) -> list[Sheet]:
             "relative": row["forward_ms"] / yardstick,
             "steps_s": 1e3 * row["batch"] / row["plain_ms"],
             "material": row["poissons_ratio"] or _SHORT.get(row["model"], row["model"]),
+            "touches": "yes" if row["contact"] else "",
         }
         for row in result["steps"]
     ]
     columns = (
-        "solver {solver} | nu {material} | unknowns {unknowns} | batch {batch} | plain {plain_ms:.2f} | "
-        "forward {forward_ms:.2f} | backward {backward_ms:.2f} | / yardstick {relative:.2f} | "
+        "solver {solver} | nu {material} | contact {touches} | unknowns {unknowns} | batch {batch} | "
+        "plain {plain_ms:.2f} | forward {forward_ms:.2f} | backward {backward_ms:.2f} | / yardstick {relative:.2f} | "
         "steps/s {steps_s:.0f} | iterations {iterations:.1f} | "
         "factors {factorisations:.2f}"
     )

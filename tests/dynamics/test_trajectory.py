@@ -5,8 +5,22 @@ import meshio
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from warp_resphys import Body, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Box,
+    Contact,
+    HalfSpace,
+    InputError,
+    Inputs,
+    Scene,
+    Simulator,
+    Sphere,
+    Tendons,
+    box_hexahedra,
+    select_vertices,
+)
 from warp_resphys.dynamics.trajectory import Trajectory
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
@@ -44,6 +58,61 @@ def test_a_series_for_paraview_has_every_step(trajectory, tmp_path):
     last = meshio.read(tmp_path / "beam" / "beam_3.vtu")
     assert np.allclose(last.points, trajectory.q[3, 0].numpy())
     assert np.allclose(last.point_data["velocity"], trajectory.v[3, 0].numpy())
+
+
+PLATE = Box(position=(0.09, 0.01, -0.015), edges=(0.02, 0.04, 0.02), moves=True)
+BALL = Sphere(position=(0.05, 0.01, -0.05), radius=0.01)
+
+
+def read_triangles(path, obstacle):
+    """Points (P, 3) and triangles (S, 3) of an obstacle by its number."""
+    file = meshio.read(path)
+    own = np.flatnonzero(file.point_data["obstacle"] == obstacle)
+    (cells,) = (block.data for block in file.cells if block.type == "triangle")
+    return file.points[own], cells[np.isin(cells, own).all(1)] - own[0]
+
+
+def test_obstacles_are_in_the_series_where_they_are_at_the_end_of_every_step(tmp_path):
+    """A plate that rises and turns, and a ball whose place and size are parameters, by environment."""
+    contact = Contact({"ball": BALL, "plate": PLATE})
+    simulator = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=[contact]), time_step=0.01)
+    ways = torch.arange(1, 4, dtype=torch.float64)[:, None, None] * torch.tensor([[0.0, 2e-4], [0.0, 5e-4]])
+    inputs = Inputs(obstacle_move_z=ways, obstacle_rotate_y=-20.0 * ways)
+    given = {"obstacle_x": torch.tensor([[0.0, 0.0], [0.02, 0.0]]), "obstacle_growth": torch.tensor([[2e-3], [0.0]])}
+    given = {name: value.double() for name, value in given.items()}
+    moved = simulator.rollout(simulator.rest_state(2), 3, inputs, given)
+    for environment, way in enumerate((2e-4, 5e-4)):
+        path = moved.write_vtk(tmp_path / f"{environment}.pvd", environment)
+        series = path.with_name(f"{environment}_obstacles.pvd")
+        assert series.read_text(encoding="utf-8").count("<DataSet") == 4
+        for step in range(4):
+            file = tmp_path / series.stem / f"{series.stem}_{step}.vtu"
+            points, triangles = read_triangles(file, 0)
+            centre = np.array(BALL.position) + [0.02 * environment, 0.0, 0.0]
+            radius = BALL.radius + 2e-3 * (1 - environment)
+            assert np.linalg.norm(points - centre, axis=1) == pytest.approx(radius)
+            volume = np.linalg.det((points - centre)[triangles]).sum() / 6.0
+            assert volume == pytest.approx(4.0 / 3.0 * np.pi * radius**3, rel=0.01)
+            points, _ = read_triangles(file, 1)
+            turn = Rotation.from_rotvec([0.0, -20.0 * step * way, 0.0])
+            half = turn.inv().apply(points - PLATE.position - [0.0, 0.0, step * way])
+            size = 0.5 * np.array(PLATE.edges) + 2e-3 * (1 - environment)
+            assert np.allclose(np.abs(half), size)
+
+
+def test_obstacles_of_a_scene_have_the_names_of_their_bodies(tmp_path):
+    floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.01))})
+    bodies = {name: Body(MESH, select_vertices(MESH, x=0.0), energies=[floor]) for name in ("a", "b")}
+    moved = Simulator(Scene(bodies)).rollout(Simulator(Scene(bodies)).rest_state(), 1)
+    assert [motion.name for motion in moved.obstacles] == ["a_floor", "b_floor"]
+    moved.write_vtk(tmp_path / "two.pvd")
+    points, _ = read_triangles(tmp_path / "two_obstacles" / "two_obstacles_1.vtu", 1)
+    assert points[:, 2].max() == pytest.approx(-0.01)
+
+
+def test_a_body_without_obstacles_has_no_file_of_them(trajectory, tmp_path):
+    trajectory.write_vtk(tmp_path / "beam.pvd")
+    assert {path.name for path in tmp_path.iterdir()} == {"beam.pvd", "beam"}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from unittest.mock import MagicMock
 
+import meshio
 import numpy as np
 import pytest
 import torch
@@ -165,6 +166,32 @@ def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
     for _ in range(12):
         state, again = robot.step(state), loaded.step(again)
     np.testing.assert_array_equal(again.q, state.q)
+
+
+def test_files_of_a_motion_have_the_obstacle_where_identification_put_it(robot, tmp_path):
+    motion = robot.rollout(robot.begin(), 2)
+    motion.write_vtk(tmp_path / "beam.pvd")
+    plate = meshio.read(tmp_path / "beam_obstacles" / "beam_obstacles_2.vtu")
+    assert plate.points[:, 2].max() == pytest.approx(-4e-3)
+    assert len(plate.cells_dict["triangle"]) == 12
+
+
+def test_a_scene_in_usd_has_the_obstacle(robot, tmp_path):
+    pytest.importorskip("pxr", reason="the extra usd is not installed")
+    from pxr import Usd, UsdGeom
+
+    motion = robot.rollout(robot.begin(), 2)
+    stage = Usd.Stage.Open(str(motion.write_usd(tmp_path / "beam.usda")))
+    plate = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/obstacles/floor"))
+    points = np.array(plate.GetPointsAttr().Get(2.0))
+    assert points[:, 2].max() == pytest.approx(-4e-3)
+    corners = points[np.array(plate.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)]
+    volume = np.linalg.det(corners.astype(float)).sum() / 6.0
+    assert volume == pytest.approx(np.ptp(points.astype(float), axis=0).prod(), rel=1e-4)
+    body = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/body"))
+    np.testing.assert_allclose(
+        np.array(body.GetPointsAttr().Get(2.0))[:, 2].min(), motion.q[2, 0, :, 2].min(), atol=1e-6
+    )
 
 
 def test_an_environment_steps_and_draws_with_obstacles():

@@ -14,6 +14,7 @@ import torch
 from ..energies.base import BoundEnergy, EnergySite, Memory, Term
 from ..energies.contact import BoundContact, ContactForces
 from ..energies.explicit import ExplicitEnergy
+from ..energies.obstacle_surfaces import ObstacleMotion
 from ..energies.placed import PlacedEnergy
 from ..energies.surfaces import BoundSurfaceContact, SurfaceForces
 from ..fem.body import Body
@@ -184,6 +185,16 @@ class EnergySet:
                 )
                 out[name] = bound.forces(placed.step(state, stage, inputs, constants, terms[i]), x)
         return out
+
+    def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
+        """Returns the motions of all obstacles in successive states, with the prefixes of their energies."""
+        motions: list[ObstacleMotion] = []
+        for placed, bound in self._pairs:
+            if isinstance(bound, BoundContact):
+                seen = [replace(state, memory=placed.own(state.memory)) for state in states]
+                own = bound.motions(seen, placed.own_constants(constants))
+                motions += [replace(motion, name=f"{placed.prefix}{motion.name}") for motion in own]
+        return tuple(motions)
 
     @staticmethod
     def _remembered(

@@ -11,6 +11,7 @@ import torch
 from ..energies.contact import ContactForces
 from ..energies.explicit import ExplicitEnergy
 from ..energies.materials import Corotated, Material
+from ..energies.obstacle_surfaces import ObstacleMotion
 from ..energies.placement import Materials, joined_names, place_energies
 from ..energies.surfaces import SurfaceForces
 from ..fem.body import Body
@@ -316,6 +317,17 @@ class Simulator:
         terms, stage = self.workspace(state.batch).potential.energies, self.method.stage(state, self.time_step)
         return self._energies.contacts(state, stage, inputs, constants, terms, after.q)
 
+    def obstacle_motions(
+        self, states: Sequence[State], parameters: Parameters | Constants | None = None
+    ) -> tuple[ObstacleMotion, ...]:
+        """Returns the motions of obstacles, if there are any, in successive states of a roll-out.
+
+        Args:
+            states: states, whose memory has the poses of obstacles that move.
+            parameters: parameters or prepared constants (`prepare`).
+        """
+        return self._energies.obstacles(states, self.prepare(parameters))
+
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> Linearisation:
@@ -458,7 +470,8 @@ class Simulator:
                     check_converged(self.settings, *solved)
                 unchecked.clear()
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
-        return Trajectory(q, v, reports, state, self.body, self.time_step)
+        obstacles = self.obstacle_motions(states, constants)
+        return Trajectory(q, v, reports, state, self.body, self.time_step, obstacles)
 
     def _checked(
         self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None

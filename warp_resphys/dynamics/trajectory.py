@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from ..energies.obstacle_surfaces import ObstacleMotion
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create
@@ -26,6 +27,7 @@ class Trajectory:
     final: State  # last state, from which another roll-out can continue
     body: Body
     time_step: float  # [s]
+    obstacles: tuple[ObstacleMotion, ...] = ()
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -83,7 +85,8 @@ class Trajectory:
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
-        The vertices have ``displacement`` and ``velocity``.
+        The vertices have ``displacement`` and ``velocity``. Obstacles are in ``NAME_obstacles.pvd``, a half-space as a
+        plate.
 
         Args:
             path: path of the ``.pvd`` file.
@@ -95,7 +98,8 @@ class Trajectory:
         """
         self._check(environment)
         q, v = (_array(values[:, environment]) for values in (self.q, self.v))
-        return write_vtk(Path(path), self.body.mesh, self.times, q, v, q[:, :0])
+        obstacles = [motion.surface(environment) for motion in self.obstacles]
+        return write_vtk(Path(path), self.body.mesh, self.times, q, v, q[:, :0], obstacles)
 
     def _check(self, environment: int) -> None:
         if not 0 <= environment < self.q.shape[1]:

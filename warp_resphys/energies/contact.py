@@ -46,8 +46,10 @@ from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
+from ..stepping.state import State
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
+from .obstacle_surfaces import ObstacleMotion
 from .obstacles import DistanceGrid, Obstacle, ObstacleSet, Pose
 
 log = logging.getLogger(__name__)
@@ -270,6 +272,16 @@ class BoundContact(BoundEnergy):
         else:
             values = [constants.value(name) for name in names]
         return Pose(*(value.expand(batch, *value.shape[1:]) for value in values))
+
+    def motions(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
+        """Returns the motions of the obstacles in successive states, at the ends of the steps that lead to them."""
+        still, poses = self._pose(Inputs(), constants, states[0].batch), []
+        for memory in (state.memory for state in states):
+            poses.append(Pose(memory.get(POSE[0], still.place), memory.get(POSE[1], still.turn), still.growth))
+        return tuple(
+            ObstacleMotion(name, obstacle, self.site.body.vertices, tuple(pose.of(k) for pose in poses))
+            for k, (name, obstacle) in enumerate(self._contact.obstacles.items())
+        )
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:

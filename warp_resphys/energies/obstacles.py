@@ -276,6 +276,10 @@ class Pose:
     turn: torch.Tensor
     growth: torch.Tensor
 
+    def of(self, number: int) -> "Pose":
+        """Returns the poses of one obstacle."""
+        return Pose(*(value[:, number, None] for value in (self.place, self.turn, self.growth)))
+
     def local(self, x: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, P, O, 3) in the axes of the obstacles, from those in the world."""
         return torch.einsum("boji,bpoj->bpoi", self.turn, x - self.place[:, None])

@@ -3,6 +3,7 @@
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -19,6 +20,21 @@ FloatArray = NDArray[np.float64]
 
 _USD = (".usd", ".usda", ".usdc")
 _MARKER_SHARE = 0.02  # diameter of a marker, over the body's size
+
+
+@dataclass(frozen=True, eq=False)
+class MovingSurface:
+    """A surface that moves in space.
+
+    Attributes:
+        name: of the thing whose surface it is.
+        points: (T + 1, P, 3) corners [m].
+        triangles: (S, 3) counter-clockwise seen from outside.
+    """
+
+    name: str
+    points: FloatArray
+    triangles: NDArray[np.int64]
 
 
 def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
@@ -46,7 +62,15 @@ def write_csv(
     return path
 
 
-def write_vtk(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, v: FloatArray, markers: FloatArray) -> Path:
+def write_vtk(
+    path: Path,
+    mesh: Mesh,
+    times: FloatArray,
+    q: FloatArray,
+    v: FloatArray,
+    markers: FloatArray,
+    obstacles: Sequence[MovingSurface] = (),
+) -> Path:
     """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
     Args:
@@ -56,6 +80,7 @@ def write_vtk(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, v: Float
         q: (T + 1, N, 3) positions of the vertices [m].
         v: (T + 1, N, 3) velocities [m/s].
         markers: (T + 1, M, 3) markers, written to ``NAME_markers.pvd`` unless M is 0 [m].
+        obstacles: surfaces, written to ``NAME_obstacles.pvd`` if there are any, numbered by ``obstacle``.
     """
     if path.suffix != ".pvd":
         raise InputError(f"{path} does not end in .pvd: give such a name, which ParaView opens as a time series.")
@@ -65,6 +90,13 @@ def write_vtk(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, v: Float
     if len(dots):
         place = path.with_name(f"{path.stem}_markers.pvd")
         _write_series(place, times, markers, ("vertex", dots[:, None]), ({"marker": dots} for _ in times))
+    if obstacles:
+        sizes = [surface.points.shape[1] for surface in obstacles]
+        firsts, number = np.cumsum([0, *sizes[:-1]]), np.repeat(np.arange(len(sizes)), sizes)
+        triangles = np.concatenate([own.triangles + first for own, first in zip(obstacles, firsts, strict=True)])
+        points = np.concatenate([surface.points for surface in obstacles], axis=1)
+        place = path.with_name(f"{path.stem}_obstacles.pvd")
+        _write_series(place, times, points, ("triangle", triangles), ({"obstacle": number} for _ in times))
     return path
 
 
@@ -88,12 +120,22 @@ def _write_series(
     write_text(path, "\n".join([*lines, "  </Collection>", "</VTKFile>", ""]))
 
 
-def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers: FloatArray) -> Path:
-    """Writes the surface of a body and its markers with their motion to a USD file; arrays as in `write_vtk`."""
+def write_usd(
+    path: Path,
+    mesh: Mesh,
+    times: FloatArray,
+    q: FloatArray,
+    markers: FloatArray,
+    obstacles: Sequence[MovingSurface] = (),
+) -> Path:
+    """Writes the surfaces of a body and its obstacles, and its markers, with their motion to a USD file.
+
+    Arrays are as in `write_vtk`; an obstacle is the mesh ``/robot/obstacles/NAME``.
+    """
     if path.suffix not in _USD:
         raise InputError(f"{path} does not end in {', '.join(_USD)}: give such a name.")
     try:
-        from pxr import Usd, UsdGeom, Vt
+        from pxr import Tf, Usd, UsdGeom, Vt
     except ImportError:
         raise InputError("USD files need a package that is not installed: pip install 'warp-resphys[usd]'.") from None
     surface = surface_vertices(mesh)
@@ -108,11 +150,17 @@ def write_usd(path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers:
     stage.SetEndTimeCode(len(q) - 1.0)
     root = UsdGeom.Xform.Define(stage, "/robot")
     stage.SetDefaultPrim(root.GetPrim())
-    body = UsdGeom.Mesh.Define(stage, "/robot/body")
-    body.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    body.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, dtype=np.int32)))
-    body.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
-    surfaces = [(body, q[:, surface])]
+    meshes = {"/robot/body": MovingSurface("body", q[:, surface], triangles)}
+    meshes |= {f"/robot/obstacles/{Tf.MakeValidIdentifier(own.name)}": own for own in obstacles}
+    if obstacles:
+        UsdGeom.Xform.Define(stage, "/robot/obstacles")
+    surfaces: list[tuple[Any, FloatArray]] = []
+    for place, own in meshes.items():
+        shape = UsdGeom.Mesh.Define(stage, place)
+        shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(own.triangles), 3, dtype=np.int32)))
+        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(own.triangles.astype(np.int32).ravel()))
+        surfaces.append((shape, own.points))
     if markers.shape[1]:
         dots = UsdGeom.Points.Define(stage, "/robot/markers")
         size = _MARKER_SHARE * float(np.ptp(mesh.vertices, axis=0).max())

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..energies.obstacle_surfaces import ObstacleMotion
 from ..io.errors import InputError
 from ..learning.replay import sample
-from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
+from ..mesh.motion_files import MovingSurface, input_columns, write_csv, write_usd, write_vtk
 from .description import Description
 from .inputs import RobotInput
 from .state import RobotState
@@ -35,6 +36,7 @@ class Motion:
         inputs: (T, B, C) commands, by name.
         known_inputs: declarations of the robot's inputs, by name.
         final: the last state, from which another roll-out can continue.
+        obstacles: motions of the obstacles that the robot touches.
     """
 
     robot: Description
@@ -48,6 +50,7 @@ class Motion:
     inputs: Mapping[str, torch.Tensor]
     known_inputs: Mapping[str, RobotInput]
     final: RobotState
+    obstacles: tuple[ObstacleMotion, ...] = ()
 
     def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:
         """Interpolates the markers at other times (F,) [s]; returns (F, B, M, 3), by cubic interpolation [m]."""
@@ -87,7 +90,8 @@ class Motion:
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with a file for each step.
 
-        The vertices have ``displacement`` and ``velocity``; markers are in ``NAME_markers.pvd``.
+        The vertices have ``displacement`` and ``velocity``; markers are in ``NAME_markers.pvd``, and obstacles
+        in ``NAME_obstacles.pvd``, a half-space as a plate.
 
         Args:
             path: of the ``.pvd`` file.
@@ -98,11 +102,11 @@ class Motion:
             DataFileError: the files cannot be written.
         """
         self._check(environment)
-        series = (_array(values, environment) for values in (self.q, self.v, self._labelled))
-        return write_vtk(Path(path), self.robot.mesh, self.times, *series)
+        q, v, markers = (_array(values, environment) for values in (self.q, self.v, self._labelled))
+        return write_vtk(Path(path), self.robot.mesh, self.times, q, v, markers, self._surfaces(environment))
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
-        """Writes the moving surface and markers of the body to a USD file; needs the extra ``usd``.
+        """Writes the moving surfaces of the body and its obstacles, and its markers, to a USD file (extra ``usd``).
 
         Args:
             path: of the ``.usd``, ``.usda`` or ``.usdc`` file.
@@ -113,8 +117,12 @@ class Motion:
             DataFileError: the file cannot be written.
         """
         self._check(environment)
-        series = (_array(values, environment) for values in (self.q, self._labelled))
-        return write_usd(Path(path), self.robot.mesh, self.times, *series)
+        q, markers = (_array(values, environment) for values in (self.q, self._labelled))
+        return write_usd(Path(path), self.robot.mesh, self.times, q, markers, self._surfaces(environment))
+
+    def _surfaces(self, environment: int) -> list[MovingSurface]:
+        """Surfaces of the obstacles."""
+        return [motion.surface(environment) for motion in self.obstacles]
 
     @property
     def _labelled(self) -> torch.Tensor:

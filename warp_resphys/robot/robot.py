@@ -364,6 +364,7 @@ class Robot:
             inputs=driven,
             known_inputs=self.inputs,
             final=state,
+            obstacles=self.simulator.obstacle_motions([state.body for state in states], self.constants),
         )
 
     def twin(

@@ -23,7 +23,7 @@ class Friction:
 
     coefficient: wp.array2d[wp.float64]  # (B, O) mu
     slip: wp.array2d[wp.float64]  # (B, 1) slide at which friction is fully developed [m]
-    load: wp.array3d[wp.float64]  # normal force at the start [N]
+    load: wp.array3d[wp.float64]  # normal force at the start [N], times the factor of the point's region
     normal: wp.array3d[wp.vec3d]  # normal at the start
     reference: wp.array3d[wp.vec3d]  # position without slide [m]
 

@@ -21,12 +21,14 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.energies.contact import Contact, vertex_areas
+from warp_resphys.energies.contact import Contact, vertex_areas, vertex_factors
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
 from warp_resphys.io.errors import InputError
+from warp_resphys.mesh.mesh import select_cells
 from warp_resphys.studies.contact_check import BLOCK, KAPPA, SIDE, SOFT, D, G, resting_floor, total_energy
 
 CPU = torch.device("cpu")
+TIGHT = SolverSettings("newton", relative_tolerance=1e-13)
 DENSITY = 1070.0
 GROOVE = {"left": 0.6, "right": -0.4}
 PLACED = {"position": (0.004, -0.003, 0.002), "axis": (0.3, -0.2, 0.9)}
@@ -198,6 +200,42 @@ def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
     assert not bool(new.sticks[1].any())
 
 
+HALVES = Mesh(
+    BLOCK.vertices,
+    BLOCK.cells,
+    {"left": select_cells(BLOCK, x=(0.0, 0.01)), "top": select_cells(BLOCK, z=(0.01, SIDE))},
+)
+
+
+def test_friction_of_a_region_of_the_body():
+    """Factors of 3 and 1: vertices within the region, beside it and between them have three, one and two times mu."""
+    factors = vertex_factors(HALVES, {"left": 3.0})
+    x = HALVES.vertices[:, 0]
+    assert factors == pytest.approx(np.where(x < 0.009, 3.0, np.where(x > 0.011, 1.0, 2.0)))
+    mu, floor = 0.2, resting_floor(DENSITY * SIDE**3 * G)
+    contact = Contact({"floor": floor}, KAPPA, mu, D, 1e-3, {"left": 3.0})
+    s = Simulator(Body(HALVES, energies=[contact]), SOFT, 5e-3, solver=TIGHT)
+    start = s.rest_state()
+    states = [State(start.q, start.v + vector(0.5, 0.0, 0.0))]
+    for _ in range(3):
+        states.append(s.step(states[-1])[0])
+    earlier, before, after = states[-3:]
+    old, new = (s.contacts(*pair)[""] for pair in ((earlier, before), (before, after)))
+    normal, friction = old.normal[0, :, 0, 2].numpy(), new.friction[0, :, 0].norm(dim=-1).numpy()
+    pressed = normal > 0.0
+    assert pressed.sum() == 9
+    assert friction[pressed] == pytest.approx((mu * factors[new.vertices] * normal)[pressed], rel=1e-6)
+    force = (s.prepare().mass[..., None] * (after.v - before.v) / 5e-3).sum(1)[0, 0]
+    assert float(force) == pytest.approx(-float(mu * (factors[new.vertices] * normal).sum()), rel=1e-6)
+
+
+def test_regions_of_friction_that_do_not_fit():
+    with pytest.raises(InputError, match=r"friction_factors: the mesh has no region 'foot'; it has left, top"):
+        vertex_factors(HALVES, {"foot": 2.0})
+    with pytest.raises(InputError, match="'top' shares cells with another region"):
+        vertex_factors(HALVES, {"left": 2.0, "top": 0.5})
+
+
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_block_that_is_thrown_at_a_shape_does_not_penetrate(shape, integrator, device):
@@ -320,9 +358,6 @@ def test_a_floor_that_moves_carries_a_block(integrator):
     q, v = turned.q[-1, 0, bottom], turned.v[-1, 0, bottom]
     expected = torch.linalg.cross(vector(0.0, 0.0, rate).expand_as(q), q)
     assert v[:, :2].numpy() == pytest.approx(expected[:, :2].numpy(), abs=1e-3)
-
-
-TIGHT = SolverSettings("newton", relative_tolerance=1e-13)
 
 
 def compare(losses, values, sizes, seed=3):
@@ -500,6 +535,7 @@ def test_values_by_the_name_of_an_obstacle():
         (lambda: Contact(TWO, friction={"a": 0.1, "b": -0.2}), "contact_friction is -0.2"),
         (lambda: Contact({"a": HalfSpace()}, distance=0.0), "contact.distance is 0: it must be positive"),
         (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
+        (lambda: Contact({"a": HalfSpace()}, friction_factors={"foot": -1.0}), "friction_factors.foot is -1"),
         (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be positive"),
         (lambda: Capsule(radius=0.1, length=0.0), "Capsule.length is 0.0"),
         (lambda: Cylinder(radius=math.inf, length=0.1), "Cylinder.radius is inf"),

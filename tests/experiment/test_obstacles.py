@@ -57,6 +57,22 @@ def test_every_shape_is_built_with_its_own_friction():
     assert (contact.stiffness, contact.distance, contact.slip_speed) == (5e4, 2e-3, 1e-3)
 
 
+def test_regions_of_the_body_have_factors_of_friction():
+    run = settings(
+        "mesh.divisions=[10,3,3]",
+        f"obstacles={FLOOR}",
+        "+regions={foot: {x: [0.09, 0.1]}}",
+        "contact={friction: 0.2, friction_factors: {foot: 3.0}}",
+    )
+    body = build_body(run)
+    (contact,), x = body.energies, body.vertices[:, 0]
+    (points,) = contact.points(body.mesh)
+    vertices = points.nodes[:, 0]
+    assert points.factors == pytest.approx(np.where(x > 0.095, 3.0, np.where(x > 0.085, 2.0, 1.0))[vertices])
+    with pytest.raises(InputError, match="no region 'hand'"):
+        build_simulator(run.changed(contact=run.contact.changed(friction_factors={"hand": 1.0})), run.simulation)
+
+
 def test_without_obstacles_there_is_no_contact():
     assert build_body(settings(BEAM)).energies == ()
 

@@ -27,7 +27,7 @@ M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4)
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -38,7 +38,7 @@ from typing_extensions import override
 
 from ..fem.body import Body
 from ..fem.elements import Points
-from ..io.errors import InputError, listed
+from ..io.errors import InputError, MeshError, listed
 from ..kernels import contact as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces, face_triangles
@@ -75,6 +75,7 @@ class ContactPoints(Points):
     """Vertices of a surface."""
 
     areas: NDArray[np.float64]  # (P,) [m^2]
+    factors: NDArray[np.float64]  # (P,) of friction
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Contact(Energy):
     its surface lies further out [m], ``obstacle_x``, ``_y`` and ``_z``, by which it lies elsewhere [m], and
     ``obstacle_turn_x``, ``_y`` and ``_z``, a rotation vector about its position [rad]. Inputs, if an obstacle moves,
     are `MOTION`, its pose at the end of a step relative to the configured one, which add to the last six. The points
-    are the vertices of the surface.
+    are the vertices of the surface, at which friction is multiplied by the factor of their region.
 
     Raises:
         InputError: no obstacle, a value out of range, or values that do not fit the obstacles.
@@ -98,6 +99,7 @@ class Contact(Energy):
     friction: Parameter | Mapping[str, float] = 0.0  # mu, likewise
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
+    friction_factors: Mapping[str, float] = field(default_factory=dict)  # of the friction of regions of the mesh
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -106,6 +108,9 @@ class Contact(Energy):
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")
+        for region, factor in self.friction_factors.items():
+            if not (math.isfinite(factor) and factor >= 0.0):
+                raise InputError(f"contact.friction_factors.{region} is {factor:g}: it must be zero or more.")
         for name, quantity in (("stiffness", STIFFNESS), ("friction", FRICTION)):
             values = self._by_obstacle(name)
             quantity.check(values)
@@ -159,7 +164,8 @@ class Contact(Energy):
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
         areas = vertex_areas(mesh)
         vertices = np.flatnonzero(areas)
-        return (ContactPoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), areas[vertices]),)
+        factors = vertex_factors(mesh, self.friction_factors)[vertices]
+        return (ContactPoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), areas[vertices], factors),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "ContactTerm":
@@ -182,6 +188,26 @@ def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
     sizes = np.linalg.norm(np.cross(tangents[..., 0, :], tangents[..., 1, :]), axis=-1) * weights
     np.add.at(areas, faces, np.einsum("fq,qk->fk", sizes, values))
     return areas
+
+
+def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float64]:
+    """Returns the factor of friction at every vertex, (N,): the mean of its cells', which is one outside all regions.
+
+    Raises:
+        InputError: the mesh has no such region, or a cell is in two of them.
+    """
+    own, named = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells), dtype=bool)
+    for name, factor in factors.items():
+        try:
+            cells = mesh.region(name)
+        except MeshError as error:
+            raise InputError(f"contact.friction_factors: {error}") from None
+        if named[cells].any():
+            raise InputError(f"contact.friction_factors: {name!r} shares cells with another region: leave one out.")
+        own[cells], named[cells] = factor, True
+    corners, size = mesh.cells.ravel(), len(mesh.vertices)
+    counts = np.bincount(corners, minlength=size).clip(1)
+    return np.asarray(np.bincount(corners, np.repeat(own, mesh.cells.shape[1]), size) / counts)
 
 
 @dataclass(frozen=True)
@@ -225,6 +251,7 @@ class BoundContact(BoundEnergy):
         assert isinstance(points, ContactPoints)
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
         self._area = site.tensor(points.areas)
+        self._factor = site.tensor(points.factors)  # (P,) of friction
         self._shapes = ObstacleSet(obstacles, contact.distance, like.device)
         self._place = site.tensor(np.array([o.position for o in obstacles]))
         self._turn = site.tensor(np.stack([o.turn for o in obstacles]))
@@ -310,7 +337,7 @@ class BoundContact(BoundEnergy):
         length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {
-            "contact_load": self._load(d, step.constants) * length[..., 0],
+            "contact_load": self._load(d, step.constants) * length[..., 0] * self._factor[:, None],
             "contact_normal": n / length,
             "contact_reference": reference,
             "contact_slip": x.new_full((state.batch, 1), self._contact.slip_speed * duration),

@@ -86,3 +86,4 @@ class ContactSettings(Settings):
     )
     distance: Positive = setting(1.0e-3, "at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")
+    friction_factors: dict[str, NotNegative] = setting({}, "factors of the friction of regions of the mesh, by name")

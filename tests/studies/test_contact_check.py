@@ -76,6 +76,10 @@ def test_the_smallest_check_passes_and_writes_a_page(folder):
         "Thrown blocks",
         "Closing plates",
         "Energy",
+        "A body on a slope",
+        "Bodies thrown at one another",
+        "Momentum of bodies",
+        "An arch",
     ):
         assert title in text
     assert "warp-resphys verify contact" in text

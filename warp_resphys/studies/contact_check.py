@@ -7,6 +7,7 @@ stopping            a sliding block comes to rest after v^2 / (2 mu g)
 sphere, cylinder    are pressed into a bonded layer with the forces of theory (`indentation`)
 throws, plates      no vertex of a surface penetrates, and every solve converges
 energy              implicit Euler gains none
+bodies              on one another (`surface_check`)
 ==================  ==================================================================================================
 """
 
@@ -40,6 +41,7 @@ from ..io.settings import Count, Natural, Positive, Settings, Some, Word, settin
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
+from . import surface_check
 from .beam import beam_mesh, clamped
 from .device_check import Check, run_checks
 from .indentation import DEPTHS, cylinder_errors, measured, pressure, sphere_error
@@ -79,6 +81,8 @@ class ContactStudy(Settings):
     seed: Count
     cells: Some[Positive] = setting(unit="m")
     cylinder_cells: Some[Positive] = setting(unit="m")
+    body_throws: Natural
+    stones: Annotated[int, Field(ge=5)]
     batches: Some[Natural]
     repeats: Natural
     results: Word | None
@@ -87,7 +91,7 @@ class ContactStudy(Settings):
     def chosen(self) -> "ContactStudy":
         """The settings, or their quick form."""
         small = {"frictions": self.frictions[:1], "degrees": 2, "throws": 20, "cells": self.cells[:1]}
-        small |= {"cylinder_cells": self.cylinder_cells[:1]}
+        small |= {"cylinder_cells": self.cylinder_cells[:1], "body_throws": 4, "stones": 5}
         return self.changed(**small, batches=self.batches[:1], repeats=1) if self.quick else self
 
 
@@ -109,6 +113,13 @@ def contact_check(settings: ContactStudy, folder: Path) -> None:
         "Energy": energy_checks,
     }
     sections = [run_checks(title, partial(checks, study, device)) for title, checks in work.items()]
+    between = {
+        "A body on a slope": partial(surface_check.slope_checks, study.quick, device),
+        "Bodies thrown at one another": partial(surface_check.throw_checks, study.body_throws, study.seed, device),
+        "Momentum of bodies": partial(surface_check.momentum_checks, device),
+        "An arch": partial(surface_check.arch_checks, study.stones, device),
+    }
+    sections += [run_checks(title, checks) for title, checks in between.items()]
     times = time_sheet(study, device)
     show(times)
     count = sum(len(section.checks) for section in sections)

@@ -96,7 +96,7 @@ def throw_checks(throws: int, seed: int, device: torch.device) -> Iterator[Check
                 most = max(most, new[2])
                 progress.advance()
             title = f"D {1e3 * distance:g} mm, {str(dtype).removeprefix('torch.')}: {each} throws"
-            result = f"{hits} hits, {crossings} crossings, {failed} failed, {most} iterations at most"
+            result = f"{hits} hit, {crossings} crossings, {failed} failed, {most} iterations at most"
             yield Check(title, result, "0 crossings, 0 failed", crossings == failed == 0)
 
 

@@ -500,6 +500,8 @@ def bound(
     if kind == EDGE_EDGE:
         most = wp.max(w0, w1) + last
     whole = share[b]
+    if apart(kind, x, most * whole / (ONE - KEPT)):
+        return
     d = nearest(kind, 0, x).d
     kept = KEPT * d
     t = wp.float64(0.0)

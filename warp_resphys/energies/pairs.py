@@ -127,9 +127,8 @@ class PairList:
         self._local = torch.full((n,), -1, device=device)
         self._local[self.vertices] = torch.arange(len(self.vertices), device=device)
         extent = np.ptp(surface.rest[surface.vertices], axis=0)
-        lengths = np.linalg.norm(surface.rest[surface.edges[:, 0]] - surface.rest[surface.edges[:, 1]], axis=1)
         self.longest_way = 0.1 * float(np.linalg.norm(extent))  # of a vertex at a time [m]
-        self._least_radius = max(reach, 0.1 * float(lengths.mean()))
+        self._least_radius = 0.5 * reach
         self._capacity, self.version, self.count = _FIRST_CAPACITY, 0, 0
         self._origin: torch.Tensor | None = None
         self._outer = self._inner = launcher.zeros(n)

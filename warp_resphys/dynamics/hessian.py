@@ -118,7 +118,7 @@ class ExactHessian(HessianApproximation):
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         self._factor.solve_in_place(right.flatten(1))
-        if self._potential.couples_cells:
+        if self._potential.has_pairs:
             self._correct(right.flatten(1)[:, :, None], self.linear.dofs, clamp=True)
 
     def _correct(self, x: torch.Tensor, order: torch.Tensor, clamp: bool) -> None:
@@ -159,7 +159,7 @@ class ExactHessian(HessianApproximation):
             raise RuntimeError("refactor before solve")
         out = torch.zeros_like(right)
         x = self._factor.solve(right[:, self._dofs].to(self.linear.dtype))
-        if self._potential.couples_cells:
+        if self._potential.has_pairs:
             self._correct(x, torch.arange(x.shape[1], device=x.device), clamp=False)
         out[:, self._dofs] = x.to(right.dtype)
         return out

@@ -322,9 +322,11 @@ class Term(ABC):
 
     Attributes:
         couples_cells: whether the term may have `low_rank` columns or `pair_tangents`.
+        has_pairs: whether it may have the latter.
     """
 
     couples_cells = False
+    has_pairs = False
     _kernels: Any  # with ``local_step`` and ``tangent``
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:

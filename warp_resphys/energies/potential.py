@@ -260,6 +260,11 @@ class IncrementalPotential(Launcher):
         return any(term.couples_cells for term in self.energies)
 
     @property
+    def has_pairs(self) -> bool:
+        """Whether there may be `pair_tangents`."""
+        return any(term.has_pairs for term in self.energies)
+
+    @property
     def tangents(self) -> list[torch.Tensor]:
         """Blocks of dP/dF (B, P, blocks, 3, 3) [J] for each of `sets` (``kernels``), from the last `update_tangent`."""
         return self._prepare_tangents()

@@ -71,7 +71,7 @@ class SurfaceTerm(Term):
         reach: distance at which contact begins [m].
     """
 
-    couples_cells = True
+    couples_cells = has_pairs = True
     _kernels = kernels
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], reach: float) -> None:

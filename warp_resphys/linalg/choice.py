@@ -39,8 +39,11 @@ def make_linear_solver(
     device: torch.device,
     dtype: torch.dtype,
     positions: NDArray[np.float64] | None = None,
+    direct: bool = False,
 ) -> LinearSolver:
     """Returns the named solver; ``auto`` selects the cheapest for the pattern and the device.
+
+    With `direct` it selects none that iterates, which would be dear for many right-hand sides of a factor.
 
     Raises:
         InputError: an unknown name, or a banded solver on a GPU.
@@ -51,6 +54,7 @@ def make_linear_solver(
         raise InputError(f"linear_solver={name} runs on the CPU alone: choose tiled, dense, sparse or auto on a GPU.")
     if name == "auto":
         name = _cheapest(rows, cols, n_nodes, block, device)
+        name = "sparse" if direct and name == "multigrid" else name
     solvers: dict[str, Callable[..., LinearSolver]] = {
         "banded": BandedSolver,
         "bordered": BorderedSolver,

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -18,15 +18,19 @@ from ..energies.base import Energy
 from ..energies.catalogue import make_material
 from ..energies.contact import Contact
 from ..energies.obstacles import Box, Cylinder, DistanceGrid
+from ..energies.surfaces import SurfaceContact
 from ..experiment.build import choose_device
 from ..experiment.files import METRICS
+from ..fem.body import Body
+from ..fem.scene import Scene
 from ..io.errors import ResphysError
 from ..io.files import write_json
 from ..io.settings import Many, Natural, Positive, Settings, Word
 from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
-from ..mesh.mesh import Mesh
+from ..mesh.mesh import Mesh, select_vertices
 from ..stepping.inputs import Inputs
+from ..stepping.state import State
 from .beam import ELEMENT_NAMES, Divisions, Element, beam_mesh, clamped
 from .benchmark import BenchmarkRun, benchmark_sheets, machine, run_benchmark
 from .gradient_check import check_gradients, pose
@@ -157,7 +161,7 @@ def trajectory_checks(
 def contact_checks(
     device: torch.device, steps: int, bounds: Mapping[torch.dtype, float] = POSITION_BOUND
 ) -> Iterator[Check]:
-    """Compares beams between obstacles, with friction, with those on the CPU, and their gradients with differences."""
+    """Compares beams between obstacles and on one another with those on the CPU, and gradients with differences."""
     solvers = [name for name in SOLVERS if name != "projective_dynamics"]  # it has no contact
     beam = partial(beam_between_obstacles, moves=True)
     yield from _compared("positions", beam, partial(pushed, steps=steps), device, solvers, bounds)
@@ -166,6 +170,11 @@ def contact_checks(
     own = {"q", "v", *(name for name in resting.parameters if name.startswith(("contact_", "obstacle_")))}
     measure = partial(_largest_error, resting, "rest", steps=2, change=_CHANGE, names=own)
     yield bounded("gradients", measure, GRADIENT_BOUND)
+    yield from _compared("two beams", beam_on_beam, partial(sliding, steps=steps), device, solvers, bounds)
+    upper = beam_on_beam(solver=solver, device=device)
+    own = {"q", "v", "surface_stiffness", "surface_friction"}
+    measure = partial(_largest_error, upper, "rest", steps=2, change=_CHANGE, names=own)
+    yield bounded("gradients of two beams", measure, GRADIENT_BOUND)
 
 
 def _compared(
@@ -268,6 +277,25 @@ def beam_between_obstacles(moves: bool, **options: Any) -> Simulator:
     contact = Contact(obstacles, stiffness=1e5, friction={"bar": 0.3, "plate": 0.6, "ball": 0.2}, slip_speed=2e-2)
     mesh = beam_mesh("hexahedron8", (0.1, 0.03, 0.03), (6, 2, 2))
     return _beam(mesh, 0.45, [contact], gravity=(1.0, 4.0, -9.0), **options)
+
+
+def beam_on_beam(**options: Any) -> Simulator:
+    """A beam that its weight presses on a thicker one and along it, with friction."""
+    upper, lower = (beam_mesh("hexahedron8", (0.1, 0.03, z), (4, 1, 1)) for z in (0.03, 0.05))
+    below = replace(lower, vertices=lower.vertices + [0.0013, 0.0017, -0.0507])
+    bodies = {"upper": clamped(upper), "lower": Body(below, fixed=select_vertices(below, x=0.0013))}
+    scene = Scene(bodies, SurfaceContact(stiffness=1e5, friction=0.3, slip_speed=2e-2))
+    material = make_material("corotated", **_MATERIAL, poissons_ratio=0.45)
+    return Simulator(scene, material, 0.01, (1.0, 4.0, -9.0), **options)
+
+
+def sliding(simulator: Simulator, steps: int) -> torch.Tensor:
+    """Positions (T + 1, 2, N, 3) [m] of bodies that begin at rest, and with a speed."""
+    rest = simulator.rest_state(2)
+    speed = simulator.tensor([[0.0, 0.0, 0.0], [0.0, 0.1, -0.05]])[:, None]
+    with torch.no_grad():
+        v = (speed * torch.ones_like(rest.v)).index_fill(1, simulator.fixed, 0.0)
+        return simulator.rollout(State(rest.q, v), steps).q
 
 
 def pushed(simulator: Simulator, steps: int) -> torch.Tensor:

@@ -282,7 +282,7 @@ def pair_forces(
     energy_out: wp.array[wp.float64],  # (C)
     near_out: wp.array[int],  # (C) whether a pair is nearer than D
 ):
-    """Gradient and energy of every pair; not a number and infinite where it has no distance."""
+    """Gradient and energy of every pair; not a number and infinite at no distance, but finite for what has crossed."""
     c = wp.tid()
     b = pairs.environment[c]
     if active[b] == 0:

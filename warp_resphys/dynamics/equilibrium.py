@@ -265,6 +265,7 @@ def _solve(
     if len(workspace.fixed):
         start = start.clone()
         start[:, workspace.fixed] = fixed_positions
+    workspace.potential.check_start(workspace.fixed, fixed_positions, follows is not None and bool(follows.all()))
     report = solver.solve(workspace.potential.coordinates.hold(start.double()).to(start), follows)
     return workspace.potential.positions.to(start.dtype, copy=True), report
 

@@ -132,8 +132,9 @@ class ExactHessian(HessianApproximation):
         self._coupled.correct(self._factor, couplings, x, order)
 
     def couplings(self, clamp: bool) -> list[Coupling]:
-        """Returns the coupling of pairs at the potential's positions, by environment."""
-        parts = self._potential.pair_tangents(clamp)
+        """Returns the coupling of pairs by environment: a clamped one at the positions, or that of the last tangent."""
+        p = self._potential
+        parts = p.pair_tangents(clamp=True) if clamp else p.last_pair_tangents
         if not parts:
             return []
         environment = torch.cat([part.environment for part in parts])

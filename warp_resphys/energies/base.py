@@ -368,6 +368,16 @@ class Term(ABC):
         """Prepares a step, after its values have been copied to the buffers."""
         del values
 
+    def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
+        """Raises InputError where a solve cannot start at positions.
+
+        Args:
+            values: buffers of the values.
+            start: (B, N, 3) `feasible` positions of all terms, fixed vertices where they are in the solve [m].
+            follows: whether the step begins where the last one ended.
+        """
+        del values, start, follows
+
     def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Returns positions of finite energy, if there are others; a solve does not pass by those.
 
@@ -380,7 +390,7 @@ class Term(ABC):
     def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that lower the share (B) of the way from one array of positions (B, N) to another.
 
-        Up to that share, which depends on no other term and no order, the energy is finite.
+        Up to that share, which depends on no other term and no order, no barrier is passed.
         """
         del values, origin, positions, share
         return []

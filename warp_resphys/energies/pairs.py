@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..kernels import broad_phase
 from ..kernels import surfaces as kernels
+from ..kernels.modules import launch_stream
 from ..mesh.mesh import Mesh, boundary_triangles
 from .launcher import Launcher, warp_view
 
@@ -115,7 +116,7 @@ class PairList:
         own = self._pieces[self.vertices]
         self._per_piece[own, self.vertices] = 1.0 / torch.bincount(own, minlength=len(self._per_piece))[own].double()
         self._degree = tensor(surface.degree, torch.float64)
-        # Half of the surface is that of the other part of a pair; edges are added at half weight.
+        # Both surfaces in contact have vertices, for half of its area, and edges, for an eighth.
         self._vertex_area = tensor(0.5 * surface.vertex_areas(), torch.float64)
         self._edge_area = tensor(0.125 * surface.edge_areas(), torch.float64)
         self._rest = tensor(surface.rest, torch.float64)
@@ -142,6 +143,11 @@ class PairList:
         if len(self._per_piece) > 1:
             inside &= way <= self._outer
         return bool(inside[:, self.vertices].all())
+
+    def lengths(self, ways: torch.Tensor) -> torch.Tensor:
+        """Returns the lengths (B, P) of ways (B, N, 3), relative to their mean where there is one piece [m]."""
+        absolute, relative = self._ways(ways)
+        return (absolute if len(self._per_piece) > 1 else relative)[:, self.vertices]
 
     def _ways(self, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns lengths (B, N) of ways (B, N, 3), and of the ways relative to the mean of a piece [m]."""
@@ -182,7 +188,8 @@ class PairList:
         low, high = (wp.empty(size, dtype=wp.vec3, device=device) for _ in range(2))
         group = wp.empty(size, dtype=int, device=device)
         own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], [low, high, group]))
-        return wp.Bvh(low, high, groups=group)
+        with wp.ScopedStream(launch_stream(own.device)):
+            return wp.Bvh(low, high, groups=group)
 
     def _set(self, keys: torch.Tensor, size: int, total: int) -> None:
         """Decodes the keys of pairs in ascending order."""

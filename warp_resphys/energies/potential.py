@@ -62,6 +62,7 @@ class IncrementalPotential(Launcher):
         low_rank: (B, 3 N, r) columns C of the last `update_tangent`; the Hessian has C C^T besides `tangents`. Or None.
         tangent_active: (B,) zero for environments whose tangent is not updated.
         clamp: (B,) non-zero for environments with eigenvalues clamped at zero.
+        last_pair_tangents: `pair_tangents` of the last `update_tangent`.
         all_active: whether the last `update_tangent` was for all environments.
         tangent_launches: launches that set `tangents`, available after their first use.
     """
@@ -84,7 +85,7 @@ class IncrementalPotential(Launcher):
         self._loads: list[bool] = []
         first = 0
         self._placed = tuple(energies)
-        self._pair_tangents: list[PairTangents] = []
+        self.last_pair_tangents: list[PairTangents] = []
         for placed in energies:
             energy, start, sets = placed.energy, first, list[PointSet]()
             for points in placed.points:
@@ -225,7 +226,7 @@ class IncrementalPotential(Launcher):
         self.clamp.zero_() if clamp is None else self.clamp.copy_(clamp)
         self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
-        self._pair_tangents = self.pair_tangents()
+        self.last_pair_tangents = self.pair_tangents()
         pairs = zip(self.energies, self.own_values, strict=True)
         parts = (term.low_rank(values, self._position_view) for term, values in pairs)
         columns = [part for part in parts if part is not None]
@@ -248,6 +249,23 @@ class IncrementalPotential(Launcher):
     def feasible(self) -> torch.Tensor | None:
         """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
         return self._feasible[0][0] if self._feasible else None
+
+    def check_start(self, fixed: torch.Tensor, fixed_positions: torch.Tensor, follows: bool) -> None:
+        """Completes `feasible` by the fixed vertices in their places, and checks it (`Term.check_start`).
+
+        Args:
+            fixed: (D,) fixed vertices.
+            fixed_positions: (1 or B, D, 3) their positions in the solve [m].
+            follows: whether the step begins where the last one ended.
+
+        Raises:
+            InputError: the solve cannot start there.
+        """
+        if self.feasible is None:
+            return
+        self.feasible[:, fixed] = fixed_positions.to(self.feasible)
+        for term, values in zip(self.energies, self.own_values, strict=True):
+            term.check_start(values, self.feasible, follows)
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""
@@ -306,7 +324,7 @@ class IncrementalPotential(Launcher):
         if self.low_rank is not None:
             along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
             product += torch.einsum("bnr,br->bn", self.low_rank, along).view_as(product)
-        for part in self._pair_tangents:
+        for part in self.last_pair_tangents:
             row = part.environment[:, None].expand_as(part.nodes)
             ways = self._direction[row, part.nodes]
             forces = torch.einsum("aij,aj->ai", part.blocks, ways.flatten(1)).view_as(ways)

@@ -80,7 +80,7 @@ class SurfaceTerm(Term):
         assert isinstance(s.source, SurfacePoints)
         self._vertices, self._reach = s.n_vertices, reach
         self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
-        self._moved = torch.as_tensor(s.source.nodes[:, 0], device=launcher.device)
+        self._none = torch.zeros(0, device=launcher.device, dtype=torch.int64)
         self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
         self._grips: Grips | None = None
         self._bounded = False
@@ -103,29 +103,39 @@ class SurfaceTerm(Term):
 
     @override
     def set_step(self, values: Values) -> None:
-        start, place = value_of(values, "surface_start"), value_of(values, "surface_place")
+        start = value_of(values, "surface_start")
         self._bounded, self._grips = False, None
-        if not self._list.covers(start):
-            count, edge = self._list.crossings(start)
-            if bool(count.any()):
-                vertex = int(self._list.surface.edges[int(edge[count > 0][0]), 0])
-                raise InputError(f"the surfaces of the bodies cross at the start of a step, near vertex {vertex}.")
-            self._list.find(start, torch.zeros_like(start))
-        if not torch.equal(start, place):
-            self._check_way(start, place)
         slides = self.sliding(values, start, value_of(values, STIFFNESS.name))
         self._grips = None if slides is None else Grips.of(self.launcher, self._list, slides)
         self._steps += 1
 
-    def _check_way(self, start: torch.Tensor, place: torch.Tensor) -> None:
-        """Raises InputError where fixed vertices pass through a surface in a step."""
-        share = self.launcher.zeros() + 1.0
-        way = (warp_view(start, wp.vec3d), warp_view(place, wp.vec3d))
-        self.launcher.launch(*self._bounding(*way, warp_view(share, wp.float64)))
+    @override
+    def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
+        given, ours = value_of(values, "surface_start"), self._list
+        if not follows:
+            count, edge = ours.crossings(given)
+            if bool(count.any()):
+                b = int(count.argmax())
+                vertex = int(ours.surface.edges[int(edge[b]), 0])
+                raise InputError(
+                    f"the surfaces of the bodies cross at the start of a step, near vertex {vertex} in environment "
+                    f"{b}: give a state in which they are apart."
+                )
+        if torch.equal(given, start):
+            return
+        share, way = self.launcher.zeros() + 1.0, start - given
+        if not (ours.covers(given) and ours.covers(start)):
+            ours.find(given, way)
+        if ours.count:
+            ends = (warp_view(given, wp.vec3d), warp_view(start, wp.vec3d))
+            self.launcher.launch(self._bound(*ends, warp_view(share, wp.float64)))
         if bool((share < 1.0).any()):
+            b = int(share.argmin())
+            vertex = int(way[b].norm(dim=-1).argmax())
             raise InputError(
-                "fixed vertices, or an obstacle, move through the gap between surfaces in a step: move them less in a "
-                "step."
+                f"fixed vertices or an obstacle move through the gap between surfaces in a step, in environment {b} by "
+                f"up to {1e3 * float(way[b, vertex].norm()):.3g} mm, at vertex {vertex}: move them less in a step, or "
+                "go there by several equilibria, one after another."
             )
 
     def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
@@ -202,7 +212,7 @@ class SurfaceTerm(Term):
 
     @override
     def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
-        return value_of(values, "surface_place"), self._moved[:0]
+        return value_of(values, "surface_place"), self._none
 
     @override
     def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
@@ -212,16 +222,17 @@ class SurfaceTerm(Term):
         """Returns the launch that bounds a way, after a search for pairs along it, and limits its length."""
         own, ours, self._bounded = self.launcher, self._list, True
         start, end, part = wp.to_torch(origin), wp.to_torch(positions), wp.to_torch(share)
+        ways = ((end - start) * own.active[:, None, None]).nan_to_num(0.0)
         start = torch.where(own.active.bool()[:, None, None], start, end)
-        ways = (end - start)[:, ours.vertices].norm(dim=-1).amax(1)
-        part.copy_(torch.minimum(part, ours.longest_way / ways.clamp_min(1e-300)))
-        way = part[:, None, None] * (end - start)
+        part.copy_(torch.minimum(part, ours.longest_way / ours.lengths(ways).amax(1).clamp_min(_TINY)))
+        way = part[:, None, None] * ways
         if not (ours.covers(start) and ours.covers(start + way)):
             ours.find(start, way)
-        if not ours.count:
-            return []
-        inputs = [warp_view(own.active, wp.int32), ours.pairs, origin, positions]
-        return [own.record(kernels.bound, (ours.count,), inputs, [share])]
+        return [self._bound(origin, positions, share)] if ours.count else []
+
+    def _bound(self, origin: Any, positions: Any, share: Any) -> Any:
+        inputs = [warp_view(self.launcher.active, wp.int32), self._list.pairs, origin, positions]
+        return self.launcher.record(kernels.bound, (self._list.count,), inputs, [share])
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

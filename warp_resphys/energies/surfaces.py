@@ -10,8 +10,9 @@ nearest point is on an edge or at a vertex that several triangles have in common
 counts once (inclusion and exclusion). Edges that are almost parallel have a factor that vanishes for parallel ones,
 where their nearest points are not unique (incremental potential contact; Li et al. 2020).
 
-Vertices have half of the area of the surface in these pairs, edges a quarter. Triangles and edges that share a vertex
-are no pair.
+In contact of two surfaces, the vertices of both stand for half of the area each, and their edges for an eighth. Where
+meshes match, the pressure at a gap is that of an obstacle; edges that cross add to it. Triangles and edges that share a
+vertex are no pair.
 
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
@@ -19,7 +20,7 @@ M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4)
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 import torch
@@ -33,6 +34,8 @@ from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet
 from .launcher import Launcher
 from .pairs import PairList, Surface
 from .surface_term import FRICTION, STIFFNESS, SurfacePoints, SurfaceTerm
+
+_LEAST: Final = 1e-4  # share of D within which surfaces count as touching
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,9 @@ class SurfaceContact(Energy):
         """Checks the values."""
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")
+                raise InputError(
+                    f"{name} of a contact between surfaces is {getattr(self, name):g}: it must be positive."
+                )
         STIFFNESS.check(self.stiffness)
         FRICTION.check(self.friction)
 
@@ -119,7 +124,6 @@ class BoundSurfaceContact(BoundEnergy):
         (points,) = site.points
         assert isinstance(points, SurfacePoints)
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=rest.device)
-        self._fixed = torch.as_tensor(body.fixed_vertices + site.first, device=rest.device)
         launcher = Launcher(1, rest.device)
         pairs = PairList(launcher, points.placed(len(rest)), contact.distance)
         self._check_rest(pairs, rest.double()[None])
@@ -136,27 +140,30 @@ class BoundSurfaceContact(BoundEnergy):
         pairs.find(rest, torch.zeros_like(rest))
         piece, ends = torch.as_tensor(pairs.surface.pieces, device=rest.device), pairs.nodes
         gaps = pairs.distances(rest)
+        if len(gaps) and float(gaps.min()) < _LEAST * self._contact.distance:
+            nearest = int(gaps.argmin())
+            raise InputError(
+                f"surfaces touch at rest, at vertices {int(ends[nearest, 0])} and {int(ends[nearest, 3])}: leave a gap "
+                "of about contact's distance between bodies."
+            )
         close = (gaps < self._contact.distance) & (piece[ends[:, 0]] == piece[ends[:, 3]])
         if bool(close.any()):
             worst = int(torch.where(close, gaps, torch.inf).argmin())
             raise InputError(
-                f"contact.distance is {1e3 * self._contact.distance:g} mm, but at rest the surface of a body is "
-                f"{1e3 * float(gaps[worst]):.3g} mm from itself, between vertices {int(ends[worst, 0])} and "
-                f"{int(ends[worst, 3])}: take less than that."
+                f"contact between surfaces begins at {1e3 * self._contact.distance:g} mm, but at rest the surface of a "
+                f"body is {1e3 * float(gaps[worst]):.3g} mm from itself, between vertices {int(ends[worst, 0])} and "
+                f"{int(ends[worst, 3])}: take a smaller distance."
             )
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         state, stage = step.state, step.stage
-        place = state.q.detach()
-        if step.inputs.fixed_positions is not None:
-            place = place.index_copy(1, self._fixed, step.inputs.fixed_positions.detach())
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         return {
             "surface_start": state.q,
             "surface_reference": stage.velocity_reference,
             "surface_slip": state.q.new_full((state.batch, 1), self._contact.slip_speed * duration),
-            "surface_place": place,
+            "surface_place": state.q.detach(),
         }
 
     def forces(self, step: EnergyStep, x: torch.Tensor) -> SurfaceForces:

@@ -52,10 +52,11 @@ class CouplingSolver:
         place[order] = torch.arange(len(order), device=order.device)
         for coupling in couplings:
             b, own = coupling.environment, coupling.unknowns
-            columns = self._places[b][own]
-            solved, k = self._solved[b][:, columns], coupling.matrix.to(x.dtype)
-            small = torch.eye(len(own), device=x.device, dtype=x.dtype) + k @ solved[own]
-            x[b] -= solved[order] @ torch.linalg.solve(small, k @ x[b, place[own]])
+            columns, solved, k = self._places[b][own], self._solved[b], coupling.matrix.to(x.dtype)
+            small = torch.eye(len(own), device=x.device, dtype=x.dtype) + k @ solved[own[:, None], columns]
+            along = x.new_zeros(solved.shape[1], x.shape[2])
+            along[columns] = torch.linalg.solve(small, k @ x[b, place[own]])
+            x[b] -= (solved @ along)[order]
 
     def _solve_missing(self, factor: Factor, couplings: Sequence[Coupling], batch: int) -> None:
         """Solves for unknowns that are not in S yet."""

@@ -114,7 +114,7 @@ def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]
     """
     folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
     moved = {motion.file for motion in run.motions().values() if motion.file is not None}
-    motions = {name: _digest(folder / name, "the file of base_motion") for name in sorted(moved)}
+    motions = {name: _digest(folder / name, "the file of base_motion or obstacle_motion") for name in sorted(moved)}
     meshes = [mesh for body in bodies if body for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))]
     paths = [getattr(mesh, "path", None) for mesh in meshes]
     return motions | {path: digest(path) for path in paths if path is not None}

@@ -14,7 +14,7 @@ from support.driven_run import write_run as write_driven
 from support.report_page import FAILING, Page, report
 from support.vertex_run import settings as vertex_settings
 from support.vertex_run import write_run as write_vertex
-from warp_resphys import Body, Contact, Sphere
+from warp_resphys import Body, Capsule, Contact, Sphere
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
 from warp_resphys.report.bodies import ComparedMotion
@@ -56,8 +56,36 @@ def test_the_scenes_of_a_motion_have_its_obstacles():
             (drawn,) = (layer for layer in view.layers if layer.kind == "surface" and layer.colour == OBSTACLE)
             np.testing.assert_array_equal(drawn.points, surface.points)
     data = json.loads(str(view_in_space("view", motion, ["resphys"], "caption", "alt").payload))
-    np.testing.assert_allclose(decoded(data["obstacles"], "<f4").reshape(-1, 3), surface.points, atol=1e-8)
+    np.testing.assert_allclose(corners(data), surface.points[None], atol=1e-8)
     np.testing.assert_array_equal(decoded(data["sides"], "<u4").reshape(-1, 3), surface.triangles)
+
+
+def corners(data):
+    """(T, P, 3) corners of the obstacles, as the script of the page computes them."""
+    owners, local = decoded(data["owners"], "<u4"), decoded(data["obstacles"], "<f4").reshape(-1, 3)
+    poses = decoded(data["poses"], "<f4").reshape(-1, owners[-1] + 1, 12)[:, owners]
+    return poses[..., :3] + (poses[..., 3:].reshape(*poses.shape[:2], 3, 3) @ local[..., None])[..., 0]
+
+
+def test_the_scenes_of_a_motion_have_its_obstacles_where_they_are_in_each_frame():
+    motion, _ = swinging()
+    obstacles = {"floor": Sphere(position=(0.0, 0.0, -0.2), radius=0.05)}
+    obstacles["bar"] = Capsule(position=(0.05, 0.01, -0.1), axis=(1.0, 0.0, 0.0), radius=0.01, length=0.05, moves=True)
+    inputs = {
+        "obstacle_move_z": np.outer(0.1 * motion.times, [0.0, 1.0]),
+        "obstacle_rotate_z": np.outer(motion.times, [0, 1]),
+    }
+    surface = ObstacleSurface.of(Body(motion.mesh, energies=[Contact(obstacles)])).moved(inputs)
+    motion = ComparedMotion(**{**vars(motion), "obstacles": surface})
+    bar = surface.owners == 1
+    assert np.ptp(surface.points[:, bar, 2].mean(axis=1)) > 0.03
+    for scene, frames in ((motion.scene(), motion.instants), (motion.film(), slice(None))):
+        for view in scene.views:
+            (drawn,) = (layer for layer in view.layers if layer.kind == "surface" and layer.colour == OBSTACLE)
+            assert np.isin(drawn.points, surface.points[frames]).all()
+            assert len(drawn.points) == len(next(layer for layer in view.layers if layer.points.ndim == 3).points)
+    data = json.loads(str(view_in_space("view", motion, ["resphys"], "caption", "alt").payload))
+    np.testing.assert_allclose(corners(data), surface.points, atol=1e-7)
 
 
 @pytest.mark.parametrize("every_vertex", [False, True])
@@ -230,6 +258,22 @@ def test_a_browser_without_webgl_says_so(browser, page):
         assert not view.find_element(By.CSS_SELECTOR, "canvas").is_displayed()
     finally:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
+def test_the_script_places_obstacles_between_frames(browser, page):
+    """The floor stays where it is; the bar is halfway between two frames."""
+    floor, bar = Sphere(position=(0.0, 0.0, -0.2), radius=0.05), Sphere(radius=0.01, moves=True)
+    body = Body(box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1)), energies=[Contact({"floor": floor, "bar": bar})])
+    surface = ObstacleSurface.of(body, {"obstacle_x": 0.2})
+    moved = surface.moved({"obstacle_move_z": np.outer([0.0, 0.1, 0.4], [0.0, 1.0])})
+    view = opened(browser, page, 1100, False)
+    script = """const [figure, obstacles, owners, poses] = arguments, around = new Float32Array(obstacles.length);
+        const own = Object.create(Object.getPrototypeOf(figure.view));
+        return [...Object.assign(own, {obstacles, owners, poses, around, data: {times: [0, 1, 2]}}).placed(1.5)];"""
+    for own, expected in ((surface, surface.points), (moved, moved.points[1:].mean(axis=0))):
+        arrays = [values.ravel().tolist() for values in (own.local, own.owners, own.poses)]
+        placed = np.reshape(browser.execute_script(script, view, *arrays), (-1, 3))
+        np.testing.assert_allclose(placed, expected, atol=1e-7)
 
 
 def test_the_page_stays_small(page):

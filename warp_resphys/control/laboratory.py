@@ -104,8 +104,7 @@ class Laboratory(World):
 
     @override
     def obstacles(self) -> ObstacleSurface:
-        surface = ObstacleSurface.of(self._simulator.body)
-        return replace(surface, points=self._frame.apply(surface.points))
+        return ObstacleSurface.of(self._simulator.body).carried(self._frame)
 
     def seen(self, number: int) -> FloatArray:
         """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""

@@ -99,24 +99,36 @@ def since_first(places: ArrayLike, quaternions: ArrayLike, source: str | Path) -
     return poses_of(matrices, x - matrices @ x[0])
 
 
-def followed(markers: FloatArray, still: FloatArray, source: str | Path) -> FloatArray:
-    """Poses (T, 6) of the base, from its markers (T, M, 3), NaN where not seen, and their rest positions (M, 3) [m].
+def followed(markers: FloatArray, still: FloatArray, source: str | Path, what: str = "the base") -> FloatArray:
+    """Poses (T, 6) of a rigid body from its markers (T, M, 3), NaN where not seen, and their rest positions (M, 3) [m].
 
-    Frames with fewer than three seen markers are interpolated. A spline smooths the motion (generalised
-    cross-validation), as a body feels the acceleration of its base.
+    Frames with fewer than three seen markers are interpolated; a single marker shows a translation alone. A spline
+    smooths the motion (generalised cross-validation), as a body feels the acceleration of its base.
+
+    Args:
+        markers: of the rigid body.
+        still: where they are at rest.
+        source: of the markers, for errors.
+        what: moves, for errors.
 
     Raises:
-        DataFileError: three or more markers are seen in less than half of the frames.
+        DataFileError: three or more markers, or the single one, are seen in less than half of the frames.
     """
     seen = np.asarray(np.isfinite(markers).all(-1) & np.isfinite(still).all(-1))
-    enough = seen.sum(1) >= 3
+    enough = seen.sum(1) >= min(3, len(still))
     if not enough.any() or enough.mean() < 0.5:
-        raise DataFileError(
-            f"{source}: the base moves, and three of its reference markers are seen in {100.0 * enough.mean():.0f} % "
-            "of the frames: fill their gaps, or give more of them in markers.reference."
+        shown, more = (
+            ("three of its markers are", ", or give more of them") if len(still) > 1 else ("its marker is", "")
         )
-    rotation, translation = np.zeros((len(markers), 3, 3)), np.zeros((len(markers), 3))
+        raise DataFileError(
+            f"{source}: {what} moves, and {shown} seen in {100.0 * enough.mean():.0f} % of the frames: fill the "
+            f"gaps{more}."
+        )
+    rotation, translation = np.tile(np.eye(3), (len(markers), 1, 1)), np.zeros((len(markers), 3))
     for frame in np.flatnonzero(enough).tolist():
+        if len(still) == 1:
+            translation[frame] = markers[frame, 0] - still[0]
+            continue
         motion = kabsch(still[seen[frame]], markers[frame, seen[frame]])
         rotation[frame], translation[frame] = motion.rotation, motion.translation
     frames, known = np.arange(len(markers)), np.flatnonzero(enough)
@@ -143,7 +155,7 @@ def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> Float
     return np.asarray(CubicSpline(times, poses)(kept))
 
 
-def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> None:
+def check_steps(poses: FloatArray, points: FloatArray, source: str | Path, what: str = "the base") -> None:
     """Checks that poses (K + 1, 6) at the steps of a simulation do not jump, for a body of points (N, 3) [m].
 
     Raises:
@@ -155,7 +167,7 @@ def check_steps(poses: FloatArray, points: FloatArray, source: str | Path) -> No
     steps = np.linalg.norm(np.diff(moved, axis=0), axis=-1).max(axis=1, initial=0.0)
     if len(steps) and steps.max() > LARGEST_STEP * float((high - low).max()):
         raise DataFileError(
-            f"{source}: the base jumps by {_MILLI * steps.max():.0f} mm in step {int(steps.argmax()) + 1}, more than a "
+            f"{source}: {what} jumps by {_MILLI * steps.max():.0f} mm in step {int(steps.argmax()) + 1}, more than a "
             "body follows without being torn: check the unit of the motion, or take a smaller time_step."
         )
 

@@ -12,10 +12,11 @@ FloatArray = NDArray[np.float64]
 
 
 def driving(dataset: Dataset, names: Sequence[str]) -> dict[str, FloatArray]:
-    """Returns what acts during each frame, (R, T, C) by input and for the base; a pose has the last values."""
+    """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
     rows = dataset.rows(names)
     series = {name: values[rows] for name, values in dataset.inputs.items()}
     series |= {} if dataset.base is None else {"base": dataset.base[rows]}
+    series |= {f"obstacle {name}": poses[rows] for name, poses in dataset.obstacles.items()}
     steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
     posed = np.array([dataset.begins[row] == STATIC for row in rows])
     steps[posed] = np.iinfo(np.int64).max

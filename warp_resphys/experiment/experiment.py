@@ -297,8 +297,9 @@ class Experiment:
             payload: whether to include the payload even if ``actuation.sees_payload`` is false.
 
         Returns:
-            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs with their
-            exponential means, and motion of the base (`base_movement`). (R, A) for static poses, under steady inputs.
+            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs (of
+            actuators, and those that move obstacles) with their exponential means, and motion of the base
+            (`base_movement`). (R, A) for static poses, under steady inputs.
         """
         _, inputs, resting = replay.prepare(parameters)
         assert isinstance(self.settings, NetworkStage)

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.base_motion import at_times
+from ..data.obstacle_motion import contact_inputs
 from ..data.trials import Trials
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
@@ -107,6 +108,7 @@ class Dataset:
         channels: names of the C channels, by input.
         resting: (R, C) inputs before time zero, by name, of trials that begin under inputs; empty if none does.
         base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
+        obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see `data.obstacle_motion`.
         sessions: session in which each trial was recorded; empty if there is one.
     """
 
@@ -126,6 +128,7 @@ class Dataset:
     channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     resting: Mapping[str, FloatArray] = field(default_factory=dict)
     base: FloatArray | None = None
+    obstacles: Mapping[str, FloatArray] = field(default_factory=dict)
     sessions: tuple[str, ...] = ()
 
     def session(self, name: str) -> str:
@@ -152,6 +155,7 @@ class Dataset:
         """
         words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
         words |= {"sessions": self.sessions} if self.sessions else {}
+        words |= {"obstacles": tuple(self.obstacles)} if self.obstacles else {}
         words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
         attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
@@ -161,6 +165,8 @@ class Dataset:
                     create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
                 create(file, name, values, units=DRIVING_QUANTITIES[name].unit or "1", time_axis=1)
+            for name, values in self.obstacles.items():
+                create(file, f"obstacles/{name}", values, units=_UNITS["base"])
             for name, values in self.resting.items():
                 create(file, f"{name}_resting", values, units=DRIVING_QUANTITIES[name].unit or "1")
 
@@ -170,7 +176,10 @@ class Dataset:
             name: None if getattr(self, name) is None else np.concatenate([getattr(self, name), getattr(other, name)])
             for name in ("times", "observed", "held", "payload", "smoothed", "velocity", "base")
         }
-        inputs = {name: np.concatenate([values, other.inputs[name]]) for name, values in self.inputs.items()}
+        inputs, obstacles = (
+            {name: np.concatenate([values, theirs[name]]) for name, values in own.items()}
+            for own, theirs in ((self.inputs, other.inputs), (self.obstacles, other.obstacles))
+        )
         resting = {
             name: np.concatenate(
                 [own.resting.get(name, np.zeros_like(own.inputs[name][:, 0])) for own in (self, other)]
@@ -178,7 +187,7 @@ class Dataset:
             for name in {**self.resting, **other.resting}
         }
         words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
-        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting}
+        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting, "obstacles": obstacles}
         return replace(self, **changed)
 
     def rows(self, names: Sequence[str]) -> list[int]:
@@ -194,12 +203,22 @@ class Dataset:
 
     def base_at(self, names: Sequence[str], time_step: float) -> torch.Tensor | None:
         """(K + 1, R, 6) motion of the base in trials, resampled to another time step; None if the base stands still."""
-        if self.base is None:
-            return None
-        times = self.time_step * np.arange(self.base.shape[1])
+        return None if self.base is None else torch.from_numpy(self._poses_at(self.base, names, time_step))
+
+    def _poses_at(self, poses: FloatArray, names: Sequence[str], time_step: float) -> FloatArray:
+        """(K' + 1, R', 6) poses (R, K + 1, 6) of some trials, resampled to another time step."""
+        times = self.time_step * np.arange(poses.shape[1])
         new = time_step * np.arange(round(times[-1] / time_step) + 1)
-        rows = [at_times(self.base[row], times, new) for row in self.rows(names)]
-        return torch.from_numpy(np.stack(rows, axis=1))
+        return np.stack([at_times(poses[row], times, new) for row in self.rows(names)], axis=1)
+
+    def contact_at(self, names: Sequence[str], body: Body, time_step: float) -> dict[str, FloatArray]:
+        """(K + 1, R, O) inputs of a body's contact in trials by name, those that move an obstacle in any trial."""
+        if not self.obstacles:
+            return {}
+        acting = [name for name, values in contact_inputs(body, self.obstacles).items() if values.any()]
+        poses = {name: self._poses_at(own, names, time_step) for name, own in self.obstacles.items()}
+        inputs = contact_inputs(body, poses)
+        return {name: inputs[name] for name in acting}
 
     def trials(
         self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float | None = None
@@ -223,6 +242,9 @@ class Dataset:
         if any(self.payload):
             hung = payload_inputs(body, payload_at, self.payload[rows])
             given |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
+        if not static:
+            moved = self.contact_at(names, body, step)
+            given |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
         poses = self.base_at(names, step)
         if poses is not None and not static:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
@@ -267,6 +289,10 @@ def read_dataset(path: Path) -> Dataset:
             resting={n: read_array(file, f"{n}_resting", (r, None)) for n in inputs if f"{n}_resting" in file},
             channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
             sessions=tuple(map(str, file.attrs.get("sessions", ()))),
+            obstacles={
+                str(name): read_array(file, f"obstacles/{name}", (r, None, 6))
+                for name in file.attrs.get("obstacles", ())
+            },
             **optional,
         )
 

@@ -243,7 +243,20 @@ def _dataset(
             for series in inputs.values():
                 _fill_inputs(series[row], trial.driven, trial)
     sessions = tuple(x.settings.session or "" for x in observed)
-    base = _bases(observed, times, settings.time_step, observer.simulator.body.mesh.vertices)
+    points = observer.simulator.body.mesh.vertices
+    base = _at_steps(observed, [x.base for x in observed], times, settings.time_step, points)
+    moved = dict.fromkeys(name for x in observed for name in x.obstacles)
+    obstacles = {
+        name: _at_steps(
+            observed,
+            [x.obstacles.get(name) for x in observed],
+            times,
+            settings.time_step,
+            points,
+            f"the obstacle {name!r}",
+        )
+        for name in moved
+    }
     return Dataset(
         names=tuple(x.settings.name for x in observed),
         labels=tuple(observer.tracked),
@@ -260,6 +273,7 @@ def _dataset(
         channels={} if drive is None else {drive.quantity.name: drive.parts},
         resting=resting,
         base=base,
+        obstacles={name: motion for name, motion in obstacles.items() if motion is not None},
         sessions=sessions if any(sessions) else (),
     )
 
@@ -269,16 +283,23 @@ def _begins(trial: Trial) -> str:
     return "released" if trial.is_released else UNDER_INPUTS if trial.begins == SLACK else trial.begins
 
 
-def _bases(observed: Sequence[Observed], times: FloatArray, time_step: float, points: FloatArray) -> FloatArray | None:
-    """(R, K + 1, 6) motion of the base at the steps of the longest trial; None if all bases stand still."""
-    if all(x.base is None for x in observed):
+def _at_steps(
+    observed: Sequence[Observed],
+    motions: Sequence[FloatArray | None],
+    times: FloatArray,
+    time_step: float,
+    points: FloatArray,
+    what: str = "the base",
+) -> FloatArray | None:
+    """(R, K + 1, 6) motion of the base or of an obstacle at the steps of the longest trial; None if it stands still."""
+    if all(poses is None for poses in motions):
         return None
     steps = time_step * np.arange(round(np.ceil(times.max() / time_step - 1e-6)) + 1)
     motion = np.zeros((len(observed), len(steps), 6))
-    for row, trial in enumerate(observed):
-        if trial.base is not None:
-            motion[row] = at_times(trial.base, trial.moving.time, steps)
-            check_steps(motion[row], points, trial.raw.source)
+    for row, (trial, poses) in enumerate(zip(observed, motions, strict=True)):
+        if poses is not None:
+            motion[row] = at_times(poses, trial.moving.time, steps)
+            check_steps(motion[row], points, trial.raw.source, what)
     return motion
 
 

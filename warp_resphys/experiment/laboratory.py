@@ -19,7 +19,7 @@ from typing_extensions import override
 from ..data.actuation import InputSequences
 from ..data.base_motion import in_frame, rigid
 from ..data.recordings.arrays import write_recording
-from ..data.recordings.recording import Recording
+from ..data.recordings.recording import ARM, Recording
 from ..data.rigid import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
@@ -38,7 +38,7 @@ from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
-from .simulate import base_of, distributed, fixed_positions
+from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of
 from .target import substeps_of, target_settings
 
 FloatArray = NDArray[np.float64]
@@ -130,6 +130,16 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
         turns = np.radians(laboratory.orientation_noise) * draw.standard_normal((len(positions), 3))
         spoke = positions[:, own] - positions[:, own].mean(axis=1, keepdims=True)
         noise[:, own] = noise[:, own][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
+    labels = [*settings.binding.observed, *settings.binding.reference]
+    pushing = obstacles_of(settings.data.obstacle_motion, [trial], times)
+    for name in [name for name, motion in settings.data.obstacle_motion.items() if motion == "recorded"]:
+        way = pushing[name][0] if name in pushing else np.zeros((len(times), 6))
+        arms = ["", *(f" +{axis}" for axis in "xyz")][: 4 if way[:, 3:].any() else 1]
+        places = np.asarray(laboratory.obstacles[name].position) + ARM * np.eye(4, 3, -1)[: len(arms)]
+        seen = setup.frame.apply(rigid(way).apply(np.broadcast_to(places, (len(way), *places.shape))))
+        labels += [f"{name}{arm}" for arm in arms]
+        positions = np.concatenate([positions, seen], axis=1)
+        noise = np.concatenate([noise, laboratory.noise * draw.standard_normal(seen.shape)], axis=1)
     actuation = None
     if trial.sequence is not None:
         least = getattr(driving_quantity(laboratory), "lower", -np.inf)
@@ -139,8 +149,7 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
     base = in_frame(poses, setup.frame) if common == "recorded" else None
     path = context.run_dir / trial.recording
-    labels = (*settings.binding.observed, *settings.binding.reference)
-    recording = Recording(labels, positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
+    recording = Recording(tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
     lengths = {name: body.length for name, body in settings.binding.rigid_bodies.items()}
     write_recording(path, with_axes(recording, lengths), {"payload_kg": trial.payload})
     moved = as_markers(noise[:, : series.shape[1]], settings.binding.observed)
@@ -292,9 +301,10 @@ class _Played(ResumableRollout):
         self.frames = part.frames
         self._fixed: list[torch.Tensor] | None = None
         common = settings.data.base_motion
+        times = simulator.time_step * np.arange((part.frames - 1) * self._substeps + 1)
+        self._moved = contact_series(simulator, settings.data.obstacle_motion, self._trials, times)
         if common is not None or any(trial.base_motion is not None for trial in self._trials):
-            times = simulator.time_step * np.arange(1, (part.frames - 1) * self._substeps + 1)
-            poses = [base_of(common, trial, times) for trial in self._trials]
+            poses = [base_of(common, trial, times[1:]) for trial in self._trials]
             self._fixed = fixed_positions(simulator, np.stack(poses, axis=1))
 
     def _inputs(self, frame: int, share: float = 0.0) -> Inputs:
@@ -327,8 +337,10 @@ class _Played(ResumableRollout):
             # Inputs are taken at the end of a substep, or in its middle.
             share = (i - 0.5 * (self._simulator.integrator == "midpoint")) / self._substeps
             inputs = self._inputs(number - 1, share) if begins in RESTING else self._inputs(0)
+            at = (number - 1) * self._substeps + i
+            inputs = inputs.replace(**{name: values[at] for name, values in self._moved.items()})
             if self._fixed is not None:
-                inputs = inputs.replace(fixed_positions=self._fixed[(number - 1) * self._substeps + i - 1])
+                inputs = inputs.replace(fixed_positions=self._fixed[at - 1])
             state, _ = self._simulator.step(state, inputs, self._constants)
         return state
 

@@ -1,8 +1,8 @@
 """Recorded trials: time zero, registration to the frame of the body, and inputs."""
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..data.actuation import NO_INPUT, check_inputs
 from ..data.base_motion import followed, in_frame, prescribed, rigid
 from ..data.marker_view import MarkerView
+from ..data.obstacle_motion import configured, prescribed_all
 from ..data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
 from ..data.recordings.quality import check_base, check_motion
 from ..data.recordings.recording import Recording
@@ -53,6 +54,7 @@ class Observed:
         release: release of a held body; None for other trials.
         shows_places: whether it shows the places of markers on the body, i.e. undeformed or under gravity only.
         base: (T, 6) motion of the base at the frames, in the frame of the body; None if the base stands still.
+        obstacles: (T, 6) motions of obstacles likewise, by name.
     """
 
     settings: Trial
@@ -66,6 +68,7 @@ class Observed:
     release: Release | None = None
     shows_places: bool = True
     base: FloatArray | None = None
+    obstacles: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def to_body(self, points: FloatArray, shift: FloatArray) -> FloatArray:
         """Transforms marker points (..., M, 3) to the frame of the body, shifted by (M, 3), as seen in its view [m]."""
@@ -195,14 +198,30 @@ class Observer:
                 f"{whole.source} has no array 'base' with the motion of the base: add it "
                 "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
             )
+        self._check_early(trial, whole, poses, "the base moves the body")
+        return poses
+
+    def _check_early(self, trial: Trial, whole: Recording, poses: FloatArray, what: str) -> None:
+        """Refuses a motion (T, 6) that begins during registration."""
         early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
         moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
         if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers.largest_residual:
             raise DataFileError(
-                f"{whole.source}: the base moves the body by {_MILLI * furthest:.1f} mm during registration: "
+                f"{whole.source}: {what} by {_MILLI * furthest:.1f} mm during registration: "
                 "keep it still until the release, or in the first data.rest_seconds."
             )
-        return poses
+
+    def _obstacles(
+        self, trial: Trial, whole: Recording, moving: Recording, transform: RigidTransform
+    ) -> dict[str, FloatArray]:
+        """(T, 6) motions of obstacles at the frames, in the frame of the body; recorded ones take precedence."""
+        own = {name: motion for name, motion in trial.obstacle_motion.items() if name not in moving.obstacles}
+        given = configured(self.data.obstacle_motion, own)
+        motions = prescribed_all(given, moving.time, self.data.folder or ".")
+        motions |= {name: in_frame(poses, transform) for name, poses in moving.obstacles.items()}
+        for name, poses in motions.items():
+            self._check_early(trial, whole, poses, f"the obstacle {name!r} moves")
+        return motions
 
     def _turned_back(self, places: FloatArray, view: MarkerView) -> FloatArray:
         """(M', 3) places in the frame of the recording, with tracked markers as seen in their own frame if it is used.
@@ -260,7 +279,9 @@ class Observer:
         whole = _frames(recording, first, first + len(moving.positions))
         base = self._base(trial, whole, moving, still, registration.transform)
         view, columns = self.reader.view(trial), trial.tracked(self.tracked)
-        return Observed(trial, recording, columns, view, moving, still, registration, driven, release, base=base)
+        obstacles = self._obstacles(trial, whole, moving, registration.transform)
+        fields = (trial, recording, columns, view, moving, still, registration, driven, release)
+        return Observed(*fields, base=base, obstacles=obstacles)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """Observes a body that rests until its inputs begin, or a static pose."""
@@ -286,7 +307,8 @@ class Observer:
         base = None if static else self._base(trial, recording, moving, still, registration.transform)
         view, columns = self.reader.view(trial), trial.tracked(self.tracked)
         fields = (trial, recording, columns, view, moving, still, registration, driven)
-        return Observed(*fields, shows_places=unloaded, base=base)
+        obstacles = {} if static else self._obstacles(trial, recording, moving, registration.transform)
+        return Observed(*fields, shows_places=unloaded, base=base, obstacles=obstacles)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether inputs (T, C) are zero up to the noise of a gauge."""

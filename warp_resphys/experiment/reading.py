@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.assignment import assign
 from ..data.marker_view import MarkerView
+from ..data.obstacle_motion import recorded
 from ..data.recordings.bag import Bag
 from ..data.recordings.quality import check_passive
 from ..data.recordings.reading import read_recording
@@ -152,6 +153,9 @@ class Reader:
             recording = read_recording(Path(trial.file), *given)
         lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
         recording = with_corners(recording, lengths)
+        seconds = _HELD_SECONDS if trial.is_released else self.data.rest_seconds
+        shown = [name for name, motion in self.data.obstacle_motion.items() if motion == "recorded"]
+        recording = replace(recording, obstacles={name: recorded(recording, name, seconds) for name in shown})
         if self._drive is None:
             if trial.inputs is not None:
                 raise InputError(

@@ -56,6 +56,8 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     for trial in trials:
         if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
             raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
+        if trial.begins == STATIC and (data.obstacle_motion or trial.obstacle_motion):
+            raise InputError(f"the trial '{trial.name}' is a static pose: obstacles cannot move in it.")
     if begins & {"held", "released"}:
         _check_release(run, data)
 

@@ -94,6 +94,7 @@ def make_report(context: StageContext) -> None:
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
         obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
+        moved=read_moved(folder, body, trials.names),
         trials=trials,
         film=film,
         driven=driven,
@@ -348,6 +349,13 @@ def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
             by_name = dict(zip(controllers, points, strict=True))
             followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
     return followed
+
+
+def read_moved(folder: Path, body: Body, names: Sequence[str]) -> dict[str, dict[str, FloatArray]]:
+    """(K + 1, O) inputs of contact by name that move obstacles, in trials by name."""
+    dataset = read_dataset(common_folder(folder) / DATASET)
+    moved = dataset.contact_at(names, body, dataset.time_step)
+    return {name: {key: values[:, row] for key, values in moved.items()} for row, name in enumerate(names)}
 
 
 def read_driven(folder: Path, run: RunSettings) -> Driven | None:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..data.base_motion import check_steps, prescribed, rigid
+from ..data.obstacle_motion import configured, contact_inputs, prescribed_all
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..io.fan_out import ALONE
@@ -48,11 +49,14 @@ def simulate(context: StageContext) -> None:
     trials, motion = settings.trials, settings.data.base_motion
     frames, names = settings.data.steps + 1, tuple(trial.name for trial in trials)
     poses, times = None, settings.time_step * np.arange(frames, dtype=np.float64)
+    points = whole_mesh(settings).vertices
     if motion is not None:
         poses = np.stack([base_of(motion, trial, times, _motion_scale(settings, trial)) for trial in trials])
-        points = whole_mesh(settings).vertices
         for motion_of_trial in poses:
             check_steps(motion_of_trial, points, "data.base_motion")
+    obstacles = obstacles_of(settings.data.obstacle_motion, trials, times)
+    for name, moved in obstacles.items():
+        check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
     parts = split_into_parts(context, names, frames)
     work_on(parts, _FreeMotion, ALONE)
     observed = read_parts(parts, "observed")
@@ -68,6 +72,7 @@ def simulate(context: StageContext) -> None:
         time_step=settings.time_step,
         velocity=read_parts(parts, "velocity"),
         base=poses,
+        obstacles=obstacles,
     ).write(context.run_dir / DATASET)
     remove_parts(context)
 
@@ -85,6 +90,19 @@ def base_of(common: BaseMotion, trial: Trial, times: NDArray[Any], scale: float 
     return np.zeros((len(times), 6)) if motion is None else prescribed(motion, times, scale=scale)
 
 
+def obstacles_of(common: Mapping[str, Any], trials: Sequence[Trial], times: NDArray[Any]) -> dict[str, FloatArray]:
+    """(R, T, 6) true motions of obstacles by name, in the frame of the body; zero in trials in which they stand still.
+
+    Args:
+        common: motions of trials without their own.
+        trials: the trials.
+        times: (T,) times [s].
+    """
+    motions = [prescribed_all(configured(common, trial.obstacle_motion), times) for trial in trials]
+    still = np.zeros((len(times), 6))
+    return {name: np.stack([own.get(name, still) for own in motions]) for own in motions for name in own}
+
+
 def _motion_scale(settings: SimulateStage, trial: Trial) -> float:
     """Factor of the motion of the base of a trial."""
     return trial.amount if isinstance(settings.data, MovingBase) else 1.0
@@ -95,6 +113,17 @@ def fixed_positions(simulator: Simulator, motions: FloatArray) -> list[torch.Ten
     fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
     size = (motions.shape[1], *fixed.shape)
     return [simulator.tensor(rigid(poses).apply(np.broadcast_to(fixed, size))) for poses in motions]
+
+
+def contact_series(
+    simulator: Simulator, common: Mapping[str, Any], trials: Sequence[Trial], times: NDArray[Any]
+) -> dict[str, torch.Tensor]:
+    """Inputs (T, B, O) of contact by name at times (T,) [s], for the true motions of obstacles in trials."""
+    motions = obstacles_of(common, trials, times)
+    if not motions:
+        return {}
+    inputs = contact_inputs(simulator.body, {name: poses.swapaxes(0, 1) for name, poses in motions.items()})
+    return {name: simulator.tensor(values) for name, values in inputs.items()}
 
 
 class _FreeMotion(ResumableRollout):
@@ -109,10 +138,11 @@ class _FreeMotion(ResumableRollout):
         shape = (len(self._trials), len(whole_mesh(settings).vertices), 3)
         self.fields = {"observed": Field(shape, "m", batch_axes=1), "velocity": Field(shape, "m/s", batch_axes=1)}
         self.frames = part.frames
+        times = self._simulator.time_step * np.arange((part.frames - 1) * self._target.substeps + 1)
+        self._moved = contact_series(self._simulator, settings.data.obstacle_motion, self._trials, times)
         self._fixed: list[torch.Tensor] | None = None
         if (motion := settings.data.base_motion) is not None:
-            times = self._simulator.time_step * np.arange(1, (part.frames - 1) * self._target.substeps + 1)
-            poses = [base_of(motion, trial, times, _motion_scale(settings, trial)) for trial in self._trials]
+            poses = [base_of(motion, trial, times[1:], _motion_scale(settings, trial)) for trial in self._trials]
             self._fixed = fixed_positions(self._simulator, np.stack(poses, axis=1))
 
     @override
@@ -123,7 +153,8 @@ class _FreeMotion(ResumableRollout):
     def step(self, number: int) -> State:
         state, substeps = self.state, self._target.substeps
         for at in range((number - 1) * substeps, number * substeps):
-            inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[at])
+            moved = {name: values[at + 1] for name, values in self._moved.items()}
+            inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[at], **moved)
             state = self._simulator.step(state, inputs, self._constants)[0]
         return state
 

@@ -117,10 +117,10 @@ def sharp_edges(points: FloatArray, triangles: IntArray) -> IntArray:
 
 def obstacle_layers(obstacles: ObstacleSurface, width: float = 1.5) -> list[Layer]:
     """Return layers of obstacles, with lines [px wide] along their sharp edges."""
-    if not len(obstacles.points):
+    if not len(obstacles.local):
         return []
     points, triangles = obstacles.points, obstacles.triangles
-    edges = sharp_edges(points, triangles)
+    edges = sharp_edges(points[0] if obstacles.moves else points, triangles)
     return [
         Layer("surface", points, triangles, OBSTACLE, light=OBSTACLE_LIGHT),
         *([Layer("lines", points, edges, OUTLINE, size=width)] if len(edges) else []),
@@ -140,7 +140,7 @@ class ComparedMotion:
     gravity: FloatArray  # (3,) direction of gravity.
     from_below: bool = False  # Whether the second view is from below, as for hanging bodies, rather than a close-up.
     target: FloatArray | None = None  # (T, N, 3) [m] of the vertices, where every one is observed.
-    obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # Of the last model.
+    obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # Of the last model, at these times.
 
     @property
     def is_fast(self) -> bool:
@@ -160,7 +160,8 @@ class ComparedMotion:
         )
         times, measured = self.times[chosen], self.measured[chosen]
         target = None if self.target is None else self.target[chosen]
-        return replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
+        shown = replace(self, times=times, measured=measured, positions=positions, markers=markers, target=target)
+        return replace(shown, obstacles=self.obstacles.at(chosen))
 
     def scene(self) -> RenderScene:
         """Return the scene of the body at some instants, with a close-up of the markers or a view from below."""

@@ -150,6 +150,8 @@ class RunReport:
     chambers: tuple[Chamber, ...] = ()  # Chambers under pressure.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
     obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
+    # (K + 1, O) inputs of contact by name, in the test trials by name: poses of the obstacles at the steps.
+    moved: Mapping[str, Mapping[str, FloatArray]] = field(default_factory=dict)
     trials: TrialResults | None = None  # Test trials; None over the folds.
     film: Film | None = None  # Motion of the bodies in one of them.
     driven: Driven | None = None  # Inputs of all trials.
@@ -180,6 +182,16 @@ class RunReport:
     def published(self) -> Mapping[str, PublishedError]:
         """Published errors of this experiment by model; may be empty."""
         return published_errors(self.experiment)
+
+    def obstacles_at(self, trial: str, times: FloatArray) -> ObstacleSurface:
+        """Returns the obstacles at times (T,) [s] of a test trial."""
+        inputs = self.moved.get(trial, {})
+        if not inputs or self.trials is None:
+            return self.obstacles
+        steps = self.trials.time_step * np.arange(len(next(iter(inputs.values()))))
+        return self.obstacles.moved(
+            {name: np.stack([np.interp(times, steps, x) for x in own.T], axis=1) for name, own in inputs.items()}
+        )
 
     @property
     def sees_markers(self) -> bool:

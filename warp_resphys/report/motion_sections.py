@@ -24,6 +24,7 @@ from .data import (
     shown_markers,
     shown_models,
 )
+from .obstacles import ObstacleSurface
 from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
 from .render import Pixels, draw, write_film
 from .verdict import unbroken
@@ -49,7 +50,7 @@ def _draw_pictures(data: RunReport, motion: ComparedMotion) -> list[Pixels]:
     shape = (
         None
         if data.trials is None or data.sees_markers
-        else distance_scene(data.mesh, *_bodies(data.trials), data.obstacles)
+        else distance_scene(data.mesh, *_bodies(data.trials), _worst_obstacles(data, data.trials))
     )
     return draw(motion.scene(), *([] if shape is None else [shape]))
 
@@ -88,8 +89,9 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     seen = dict(zip(models, markers, strict=True))
     whole = None if trials.labels else trials.target[row][frames]
     at_rest = trials.bound[points]
+    around = data.obstacles_at(film.trial, times[frames])
     return ComparedMotion(
-        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole, data.obstacles
+        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole, around
     )
 
 
@@ -103,6 +105,13 @@ def _bodies(trials: TrialResults) -> tuple[dict[str, FloatArray], FloatArray]:
     """Positions (N, 3) [m] in the worst frame of the worst trial: by model, and of the target."""
     at = trials.worst, worst_state(trials, trials.worst)
     return {m: trials.positions[m][at] for m in shown_models(trials.positions)}, trials.target[at]
+
+
+def _worst_obstacles(data: RunReport, trials: TrialResults) -> ObstacleSurface:
+    """Obstacles in the worst frame of the worst trial."""
+    row = trials.worst
+    at = worst_state(trials, row)
+    return data.obstacles_at(trials.names[row], trials.times[row, at : at + 1]).at(0)
 
 
 def motion_section(data: RunReport, canvas: Canvas) -> Part | None:

@@ -45,6 +45,9 @@ class View {
     this.weights = decoded(data.weights, Float32Array);
     this.errors = data.errors === null ? null : bytes(data.errors);
     this.obstacles = decoded(data.obstacles, Float32Array);
+    this.owners = decoded(data.owners, Uint32Array);
+    this.poses = decoded(data.poses, Float32Array);
+    this.around = new Float32Array(this.obstacles.length);
     this.measured = decoded(data.measured, Float32Array);
     this.simulated = decoded(data.simulated, Float32Array);
     this.place = new Float32Array(this.rest.length);
@@ -263,6 +266,20 @@ class View {
     return out;
   }
 
+  placed(frame) {  // The corners of the obstacles: their poses are a position and a rotation by rows.
+    const {obstacles, owners, around} = this, size = 12 * (1 + owners.at(-1)), moves = this.poses.length > size;
+    const poses = moves ? this.between(this.poses, 0, size, frame) : this.poses;
+    for (let at = 0; at < owners.length; at++) {
+      const own = 12 * owners[at];
+      for (let axis = 0; axis < 3; axis++) {
+        const row = own + 3 + 3 * axis;
+        around[3 * at + axis] = poses[own + axis] + poses[row] * obstacles[3 * at]
+          + poses[row + 1] * obstacles[3 * at + 1] + poses[row + 2] * obstacles[3 * at + 2];
+      }
+    }
+    return around;
+  }
+
   draw() {
     const {gl, canvas, data} = this, ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(Math.round(canvas.clientWidth * ratio), 1);
@@ -282,7 +299,7 @@ class View {
       this.lines("sharp", [...outline, 1], 0.0);
     }
     if (this.obstacles.length) {
-      this.load(this.obstacles);
+      this.load(this.placed(frame));
       this.surface(rgb(data.solid), 1.0, false, 0.0, "sides");
     }
     if (front !== undefined && this.body(front, frame)) {

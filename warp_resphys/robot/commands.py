@@ -60,8 +60,8 @@ class Commands:
         self._simulator, self._description, self._inputs = simulator, description, inputs
         self._mass_factor = parameters.get(MASS_FACTOR)
         h, filters = simulator.time_step, description.filters if description.learned is not None else ()
-        driven = [name for name, declared in inputs.items() if declared.is_driven]
-        responses = {name: response_of(simulator.inputs[name], parameters) for name in driven}
+        taken = [name for name, declared in inputs.items() if declared.is_taken]
+        responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
         self._responses = {name: InputResponse(h, *own, filters=filters) for name, own in responses.items()}
 
     def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> RobotState:

@@ -237,6 +237,7 @@ def describe(folder: Path, model: str) -> Description:
     own = intervals["models"].get(model, {})
     learned, actuation = learned_of(experiment, model), settings.actuation
     base = None if learned is None else experiment.base_movement_mask(simulator)
+    moved = dataset.contact_at(dataset.names, simulator.body, dataset.time_step)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,
@@ -255,7 +256,10 @@ def describe(folder: Path, model: str) -> Description:
         filters=actuation.filter_time_constants,
         sees_payload=model in LEARNED and (actuation.sees_payload or model == SIMFREE),
         told_of_base=None if base is None else tuple(base.tolist()),
-        seen={n: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist())) for n, x in dataset.inputs.items()},
+        seen={
+            name: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist()))
+            for name, x in {**dataset.inputs, **moved}.items()
+        },
         intervals=Intervals.from_plain(own.get("without_spread", own)),
         level=intervals["level"],
         errors_mm=errors.get("errors_mm", {}).get(model, {}),

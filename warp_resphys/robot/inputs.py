@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
+from ..energies.contact import MOTION
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError, listed
 from ..stepping.quantity import Quantity
@@ -45,6 +46,11 @@ class RobotInput:
     @property
     def is_driven(self) -> bool:
         """Whether it is the command of an actuator."""
+        return self.is_taken and self.quantity not in MOTION
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether an energy of the body takes it: the command of an actuator, or the motion of an obstacle."""
         return self.quantity not in (_UNLIMITED, PAYLOAD)
 
 

@@ -97,8 +97,8 @@ def condition_names(robot: Robot) -> Sequence[str]:
     description, names = robot.description, list[str]()
     if description.payload_at is not None and description.sees_payload:
         names.append("payload [kg]")
-    for driven in [robot.inputs[name] for name in robot.driven if name in description.seen]:
-        parts = [f"{driven.name} {part} [{driven.unit}]" for part in driven.parts]
+    for taken in [taken for name, taken in robot.inputs.items() if name in description.seen]:
+        parts = [f"{taken.name} {part} [{taken.unit}]" for part in taken.parts]
         names += parts + [f"mean of {part} over {seconds:g} s" for seconds in description.filters for part in parts]
     if description.told_of_base is not None:
         base = [f"{when} {what}" for when in ("during", "before") for what in _MOVEMENT]

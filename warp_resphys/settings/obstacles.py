@@ -11,6 +11,7 @@ from .mesh import Direction, LengthUnit
 class _Placed(Settings):
     position: Vector = setting((0.0, 0.0, 0.0), "of its centre; of a half-space, of a point of its plane", "m")
     axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
+    moves: bool = setting(False, "whether it moves, by `data.obstacle_motion` or by inputs of a robot")
 
 
 class HalfSpaceSettings(_Placed):

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
 from .mesh import LengthUnit, PlaceSettings
-from .trials import LimitSettings, different
+from .trials import LimitSettings, MotionSettings, different
 
 LEAST_MOVING = 3  # frames after a release, from which its motion is seen
 
@@ -223,6 +223,11 @@ class PictureData(Settings):
     def base_motion(self) -> None:
         """Motion of the base: bodies rest."""
         return None
+
+    @property
+    def obstacle_motion(self) -> dict[str, MotionSettings]:
+        """Motion of obstacles: none moves."""
+        return {}
 
     def limited(self) -> "PictureData":
         """Returns the data with as many poses of training, and of the test of their materials, as the limit allows."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from ..io.errors import InputError
+from ..io.errors import InputError, listed
 from ..io.settings import Natural, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
@@ -354,16 +354,50 @@ class RunSettings(SimulatorSettings):
         return self
 
     def motions(self) -> dict[str, MotionSettings]:
-        """Returns the configured motions of the base by dotted key."""
+        """Returns the configured motions of the base and of obstacles by dotted key."""
         common = self.data.base_motion
         motions = {"data.base_motion": common} if isinstance(common, MotionSettings) else {}
+        motions |= {
+            f"data.obstacle_motion.{name}": motion
+            for name, motion in self.data.obstacle_motion.items()
+            if isinstance(motion, MotionSettings)
+        }
         tables = {} if self.recorded is None or self.is_laboratory else {"data": self.recorded.trials}
         tables |= {} if self.laboratory is None or not self.is_laboratory else {"laboratory": self.laboratory.trials}
         for group, trials in tables.items():
             for name, trial in trials.items():
                 if trial.base_motion is not None:
                     motions[f"{group}.trials.{name}.base_motion"] = trial.base_motion
+                for obstacle, motion in trial.obstacle_motion.items():
+                    motions[f"{group}.trials.{name}.obstacle_motion.{obstacle}"] = motion
         return motions
+
+    @model_validator(mode="after")
+    def _moves_obstacles(self) -> Self:
+        common = self.data.obstacle_motion
+        recorded = [name for name, motion in common.items() if motion == "recorded"]
+        keys = {f"data.obstacle_motion.{name}": name for name in recorded}
+        keys |= {key: key.rpartition(".")[2] for key in self.motions() if ".obstacle_motion." in key}
+        for key, name in keys.items():
+            for prefix, body in self.bodies.items():
+                if name not in body.obstacles:
+                    has = listed([*body.obstacles]) if body.obstacles else "none"
+                    raise ValueError(f"{key} is of {name!r}, but {prefix}obstacles has {has}: choose one of them.")
+                if not body.obstacles[name].moves:
+                    raise ValueError(f"{key} moves {name!r}: set {prefix}obstacles.{name}.moves to true.")
+        if recorded and self.markers is not None:
+            taken = {*self.markers.tracked, *self.markers.reference, *self.markers.rigid_bodies}
+            if self.markers.labels == "assigned":
+                raise ValueError(
+                    f"data.obstacle_motion.{recorded[0]} is recorded by a marker of its name, but markers.labels is "
+                    "assigned: use recordings with names, or give the motion."
+                )
+            if both := [name for name in recorded if name in taken]:
+                raise ValueError(
+                    f"data.obstacle_motion.{both[0]} is recorded by a marker of its name, which is one of the body, "
+                    "too: give the obstacle another name."
+                )
+        return self
 
     @model_validator(mode="after")
     def _view(self) -> Self:
@@ -380,8 +414,11 @@ class RunSettings(SimulatorSettings):
                 "markers.plane is set, but data.axes is not: name the axes of the recordings along which the body's x, "
                 "y and z are, which define the axis that is not observed."
             )
-        if markers.frame == "own" and (data.base_motion is not None or self.motions()):
-            raise ValueError("markers.frame is own, but a base_motion defines where the body is: take one of them out.")
+        if markers.frame == "own" and (data.base_motion is not None or data.obstacle_motion or self.motions()):
+            raise ValueError(
+                "markers.frame is own, but base_motion and obstacle_motion need to know where the body is: take one of "
+                "them out."
+            )
         whole = markers.plane is None and markers.frame == "body"
         if not whole and self.identify is not None and self.identify.placement is not None:
             raise ValueError(

@@ -35,7 +35,7 @@ Trials = Count | Literal["others"] | Many[Word]
 
 
 class SwingSettings(Settings):
-    """A sinusoid of a base's motion."""
+    """A sinusoid of a motion."""
 
     frequency: Positive = setting(unit="Hz")
     translation: Vector = setting((0.0, 0.0, 0.0), "amplitudes along x, y and z", "m")
@@ -44,7 +44,7 @@ class SwingSettings(Settings):
 
 
 class MotionSettings(Settings):
-    """Motion of the base: a table of poses in a file, or a sum of sinusoids."""
+    """Motion of the base or of an obstacle: a table of poses in a file, or a sum of sinusoids."""
 
     file: Word | None = setting(None, "table of poses, in the folder of the recordings")
     swings: dict[str, SwingSettings] | None = setting(None, "sinusoids, by any names")
@@ -62,6 +62,7 @@ class MotionSettings(Settings):
 
 
 BaseMotion = MotionSettings | Literal["recorded", "reference"] | None
+ObstacleMotions = dict[str, MotionSettings]  # by obstacle
 
 
 class TrialSettings(Settings):
@@ -77,6 +78,7 @@ class TrialSettings(Settings):
     payload: NotNegative = setting(0.0, "mass that hangs on the body", "kg")
     pull: Vector | None = setting(None, "force at the tip that holds a simulated body before its release", "N")
     base_motion: MotionSettings | None = setting(None, "of this trial, in place of data.base_motion")
+    obstacle_motion: ObstacleMotions = setting({}, "of this trial, in place of data.obstacle_motion, by obstacle")
 
 
 def _file(value: Any) -> Any:
@@ -113,6 +115,7 @@ class Trial(Settings):
     input_delay: float = 0.0  # [s]
     labels: Many[str] | None = None
     base_motion: MotionSettings | None = None
+    obstacle_motion: ObstacleMotions = Field(default_factory=dict)
     load: "HeldSettings | None" = None  # how it is held, where that differs from the other trials
 
     @property
@@ -172,6 +175,7 @@ class AmountSettings(Settings):
 class _Simulated(Settings):
     steps: Natural = setting(description="of each trial")
     base_motion: MotionSettings | None = setting(None, "motion of the base")
+    obstacle_motion: ObstacleMotions = setting({}, "motion of obstacles from their places, by obstacle")
     folds: Literal["leave_one_out"] | None = setting(None, "cross-validation in place of the split")
     limit: LimitSettings | None = setting(None, "fewer trials, evenly chosen")
 
@@ -265,6 +269,10 @@ class ReadingSettings(Settings):
         "own", "own: each trial is shifted to the mean positions of the markers, as they drift"
     )
     base_motion: BaseMotion = setting(None, "motion of the base: recorded, reference (by markers), or given")
+    obstacle_motion: dict[str, MotionSettings | Literal["recorded"]] = setting(
+        {},
+        "motion of obstacles from their places, by obstacle: given, or recorded by a marker or rigid body of its name",
+    )
     payload_at: PlaceSettings | None = setting(None, "vertices that carry payloads, in equal shares")
     up: SignedAxis | Direction | None = setting(
         None, "direction against gravity in the frame of the recordings; null: gravity is as configured"

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from ..control.replay import driven_settings, replay
+from ..energies.contact import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
 from ..io.files import read_json
@@ -133,6 +134,9 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
     from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
     seen, obstacles = played.markers[frames][:, some], ObstacleSurface.of(robot.simulator.body, robot.parameters)
+    acting = {name: values[:, 0].double().cpu().numpy() for name, values in whole.inputs.items()}
+    steps = np.clip(np.rint(times / robot.time_step).astype(int) - 1, 0, None)
+    obstacles = obstacles.moved({q.name: acting[q.name][steps] for q in MOTION if q.name in acting})
     return ComparedMotion(mesh, times, seen, positions, markers, bound, gravity, from_below, obstacles=obstacles)
 
 

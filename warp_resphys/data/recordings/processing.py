@@ -77,7 +77,9 @@ def resample(recording: Recording, rate: float) -> Recording:
     if recording.actuation is not None:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
     base = None if recording.base is None else at_times(recording.base, old, new)
-    return dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
+    moved = {name: at_times(poses, old, new) for name, poses in recording.obstacles.items()}
+    resampled = dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
+    return dataclasses.replace(resampled, obstacles=moved)
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +41,8 @@ class Recording:
     # (T, 6) motion of the base since the first frame, if recorded; see `data.base_motion`
     base: FloatArray | None = None
     start: float = 0.0  # Time of the first frame [s]; after `trim_to_release`, since the release
+    # (T, 6) motions of obstacles, if recorded; see `data.obstacle_motion`
+    obstacles: Mapping[str, FloatArray] = dataclasses.field(default_factory=dict)
 
     @property
     def seen(self) -> BoolArray:
@@ -72,7 +74,9 @@ class Recording:
     def frames(self, chosen: slice) -> "Recording":
         """Returns some of the frames, with rate and start unchanged."""
         actuation, base = (None if series is None else series[chosen] for series in (self.actuation, self.base))
-        return dataclasses.replace(self, positions=self.positions[chosen], actuation=actuation, base=base)
+        obstacles = {name: poses[chosen] for name, poses in self.obstacles.items()}
+        positions = self.positions[chosen]
+        return dataclasses.replace(self, positions=positions, actuation=actuation, base=base, obstacles=obstacles)
 
 
 @dataclasses.dataclass(frozen=True)

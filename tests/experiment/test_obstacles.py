@@ -21,7 +21,6 @@ from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.identification_section import parameter_wording
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
-from warp_resphys.robot.twin.full import FullEstimator
 from warp_resphys.settings.body import SimulatorSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
@@ -229,11 +228,6 @@ def test_an_environment_steps_and_draws_with_obstacles():
         furthest.append(world.bodies()[1][..., 0].max())
         assert world.obstacles().points.shape == (16, 3)
     assert 0.019 < furthest[0] < 0.02 < furthest[1]
-
-
-def test_a_twin_is_refused(robot):
-    with pytest.raises(InputError, match="a twin cannot follow a robot with obstacles"):
-        FullEstimator(robot, {})
 
 
 def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):

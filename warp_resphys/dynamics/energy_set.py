@@ -196,6 +196,13 @@ class EnergySet:
                 motions += [replace(motion, name=f"{placed.prefix}{motion.name}") for motion in own]
         return tuple(motions)
 
+    def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
+        """Returns positions (B, N, 3) [m] out of obstacles, see `Simulator.outside`."""
+        for placed, bound in self._pairs:
+            if isinstance(bound, BoundContact):
+                q = bound.outside(q, state, placed.own_constants(constants))
+        return q
+
     @staticmethod
     def _remembered(
         remembering: Sequence[tuple[int, tuple[PlacedEnergy, BoundEnergy]]],

@@ -295,6 +295,20 @@ class Simulator:
         x = self.method.solution_for(state, q)
         return State(q, state.v, memory=self._end_step(state, stage, inputs or _NO_INPUTS, constants, x, q))
 
+    def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
+        """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.
+
+        Args:
+            q: positions, of which some may be within an obstacle.
+            state: nearby, out of all obstacles: vertices are pushed to their gap in it, or to half of the distance at
+                which contact begins, whichever is less.
+            constants: constants from `prepare`.
+
+        Raises:
+            InputError: the obstacles leave no place.
+        """
+        return self._energies.outside(q, state, constants)
+
     def contacts(
         self, state: State, after: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> dict[str, ContactForces | SurfaceForces]:

@@ -466,6 +466,21 @@ class BoundContact(BoundEnergy):
         self._check(q, pose, "after an obstacle has moved")
         return q
 
+    def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
+        """Returns positions (B, N, 3) [m] out of the obstacles, at least by the gaps of a state, at most by half of D.
+
+        Raises:
+            InputError: the obstacles leave no place.
+        """
+        pose = Pose(
+            *(
+                constants.value(name).expand(state.batch, *constants.value(name).shape[1:])
+                for name in (*POSE, GROWTH.name)
+            )
+        )
+        gaps, _ = self._shapes.distances(state.q[:, self._vertices], pose)
+        return self._pushed_out(q, pose, gaps)
+
     def _check_body(self, body: Body) -> None:
         """Raises InputError for a body whose vertices contact cannot move on their own."""
         if len(body.symmetry) or len(body.glued):

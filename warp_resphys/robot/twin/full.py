@@ -68,7 +68,8 @@ class FullEstimator(TwinEstimator[FullBelief]):
         start: of the robot, one environment; its equilibrium under the inputs if omitted.
 
     Raises:
-        InputError: an unknown parameter or input; a network in place of the simulator; obstacles.
+        InputError: an unknown parameter or input; a network in place of the simulator; obstacles that move, or
+            parameters to refine beside obstacles.
         ConvergenceError: there is no equilibrium.
     """
 
@@ -84,9 +85,13 @@ class FullEstimator(TwinEstimator[FullBelief]):
     ) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
-        if any(isinstance(energy, Contact) for energy in robot.simulator.body.energies):
+        contacts = [energy for energy in robot.simulator.body.energies if isinstance(energy, Contact)]
+        if any(contact.moves for contact in contacts):
+            raise InputError("a twin cannot follow a robot with obstacles that move: set moves to false.")
+        if contacts and refine:
             raise InputError(
-                "a twin cannot follow a robot with obstacles, into which its corrections would move the body."
+                "a twin of a robot with obstacles refines no parameters, as a body that lies on one hardly shows them: "
+                "leave refine out."
             )
         self._refined, self.robot = dict(refine or {}), robot
         self._check()

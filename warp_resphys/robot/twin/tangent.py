@@ -126,7 +126,7 @@ def pulled_by(robot: Steppable, inputs: Mapping[str, Given], forces: torch.Tenso
 def shifted(
     robot: Steppable, state: RobotState, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True
 ) -> RobotState:
-    """Returns a state with other positions and velocities, and a past that fits them.
+    """Returns a state with other positions and velocities, and a past that fits them; obstacles push the body out.
 
     Args:
         robot: in this state.
@@ -137,7 +137,8 @@ def shifted(
             had always been there.
     """
     body, memory = state.body, dict(state.body.memory)
-    q, v = body.q + moved, body.v + faster
+    q, v = robot.simulator.outside(body.q + moved, body, robot.constants), body.v + faster
+    moved = q - body.q
     if at_once and memory:
         after, before = (robot.simulator.remember(body, x, robot.constants).memory for x in (q, body.q))
         memory = {name: value + (after[name] - before[name]) for name, value in memory.items()}

@@ -22,6 +22,7 @@ from warp_resphys.report.identification_section import parameter_wording
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
+from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
 
@@ -241,3 +242,31 @@ def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):
     page.run(0.05)
     moved = meshes["/obstacles"].vertices - before
     np.testing.assert_allclose(moved, np.tile([0.0, 0.0, -1e-3 / live.size], (8, 1)), atol=1e-6)
+
+
+def test_the_tentacle_curls_around_its_post_and_not_onto_itself():
+    """It goes through the place of the post where that is elsewhere, and lies on it otherwise, far from itself."""
+    run = settings("experiment=tentacle_wrap", "mesh.layers=8")
+    simulator, post = build_simulator(run, run.simulation), run.obstacles["post"]
+    vertices = simulator.body.mesh.vertices
+    ends = {}
+    for name, shift in {"around": 0.0, "alone": 1.0}.items():
+        constants = simulator.prepare({"obstacle_x": simulator.tensor([[shift]])})
+        state = simulator.rest_state()
+        for number in range(100):
+            tension = simulator.tensor([[run.data.input_limit * min(number / 80, 1.0), 0.0]])
+            before, inputs = state, Inputs(tendon_tension=tension)
+            state, _ = simulator.step(state, inputs, constants)
+        ends[name] = state.q[0].numpy()
+        if name == "around":
+            forces = simulator.contacts(before, state, inputs, constants)[""]
+    away = {name: np.linalg.norm((q - post.position)[:, [0, 2]], axis=1) - post.radius for name, q in ends.items()}
+    assert away["alone"].min() < -5e-3
+    assert 0.0 < away["around"].min() < run.contact.distance
+    assert float(forces.normal.sum((1, 2))[0, 0]) < -0.1  # N: it pulls itself against the post.
+    layers = np.unique(vertices[:, 2].round(6))
+    line = np.stack([ends["around"][np.isclose(vertices[:, 2], z, atol=1e-5)].mean(axis=0) for z in layers])
+    tip = line[0] - line[1]
+    assert tip[2] > 0.7 * np.linalg.norm(tip)  # The tip points up, where it hangs down at rest.
+    far = np.abs(layers[:, None] - layers) > 0.08
+    assert np.linalg.norm(line[:, None] - line, axis=2)[far].min() > 0.03

@@ -42,8 +42,12 @@ def with_hand(robot: Robot) -> Robot:
     if not settings.obstacles:
         modulus = np.ravel(robot.parameters.get("youngs_modulus", about.material.constants.get("youngs_modulus", ())))
         stiffness = float(modulus[0]) if len(modulus) == 1 else _STIFFNESS
-        fields = {"stiffness": stiffness, "friction": _FRICTION, "slip_speed": _SLIP_SPEED * size}
-        contact = ContactSettings(distance=_DISTANCE * thickness, **fields)
+        contact = ContactSettings(
+            stiffness=stiffness,
+            friction=_FRICTION,
+            distance=_DISTANCE * thickness,
+            slip_speed=_SLIP_SPEED * size,
+        )
     by_obstacle = {
         key: {**values, HAND: max(values.values())}
         for key in ("stiffness", "friction")

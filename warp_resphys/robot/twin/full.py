@@ -17,6 +17,7 @@ from typing_extensions import override
 
 from ...energies.contact import Contact
 from ...energies.strings import PAYLOAD
+from ...energies.surfaces import SurfaceContact
 from ...io.errors import ConvergenceError, InputError, listed
 from ...learning.parameters import check_names, identifiable_parameters
 from ...stepping.quantity import Quantity
@@ -85,6 +86,11 @@ class FullEstimator(TwinEstimator[FullBelief]):
     ) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
+        if any(isinstance(energy, SurfaceContact) for energy in robot.simulator.body.energies):
+            raise InputError(
+                "a twin cannot follow a robot with contact between surfaces, which its corrections would make cross: "
+                "set self_contact=null."
+            )
         contacts = [energy for energy in robot.simulator.body.energies if isinstance(energy, Contact)]
         if any(contact.moves for contact in contacts):
             raise InputError("a twin cannot follow a robot with obstacles that move: set moves to false.")

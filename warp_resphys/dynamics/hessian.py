@@ -1,13 +1,14 @@
 """The matrix of the global step: a Hessian, or the constant matrix of projective dynamics."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..energies.base import PointSet
+from ..energies.base import PairTangents, PointSet
 from ..energies.potential import IncrementalPotential
 from ..linalg.coupling import Coupling, CouplingSolver
 from ..linalg.linear_solver import Factor, LinearSolver
@@ -40,8 +41,13 @@ class HessianApproximation(ABC):
         """
 
     @abstractmethod
-    def solve_in_place(self, right: torch.Tensor) -> None:
-        """Overwrites residuals (B, F, 3) [N] at the free vertices, ordered as `vertex_at`, with displacements [m]."""
+    def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
+        """Overwrites residuals (B, F, 3) [N] at the free vertices, ordered as `vertex_at`, with displacements [m].
+
+        Args:
+            right: the residuals.
+            needed: (B,) environments whose displacements are used.
+        """
 
 
 class ExactHessian(HessianApproximation):
@@ -114,16 +120,16 @@ class ExactHessian(HessianApproximation):
             self._coupled.forget(range(self._potential.batch))
 
     @override
-    def solve_in_place(self, right: torch.Tensor) -> None:
+    def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         self._factor.solve_in_place(right.flatten(1))
         if self._potential.has_pairs:
-            self._correct(right.flatten(1)[:, :, None], self.linear.dofs, clamp=True)
+            self._correct(self._potential.pair_tangents(True, needed), right.flatten(1)[:, :, None], self.linear.dofs)
 
-    def _correct(self, x: torch.Tensor, order: torch.Tensor, clamp: bool) -> None:
-        """Adds the coupling of pairs at the potential's positions to solutions (B, n, k) without it."""
-        couplings = self.couplings(clamp)
+    def _correct(self, parts: Sequence[PairTangents], x: torch.Tensor, order: torch.Tensor) -> None:
+        """Adds the coupling of pairs to solutions (B, n, k) without it."""
+        couplings = self.couplings(parts)
         if not couplings:
             return
         if self._coupled is None:
@@ -131,10 +137,8 @@ class ExactHessian(HessianApproximation):
         assert self._factor is not None
         self._coupled.correct(self._factor, couplings, x, order)
 
-    def couplings(self, clamp: bool) -> list[Coupling]:
-        """Returns the coupling of pairs by environment: a clamped one at the positions, or that of the last tangent."""
-        p = self._potential
-        parts = p.pair_tangents(clamp=True) if clamp else p.last_pair_tangents
+    def couplings(self, parts: Sequence[PairTangents]) -> list[Coupling]:
+        """Returns second derivatives of pairs as matrices of the unknowns, by environment."""
         if not parts:
             return []
         environment = torch.cat([part.environment for part in parts])
@@ -161,7 +165,7 @@ class ExactHessian(HessianApproximation):
         out = torch.zeros_like(right)
         x = self._factor.solve(right[:, self._dofs].to(self.linear.dtype))
         if self._potential.has_pairs:
-            self._correct(x, torch.arange(x.shape[1], device=x.device), clamp=False)
+            self._correct(self._potential.last_pair_tangents, x, torch.arange(x.shape[1], device=x.device))
         out[:, self._dofs] = x.to(right.dtype)
         return out
 
@@ -226,7 +230,8 @@ class ProjectiveHessian(HessianApproximation):
         self._factor = self._linear.factor(values.to(self._linear.dtype))
 
     @override
-    def solve_in_place(self, right: torch.Tensor) -> None:
+    def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
+        del needed
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         right.copy_(self._factor.solve(right))

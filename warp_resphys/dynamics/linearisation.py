@@ -117,7 +117,7 @@ class Linearisation:
             columns = p.low_rank[0].view(p.n_vertices, 3, -1)[self.free].flatten(0, 1)
             columns = scipy.sparse.csc_array(columns.cpu().numpy())
             matrix = scipy.sparse.csc_array(matrix + columns @ columns.T)
-        for coupling in self._workspace.hessian(self._name).couplings(clamp=False):
+        for coupling in self._workspace.hessian(self._name).couplings(p.last_pair_tangents):
             if coupling.environment == 0:
                 at, block = coupling.unknowns.cpu().numpy(), coupling.matrix.cpu().numpy()
                 pairs = (block.ravel(), (np.repeat(at, len(at)), np.tile(at, len(at))))

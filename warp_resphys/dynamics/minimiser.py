@@ -226,7 +226,7 @@ class Minimiser:
         p = self._potential
         if state.directions:
             p.launch(self._project)
-            self._hessian.solve_in_place(self._right)
+            self._hessian.solve_in_place(self._right, self._progress["phase"] == kernels.NEED_DIRECTION)
             p.launch(self._first_trial)
         else:
             p.launch(self._evaluate)

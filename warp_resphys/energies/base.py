@@ -353,15 +353,16 @@ class Term(ABC):
         del values, positions
         return None
 
-    def pair_tangents(self, values: Values, positions: Any, clamp: bool) -> PairTangents | None:
+    def pair_tangents(self, values: Values, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
         """Returns the part of the Hessian that couples vertices of different cells, or None.
 
         Args:
             values: buffers of the values.
             positions: Warp array (B, N) of the positions [m].
             clamp: whether negative eigenvalues are left out.
+            active: (B,) zero for environments that are left out.
         """
-        del values, positions, clamp
+        del values, positions, clamp, active
         return None
 
     def set_step(self, values: Values) -> None:

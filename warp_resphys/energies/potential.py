@@ -235,14 +235,16 @@ class IncrementalPotential(Launcher):
             whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 
-    def pair_tangents(self, clamp: bool = False) -> list[PairTangents]:
+    def pair_tangents(self, clamp: bool = False, active: torch.Tensor | None = None) -> list[PairTangents]:
         """Returns the parts of the Hessian at ``positions`` that couple vertices of different cells.
 
         Args:
             clamp: whether negative eigenvalues are left out.
+            active: (B,) zero for environments that are left out; None: those of ``active``.
         """
+        chosen = self.active if active is None else active
         pairs = zip(self.energies, self.own_values, strict=True)
-        parts = (term.pair_tangents(values, self._position_view, clamp) for term, values in pairs)
+        parts = (term.pair_tangents(values, self._position_view, clamp, chosen) for term, values in pairs)
         return [part for part in parts if part is not None]
 
     @property

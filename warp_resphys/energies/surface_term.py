@@ -181,15 +181,15 @@ class SurfaceTerm(Term):
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         return [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
 
-    def _chosen(self) -> torch.Tensor:
-        """Returns the pairs that were near at the last evaluation."""
+    def _chosen(self, active: torch.Tensor) -> torch.Tensor:
+        """Returns the pairs of active environments that were near at the last evaluation."""
         if self._sized != self._list.version or not self._list.count:
             return torch.zeros(0, device=self.launcher.device, dtype=torch.int64)
-        return (self._near * self.launcher.active[self._list.environment]).nonzero().ravel()
+        return (self._near * active[self._list.environment]).nonzero().ravel()
 
     @override
-    def pair_tangents(self, values: Values, positions: Any, clamp: bool) -> PairTangents | None:
-        own, chosen, parts = self.launcher, self._chosen(), list[PairTangents]()
+    def pair_tangents(self, values: Values, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
+        own, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
             stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
@@ -204,7 +204,8 @@ class SurfaceTerm(Term):
             blocks = self._force.new_zeros(grips.count, 12, 12)
             inputs = [grips.struct, *self._friction(values), positions]
             own.launch(own.record(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)]))
-            parts.append(PairTangents(grips.environment, grips.nodes, blocks))
+            used = active.bool()[grips.environment]
+            parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
         if not parts:
             return None
         names = ("environment", "nodes", "blocks")
@@ -244,7 +245,7 @@ class SurfaceTerm(Term):
             self._list.find(positions, torch.zeros_like(positions))
         active = warp_view(self.launcher.active, wp.int32)
         self.launcher.launch(*self._record(values, warp_view(positions, wp.vec3d), active))
-        return self._chosen()
+        return self._chosen(self.launcher.active)
 
     def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> "_Near":
         """Returns the geometry of chosen pairs at positions (B, N, 3), differentiable."""

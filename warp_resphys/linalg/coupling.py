@@ -52,10 +52,10 @@ class CouplingSolver:
         place[order] = torch.arange(len(order), device=order.device)
         for coupling in couplings:
             b, own = coupling.environment, coupling.unknowns
-            columns, solved, k = self._places[b][own], self._solved[b], coupling.matrix.to(x.dtype)
-            small = torch.eye(len(own), device=x.device, dtype=x.dtype) + k @ solved[own[:, None], columns]
+            columns, solved, k = self._places[b][own], self._solved[b], coupling.matrix
+            small = torch.eye(len(own), device=x.device, dtype=k.dtype) + k @ solved[own[:, None], columns].to(k)
             along = x.new_zeros(solved.shape[1], x.shape[2])
-            along[columns] = torch.linalg.solve(small, k @ x[b, place[own]])
+            along[columns] = torch.linalg.solve(small, k @ x[b, place[own]].to(k)).to(x)
             x[b] -= (solved @ along)[order]
 
     def _solve_missing(self, factor: Factor, couplings: Sequence[Coupling], batch: int) -> None:

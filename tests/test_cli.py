@@ -145,7 +145,7 @@ class TestOwnOptions:
 
     def test_help_names_them(self, command, own):
         _, out, err = outcome("--help")
-        assert re.search("^experiment: beam_.*, my_robot, .*, tentacle$", out, flags=re.MULTILINE)
+        assert re.search("^experiment: beam_.*, my_robot, .*, tentacle_wrap$", out, flags=re.MULTILINE)
         assert err == ""
 
     def test_another_folder_takes_their_place(self, command, own):

@@ -69,6 +69,17 @@ def pair_forces(launcher, pairs, x, stiffness, reach):
     return energy.numpy(), force.numpy()
 
 
+def pair_tangents(launcher, pairs, x, stiffness, reach):
+    """Second derivatives (C, 12, 12) of the energies of pairs at positions (C, 4, 3)."""
+    count, at = len(x), torch.tensor(x.reshape(1, -1, 3))
+    hessian = torch.zeros(count, 12, 12, dtype=torch.float64)
+    chosen, kappa = torch.arange(count, dtype=torch.int32), torch.tensor([[stiffness]], dtype=torch.float64)
+    inputs = [warp_view(chosen, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
+    out = [warp_view(hessian, wp.float64)]
+    launcher.launch(launcher.record(kernels.pair_tangents, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    return hessian.numpy()
+
+
 @pytest.mark.parametrize("kind", [0, 1])
 def test_derivatives_of_pairs(kind):
     """Vertex and triangle, and edges, also almost parallel ones, at random: gradient and Hessian are differences."""
@@ -79,12 +90,7 @@ def test_derivatives_of_pairs(kind):
     given = (np.full(count, kind), x, random.uniform(0.5, 2.0, count), degree, parallel)
     launcher, pairs = pairs_of(*given)
     energy, force = pair_forces(launcher, pairs, x, 3.0, reach)
-    hessian = torch.zeros(count, 12, 12, dtype=torch.float64)
-    chosen, kappa = torch.arange(count, dtype=torch.int32), torch.tensor([[3.0]], dtype=torch.float64)
-    at = torch.tensor(x.reshape(1, -1, 3))
-    inputs = [warp_view(chosen, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
-    out = [warp_view(hessian, wp.float64)]
-    launcher.launch(launcher.record(kernels.pair_tangents, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    hessian = pair_tangents(launcher, pairs, x, 3.0, reach)
     slopes, curvatures, h = np.zeros((count, 12)), np.zeros((count, 12, 12)), 1e-6
     for k in range(12):
         way = np.zeros((count, 12))
@@ -96,8 +102,80 @@ def test_derivatives_of_pairs(kind):
     assert (energy != 0.0).sum() > 200
     size = 1e-3 + np.abs(slopes).max(1)
     assert (np.abs(slopes - force.reshape(count, 12)).max(1) / size).max() < 1e-6
-    errors = np.abs(hessian.numpy() - curvatures).max((1, 2)) / (1e-2 + np.abs(curvatures).max((1, 2)))
+    errors = np.abs(hessian - curvatures).max((1, 2)) / (1e-2 + np.abs(curvatures).max((1, 2)))
     assert np.quantile(errors, 0.99) < 1e-6  # in between, a difference crosses a change of the nearest feature
+
+
+def peer_barrier(ipctk, kind, x, width, reach):
+    """Energy, gradient (12,) and Hessian (12, 12) of D B(d / D) of a pair, with the factor of edges, by ipctk."""
+    of = "edge_edge" if kind else "point_triangle"
+    d2, g2, h2 = (getattr(ipctk, f"{of}_distance{part}")(*x) for part in ("", "_gradient", "_hessian"))
+    d = math.sqrt(d2)
+    n = g2 / (2.0 * d)
+    curved = (0.5 * h2 - np.outer(n, n)) / d
+    # Its barrier is (d - D)^2 ln(d / D) with a minus sign.
+    b, b1, b2 = (
+        getattr(ipctk, f"barrier{part}")(d, reach) / reach for part in ("", "_first_derivative", "_second_derivative")
+    )
+    energy, slope, hessian = b, b1 * n, b2 * np.outer(n, n) + b1 * curved
+    if kind:
+        m, m1, m2 = (getattr(ipctk, f"edge_edge_mollifier{part}")(*x, width) for part in ("", "_gradient", "_hessian"))
+        hessian = m * hessian + np.outer(m1, slope) + np.outer(slope, m1) + energy * m2
+        energy, slope = m * energy, m * slope + energy * m1
+    return energy, slope, hessian
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_pairs_are_those_of_ipctk(kind):
+    """Energy, gradient and Hessian where the nearest points are inside of both parts."""
+    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
+    random, reach = np.random.default_rng(kind + 5), 0.25
+    x = random.normal(size=(4000, 4, 3))
+    ends = (
+        [(0, (1, 2)), (0, (1, 3)), (0, (2, 3))]
+        if kind == 0
+        else [(k, (2, 3)) for k in (0, 1)] + [(k, (0, 1)) for k in (2, 3)]
+    )
+    far = [all(ipctk.point_edge_distance(y[p], y[a], y[b]) > reach**2 for p, (a, b) in ends) for y in x]
+    near = [(ipctk.edge_edge_distance if kind else ipctk.point_triangle_distance)(*y) < reach**2 for y in x]
+    x = x[np.array(far) & np.array(near)]
+    count = len(x)
+    assert count > 30
+    width = np.full(count, 20.0)  # most edges are almost parallel for it
+    launcher, pairs = pairs_of(np.full(count, kind), x, np.ones(count), np.full((count, 4), 5.0), width)
+    energy, force = pair_forces(launcher, pairs, x, 1.0, reach)
+    hessian = pair_tangents(launcher, pairs, x, 1.0, reach)
+    for c in range(count):
+        expected = peer_barrier(ipctk, kind, x[c], width[c], reach)
+        actual = (energy[c], force[c].ravel(), hessian[c])
+        for own, peer in zip(actual, expected, strict=True):
+            assert own == pytest.approx(peer, rel=1e-9, abs=1e-11 * float(np.abs(peer).max()))
+
+
+def test_listed_pairs_are_those_of_ipctk():
+    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
+    mesh, x = joined()
+    surface, reach = Surface.of(mesh), 3e-3
+    pairs = PairList(Launcher(3, CPU), surface, reach)
+    pairs.find(x, torch.zeros_like(x))
+    within = pairs.distances(x) < reach
+    peer = ipctk.CollisionMesh(mesh.vertices, surface.edges, surface.triangles)
+    for b in range(3):
+        q, candidates = x[b].numpy(), ipctk.Candidates()
+        candidates.build(peer, q, reach)
+        expected = {
+            (0, k.vertex_id, *surface.triangles[k.face_id])
+            for k in candidates.fv_candidates
+            if ipctk.point_triangle_distance(q[k.vertex_id], *q[surface.triangles[k.face_id]]) < reach**2
+        } | {
+            (1, *(edge for e in sorted((k.edge0_id, k.edge1_id)) for edge in surface.edges[e]))
+            for k in candidates.ee_candidates
+            if ipctk.edge_edge_distance(*q[surface.edges[k.edge0_id]], *q[surface.edges[k.edge1_id]]) < reach**2
+        }
+        own = within & (pairs.environment == b)
+        listed = zip(pairs.kind[own].tolist(), pairs.nodes[own].tolist(), strict=True)
+        assert {(kind, *nodes) for kind, nodes in listed} == expected
+        assert not ipctk.has_intersections(peer, q)
 
 
 def joined():

@@ -212,7 +212,7 @@ class TestReducedModel:
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ())
         body, energies = robot.simulator.body, robot.simulator.body.energies
         monkeypatch.setitem(vars(body), "energies", [*energies, Contact({"floor": HalfSpace(position=(0, 0, -9))})])
-        with pytest.raises(InputError, match="obstacles cannot be reduced"):
+        with pytest.raises(InputError, match="in contact cannot be reduced"):
             sampling.check_reducible(robot)
         monkeypatch.setitem(vars(body), "energies", [*energies, SimpleNamespace(memory=("slide",))])
         with pytest.raises(InputError, match="with memory"):

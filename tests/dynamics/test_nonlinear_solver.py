@@ -321,7 +321,7 @@ class DiagonalMetric:
     def refactor(self, clamp=None, active=None):
         """It is always the same."""
 
-    def solve_in_place(self, right):
+    def solve_in_place(self, right, needed):
         right.mul_(self.inverse)
 
 

@@ -81,9 +81,7 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "verify device": Command(
             "compare a device with the CPU, and time both: a page of results", "studies.device_check:check_device"
         ),
-        "verify contact": Command(
-            "contact with obstacles beside theory: a page of results", "studies.contact_check:contact_check"
-        ),
+        "verify contact": Command("contact beside theory: a page of results", "studies.contact_check:contact_check"),
         "train-policy": Command(
             "learn a policy on a run's robot, and try it on its laboratory",
             "studies.policy:train_policy",

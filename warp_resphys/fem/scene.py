@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh, join
 from ..stepping.inputs import Inputs
-from .body import Body
+from .body import Body, BodyEnergy
 from .coordinates import Coordinates
 
 _FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex
@@ -31,7 +30,7 @@ class Scene(Body):
         InputError: no body.
     """
 
-    def __init__(self, bodies: Mapping[str, Body], contact: Any = None) -> None:
+    def __init__(self, bodies: Mapping[str, Body], contact: BodyEnergy | None = None) -> None:
         if not bodies:
             raise InputError("a scene needs one or more bodies: give them by name.")
         object.__setattr__(self, "bodies", dict(bodies))
@@ -40,7 +39,7 @@ class Scene(Body):
         object.__setattr__(self, "contact", contact)
 
     bodies: Mapping[str, Body]
-    contact: Any
+    contact: BodyEnergy | None
 
     @cached_property
     def mesh(self) -> Mesh:

@@ -1,4 +1,4 @@
-"""Contact with obstacles beside theory, and the time of a step in contact; a page of results.
+"""Contact beside theory, and the time of a step in contact; a page of results.
 
 ==================  ==================================================================================================
 incline             a block sticks up to arctan mu, where it creeps with v_s (1 - sqrt(1 - tan a / mu)), and is

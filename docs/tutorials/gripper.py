@@ -10,7 +10,7 @@
 #
 # Two soft fingers with tendons grasp a soft ball on a table, lift it, and shake it. Everything touches everything: the
 # ball the table, the fingers the ball ([the equations](../theory.md#contact)). Gradients pass through all of it, and
-# find a course of the tension that needs less than any constant one.
+# find a course of the tension that needs less than ten constant ones that were tried.
 #
 # ## Fingers, ball and table
 
@@ -121,7 +121,9 @@ least = int(torch.where(heights >= HELD, efforts, torch.inf).argmin())
 #
 # Also ten simulations, where one with its gradient counts as two: five steps of Adam from 1.4 N, for less tension and
 # against every millimetre that is missing. A ball that was dropped has no gradient that leads back, so the steps
-# are small, and the best course that holds the ball counts.
+# are small, and the best course that holds the ball counts. Start, size and number of the steps were chosen by trials
+# of this task: with more steps the ball falls. The constant tension of 1.3 N misses the mark by 0.1 mm, and would need
+# 1.16 N on average.
 
 # %%
 knots = torch.full((1, 6), 1.4, dtype=torch.float64, requires_grad=True)

@@ -47,6 +47,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
 from ..stepping.state import State
+from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .obstacle_surfaces import ObstacleMotion
@@ -347,8 +348,7 @@ class BoundContact(BoundEnergy):
 
     def _load(self, d: torch.Tensor, constants: Constants) -> torch.Tensor:
         """Returns the normal forces (B, P, O) at distances [N]."""
-        s = (d / self._contact.distance).clamp_max(1.0)
-        pressure = 2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s
+        pressure = barrier_pressure(d, self._contact.distance)
         return constants.value(STIFFNESS.name)[:, None] * self._area[:, None] * pressure
 
     def forces(self, step: EnergyStep, x: torch.Tensor) -> ContactForces:
@@ -358,9 +358,8 @@ class BoundContact(BoundEnergy):
         d, n = self._shapes.distances(at, pose)
         normal, way = value_of(values, "contact_normal"), at[:, :, None] - value_of(values, "contact_reference")
         u = way - (way * normal).sum(-1, keepdim=True) * normal
-        slip, square = value_of(values, "contact_slip")[..., None], u.square().sum(-1)
-        y = torch.where(square > 0.0, square.clamp_min(torch.finfo(u.dtype).tiny).sqrt(), 0.0)
-        factor = torch.where(y < slip, (2.0 - y / slip) / slip, 1.0 / y.clamp_min(torch.finfo(u.dtype).tiny))
+        slip = value_of(values, "contact_slip")[..., None]
+        y, factor = friction_over_slide(u, slip)
         most = step.constants.value(FRICTION.name)[:, None] * value_of(values, "contact_load")
         return ContactForces(
             self._contact.names,
@@ -472,12 +471,7 @@ class BoundContact(BoundEnergy):
         Raises:
             InputError: the obstacles leave no place.
         """
-        pose = Pose(
-            *(
-                constants.value(name).expand(state.batch, *constants.value(name).shape[1:])
-                for name in (*POSE, GROWTH.name)
-            )
-        )
+        pose = self._pose(Inputs(), constants, state.batch)
         gaps, _ = self._shapes.distances(state.q[:, self._vertices], pose)
         return self._pushed_out(q, pose, gaps)
 

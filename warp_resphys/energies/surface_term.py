@@ -12,6 +12,7 @@ from ..fem.elements import Points
 from ..io.errors import InputError
 from ..kernels import surfaces as kernels
 from ..stepping.quantity import Quantity
+from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, PairTangents, PointSet, Term, Values, value_of
 from .launcher import HostLaunches, Launcher, warp_view
 from .pairs import PairList, Surface
@@ -56,9 +57,7 @@ class Sliding(NamedTuple):
         row = self.environment[:, None]
         way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
         u = way - (way * self.normal).sum(-1, keepdim=True) * self.normal
-        e, square = slip[self.environment, 0], u.square().sum(-1)
-        y = torch.where(square > 0.0, square.clamp_min(_TINY).sqrt(), 0.0)
-        factor = torch.where(y < e, (2.0 - y / e) / e, 1.0 / y.clamp_min(_TINY))
+        _, factor = friction_over_slide(u, slip[self.environment, 0])
         return -(friction[self.environment, 0] * self.load * factor)[:, None] * u
 
 
@@ -279,8 +278,7 @@ class SurfaceTerm(Term):
         if not len(chosen):
             return None
         near = self._pairs(chosen, start)
-        n, s = near.r / near.d[..., None], (near.d / self._reach).clamp_max(1.0)
-        pressure = near.part * (2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s)
+        n, pressure = near.r / near.d[..., None], near.part * barrier_pressure(near.d, self._reach)
         normal = n[:, 0]
         load = near.factor * stiffness[near.environment, 0] * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
         kept = load > 0.0

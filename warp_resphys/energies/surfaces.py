@@ -129,7 +129,7 @@ class BoundSurfaceContact(BoundEnergy):
         self._check_rest(pairs, rest.double()[None])
 
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:
-        """Raises InputError where surfaces cross at rest, or parts of one piece are within reach of one another."""
+        """Raises InputError where surfaces cross or touch at rest, or parts of a piece are within reach of others."""
         count, edge = pairs.crossings(rest)
         if int(count):
             vertex = int(pairs.surface.edges[int(edge), 0])

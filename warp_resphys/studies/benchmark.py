@@ -62,7 +62,7 @@ class Batches(Settings):
     cuda: Some[Natural]
 
     def on(self, device: str) -> Sequence[int]:
-        """Those of a device."""
+        """Returns the batch sizes for a device."""
         return self.cuda if device.startswith("cuda") else self.cpu
 
 

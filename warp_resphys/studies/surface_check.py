@@ -85,17 +85,17 @@ def turned(mesh: Mesh, random: np.random.Generator, place: Any) -> Mesh:
 
 def throw_checks(throws: int, seed: int, device: torch.device) -> Iterator[Check]:
     """Two or three blocks of random sizes thrown at one another."""
-    each = max(throws // len(_THROWN), 1)
-    with Progress("throws of bodies", len(_THROWN) * each, "throws") as progress:
+    share = max(throws // len(_THROWN), 1)
+    with Progress("throws of bodies", len(_THROWN) * share, "throws") as progress:
         for distance, dtype in _THROWN:
             random = np.random.default_rng(seed)
             crossings = failed = most = hits = 0
-            for k in range(each):
+            for k in range(share):
                 new = _throw(distance, dtype, 2 + k % 2, random, device)
                 crossings, failed, hits = crossings + new[0], failed + new[1], hits + new[3]
                 most = max(most, new[2])
                 progress.advance()
-            title = f"D {1e3 * distance:g} mm, {str(dtype).removeprefix('torch.')}: {each} throws"
+            title = f"D {1e3 * distance:g} mm, {str(dtype).removeprefix('torch.')}: {share} throws"
             result = f"{hits} hit, {crossings} crossings, {failed} failed, {most} iterations at most"
             yield Check(title, result, "0 crossings, 0 failed", crossings == failed == 0)
 
@@ -212,8 +212,8 @@ def least_friction(stones: int) -> float:
         ):
             limits[row, 3 * joint], limits[row, 3 * joint + number] = -limit, sign
         free: NDArray[np.float64] = np.zeros(count)
-        found = linprog(free, limits, np.zeros(len(limits)), balance, weights, bounds=(None, None))
-        return bool(found.status == 0)
+        solution = linprog(free, limits, np.zeros(len(limits)), balance, weights, bounds=(None, None))
+        return bool(solution.status == 0)
 
     low, high = 0.0, 3.0
     for _ in range(20):

@@ -223,12 +223,13 @@ def test_pairs_are_all_pairs_within_reach():
     assert not pairs.covers(x + 1e-2)
 
 
-def test_crossings_are_seen():
+def test_crossings_are_seen(device):
     mesh, x = joined()
-    pairs = PairList(Launcher(3, CPU), Surface.of(mesh), 1e-3)
+    x = x.to(device)
+    pairs = PairList(Launcher(3, x.device), Surface.of(mesh), 1e-3)
     assert pairs.crossings(x)[0].tolist() == [0, 0, 0]
     x[1, len(PLATE.vertices) :, 2] -= 0.004
-    count, _ = pairs.crossings(x)
+    count = pairs.crossings(x)[0].tolist()
     assert count[0] == count[2] == 0 < count[1]
 
 
@@ -244,31 +245,32 @@ def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, **options):
 def thrown(simulator, velocity, spin, batch=1):
     """The state with the cube thrown with a velocity (B, 3) and a spin (B,) about z."""
     rest, cube = simulator.rest_state(batch), simulator.body.vertex_slice("cube")
+    velocity, spin = simulator.tensor(velocity), simulator.tensor(spin)
     arm = rest.q[:, cube] - rest.q[:, cube].mean(1, keepdim=True)
-    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    axis = simulator.tensor([0.0, 0.0, 1.0])
     own = velocity[:, None] + spin[:, None, None] * torch.linalg.cross(axis.expand_as(arm), arm)
     v = torch.cat([torch.zeros_like(rest.q[:, : cube.start]), own], 1)
     return State(rest.q, v)
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_gradients_of_an_oblique_impact(integrator):
-    """Four throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
-    simulator = landing(integrator=integrator)
+def test_gradients_of_an_oblique_impact(integrator, device):
+    """Sixteen throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
+    simulator = landing(integrator=integrator, device=device)
     random = np.random.default_rng(0)
-    velocity = torch.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (4, 3)))
-    weights = torch.tensor(random.normal(size=(2, 4, simulator.body.n_vertices, 3)))
+    velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (16, 3)))
+    weights = simulator.tensor(random.normal(size=(2, 16, simulator.body.n_vertices, 3)))
     values = {
         "velocity": velocity,
-        "spin": torch.linspace(-5.0, 5.0, 4, dtype=torch.float64),
-        "surface_friction": torch.linspace(0.1, 0.9, 4, dtype=torch.float64)[:, None],
-        "surface_stiffness": torch.full((4, 1), KAPPA, dtype=torch.float64),
-        "plate_youngs_modulus": torch.full((4, 1), 2.5e5, dtype=torch.float64),
+        "spin": simulator.tensor(np.linspace(-5.0, 5.0, 16)),
+        "surface_friction": simulator.tensor(np.linspace(0.1, 0.9, 16)[:, None]),
+        "surface_stiffness": simulator.tensor(np.full((16, 1), KAPPA)),
+        "plate_youngs_modulus": simulator.tensor(np.full((16, 1), 2.5e5)),
     }
 
     def loss(given):
         parameters = {name: given[name] for name in given if name not in ("velocity", "spin")}
-        start = thrown(simulator, given["velocity"], given["spin"], 4)
+        start = thrown(simulator, given["velocity"], given["spin"], 16)
         path = simulator.rollout(start, 7, parameters=parameters)
         return (1e2 * path.q[-1] * weights[0]).sum((1, 2)) + (path.v[-1] * weights[1]).sum((1, 2))
 
@@ -278,11 +280,11 @@ def test_gradients_of_an_oblique_impact(integrator):
         size = (1e-4 if name == "surface_stiffness" else 1e-6) * float(value.abs().max())
         way = size * torch.ones_like(value)
         if name == "velocity":
-            way = size * torch.tensor([0.6, -0.5, 0.6], dtype=torch.float64).expand(4, 3)
+            way = size * simulator.tensor([0.6, -0.5, 0.6]).expand(16, 3)
         with torch.no_grad():
             expected = (loss({**values, name: value + way}) - loss({**values, name: value - way})) / 2.0
-        actual = (slopes[name] * way).reshape(4, -1).sum(1)
-        assert float((actual - expected).abs().max()) < 2e-6 * float(expected.abs().max()), name
+        actual = (slopes[name] * way).reshape(16, -1).sum(1)
+        assert float((actual - expected).abs().max()) < 1e-6 * float(expected.abs().max()), name
 
 
 def test_friction_sticks_and_slides_on_a_slope():
@@ -318,18 +320,19 @@ def test_momentum_is_conserved():
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_throws_never_cross(dtype):
+def test_throws_never_cross(dtype, device):
     """Three bodies thrown at one another at 5 m/s, with D of 0.2 mm: no surface ever crosses another."""
     random = np.random.default_rng(3)
     places = ((0.0, 0.0, 0.0), (0.003, 0.001, 0.034), (0.002, 0.036, 0.002))
     bodies = {f"body{k}": Body(turned(CUBE, random.uniform(-1, 1, 2), place)) for k, place in enumerate(places)}
     scene = Scene(bodies, SurfaceContact(KAPPA, 0.4, distance=2e-4))
-    simulator = Simulator(scene, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0), dtype=dtype, relative_tolerance=1e-5)
+    options = {"gravity": (0.0, 0.0, 0.0), "dtype": dtype, "device": device, "relative_tolerance": 1e-5}
+    simulator = Simulator(scene, SOFT, time_step=0.004, **options)
     rest = simulator.rest_state()
     v = torch.zeros_like(rest.v)
     v[:, scene.vertex_slice("body1"), 2], v[:, scene.vertex_slice("body2"), 1] = -5.0, -5.0
     path = simulator.rollout(State(rest.q, v), 25)
-    pairs = PairList(Launcher(1, CPU), Surface.of(scene.mesh), 2e-4)
+    pairs = PairList(Launcher(1, rest.q.device), Surface.of(scene.mesh), 2e-4)
     gaps = []
     for q in path.q.double():
         assert int(pairs.crossings(q)[0]) == 0
@@ -348,19 +351,19 @@ def clip():
     return Mesh(mesh.vertices[used], cells.reshape(-1, 8))
 
 
-def test_a_body_touches_itself():
+def test_a_body_touches_itself(device):
     """The ends of a clip are pressed together: without contact they pass through one another."""
     mesh = clip()
     ends = mesh.vertices[:, 0] > 0.029
     force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
     upper, lower = ends & (mesh.vertices[:, 2] > 0.014), ends & (mesh.vertices[:, 2] < 0.014)
     force[0, upper, 2], force[0, lower, 2] = -0.06 / upper.sum(), 0.06 / lower.sum()
-    pressed = Inputs(external_force=force)
-    pairs = PairList(Launcher(1, CPU), Surface.of(mesh), D)
+    pressed = Inputs(external_force=force.to(device))
+    pairs = PairList(Launcher(1, torch.device(device)), Surface.of(mesh), D)
     crossings = {}
     for name, energies in (("free", []), ("touching", [SurfaceContact(KAPPA, 0.3)])):
         body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=energies)
-        simulator = Simulator(body, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0))
+        simulator = Simulator(body, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0), device=device)
         before = simulator.rollout(simulator.rest_state(), 9, pressed).final
         path = simulator.rollout(before, 1, pressed)
         crossings[name] = int(pairs.crossings(path.q[-1])[0])
@@ -373,17 +376,16 @@ def test_a_body_touches_itself():
         assert float(forces.normal.norm()) > 0.01
 
 
-def test_batch_is_what_its_environments_are_alone():
-    """Environments with different contacts in one batch are bit for bit what they are alone."""
-    velocity = torch.tensor(
-        [[0.3, 0.0, -1.0], [0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [-0.4, 0.3, -1.5]], dtype=torch.float64
-    )
-    spin = torch.tensor([0.0, 3.0, 0.0, -4.0], dtype=torch.float64)
+def test_batch_is_what_its_environments_are_alone(device):
+    """Sixteen environments with different contacts in one batch are bit for bit what they are alone."""
+    random = np.random.default_rng(1)
+    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (16, 3)))
+    spin = torch.linspace(-4.0, 4.0, 16, dtype=torch.float64)
     settings = SolverSettings(linear_solver="banded")
-    together = landing(solver=settings)
-    path = together.rollout(thrown(together, velocity, spin, 4), 12)
-    for b in range(4):
-        alone = landing(solver=settings)
+    together = landing(solver=settings, device=device)
+    path = together.rollout(thrown(together, velocity, spin, 16), 12)
+    for b in range(16):
+        alone = landing(solver=settings, device=device)
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
         assert torch.equal(own.q[:, 0], path.q[:, b])
 

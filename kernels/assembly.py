@@ -13,6 +13,30 @@ ZERO = wp.float64(0.0)
 
 
 @wp.kernel
+def sum_blocks(
+    start: wp.array[int],  # (R + 1) first entry of every row in `incident`
+    incident: wp.array[int],  # 4 pair + number of the vertex in it, in ascending order: a fixed summation order
+    rows: wp.array[wp.vec3i],  # (R) first value of the matrix of a row, its size, and the number of the row's vertex
+    columns: wp.array[wp.vec4i],  # (A) numbers of the vertices of a pair, -1: left out
+    blocks: wp.array3d[wp.float64],  # (A, 12, 12) [N/m]
+    out: wp.array[wp.float64],  # matrices, one after another, zero before
+):
+    """Sums matrices of pairs into those of environments."""
+    r = wp.tid()
+    row = rows[r]
+    for entry in range(start[r], start[r + 1]):
+        pair = incident[entry] / 4
+        first = 3 * (incident[entry] - 4 * pair)
+        for k in range(3):
+            to = row[0] + (3 * row[2] + k) * row[1]
+            for j in range(4):
+                column = columns[pair][j]
+                if column >= 0:
+                    for m in range(3):
+                        out[to + 3 * column + m] += blocks[pair, first + k, 3 * j + m]
+
+
+@wp.kernel
 def cell_blocks(
     active: wp.array[int],  # (B) zero: skip the environment
     gradients: wp.array2d[wp.vec3d],

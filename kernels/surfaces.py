@@ -384,6 +384,37 @@ def pair_tangents(
                 add_block(out, a, i, j, block + (TWO * plain.energy * m[1]) * curved)
 
 
+@wp.kernel
+def pair_springs(
+    chosen: wp.array[int],  # (A) pairs
+    pairs: Pairs,
+    stiffness: wp.array2d[wp.float64],
+    reach: wp.float64,
+    positions: wp.array2d[wp.vec3d],
+    out: wp.array3d[wp.float64],  # (A, 12, 12), zero before
+):
+    """`pair_tangents` by the change of the distance of the nearest points alone, if it is stable against that."""
+    a = wp.tid()
+    c = chosen[a]
+    b, kind = pairs.environment[c], pairs.kind[c]
+    x = corners(positions, b, pairs.nodes[c])
+    first = nearest(kind, 0, x)
+    sum = wp.float64(0.0)
+    for feature in range(features(kind)):
+        at = nearest(kind, feature, x)
+        if at.d < reach and at.d > ZERO:
+            by = wp.dot(first.w, at.w) * wp.dot(first.n, at.n)
+            sum += part(kind, feature, pairs.degree[c]) * barrier(at.d / reach)[2] * by * by
+    if kind == EDGE_EDGE:
+        sum *= mollifier(parallelism(x), pairs.parallel[c])[0]
+    size = wp.dot(first.w, first.w)
+    factor = wp.max(sum, ZERO) * stiffness[b, 0] * pairs.area[c] / (reach * size * size)
+    block = factor * wp.outer(first.n, first.n)
+    for i in range(4):
+        for j in range(4):
+            add_block(out, a, i, j, first.w[i] * first.w[j] * block)
+
+
 @wp.struct
 class FrictionPairs:
     """Friction of pairs in a step, of all environments."""

@@ -141,8 +141,16 @@ _SOLVE: Final = (
     int some = 0;
     for (int c = lane; c < n; c += LANES) some |= (x[c] != S(0));
     if (!RESPHYS_ANY(some)) return;  // A zero right-hand side: the environment needs no direction.
+    int early = 0;
+    for (int c = lane; c < T && c < n; c += LANES) early |= (x[c] != S(0));
+    const bool sparse = !RESPHYS_ANY(early);  // Such as a column of a unit matrix: tiles of zeros are skipped.
     for (int i = 0; i < tiles; ++i) {
         const int first = (i > width ? i - width : 0) * T;
+        if (sparse) {
+            some = 0;
+            for (int c = first + lane; c < i * T + T && c < n; c += LANES) some |= (x[c] != S(0));
+            if (!RESPHYS_ANY(some)) continue;
+        }
         for (int r = lane / Q; r < T; r += LANES / Q) {
             const S* row = all + (i * T + r) * stride + (width - i) * T;
             S sum = S(0);
@@ -162,6 +170,11 @@ _SOLVE: Final = (
     }
     for (int i = tiles - 1; i >= 0; --i) {
         const int first = (i > width ? i - width : 0) * T;
+        if (sparse) {
+            some = 0;
+            for (int c = i * T + lane; c < i * T + T && c < n; c += LANES) some |= (x[c] != S(0));
+            if (!RESPHYS_ANY(some)) continue;
+        }
         for (int c = lane / Q; c < T; c += LANES / Q) {
             const S* inverse = all + i * T * stride + width * T + c;
             S sum = S(0);

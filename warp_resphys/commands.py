@@ -63,6 +63,9 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),
         "benchmark sizes": Command("time and memory by linear solver and size of the body", "studies.sizes:size_study"),
         "benchmark peers": Command("a step beside another simulator's, at equal error", "studies.peers:peer_study"),
+        "benchmark gripper": Command(
+            "a step of grippers in a grasp, beside one without contact", "studies.gripper:gripper_study"
+        ),
         "benchmark elements": Command("sag of a beam, by element and refinement", "studies.elements:element_study"),
         "benchmark locking": Command(
             "deflection of an arm, by element and refinement", "studies.locking:locking_study"

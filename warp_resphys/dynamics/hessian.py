@@ -5,14 +5,19 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..energies.base import PairTangents, PointSet
+from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..linalg.coupling import Coupling, CouplingSolver
+from ..kernels.assembly import sum_blocks
 from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
+
+_ROUNDED = 8  # Numbers of vertices with couplings are rounded up to multiples of it.
 
 
 class HessianApproximation(ABC):
@@ -100,8 +105,7 @@ class ExactHessian(HessianApproximation):
         self._potential.update_tangent(self.clamped, active)
         self._factor = self._factor_of(self.assembly(), active=active)
         if self._coupled is not None:
-            changed = range(self._potential.batch) if active is None else active.nonzero().ravel().tolist()
-            self._coupled.forget(changed)
+            self._coupled.forget(active)
 
     def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
         """Factorises assembled values, with the low-rank correction of the potential."""
@@ -117,7 +121,7 @@ class ExactHessian(HessianApproximation):
         if self._factor.failed.any():
             self._factor = self._factor_of(self.assembly(), definite=False)
         if self._coupled is not None:
-            self._coupled.forget(range(self._potential.batch))
+            self._coupled.forget()
 
     @override
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
@@ -133,29 +137,48 @@ class ExactHessian(HessianApproximation):
         if not couplings:
             return
         if self._coupled is None:
-            self._coupled = CouplingSolver(x.shape[1], x)
+            self._coupled = CouplingSolver(*x.shape[:2], x)
         assert self._factor is not None
         self._coupled.correct(self._factor, couplings, x, order)
 
     def couplings(self, parts: Sequence[PairTangents]) -> list[Coupling]:
-        """Returns second derivatives of pairs as matrices of the unknowns, by environment."""
+        """Returns second derivatives of pairs as matrices of the unknowns, one for every environment with pairs."""
         if not parts:
             return []
         environment = torch.cat([part.environment for part in parts])
         nodes = self._place[torch.cat([part.nodes for part in parts])]
         blocks = torch.cat([part.blocks for part in parts])
-        out = []
-        for b in environment.unique().tolist():
-            own = environment == b
-            vertices, local = nodes[own].unique(return_inverse=True)
-            axes = torch.arange(3, device=nodes.device)
-            at = (3 * local[..., None] + axes).flatten(1)
-            size = 3 * len(vertices)
-            matrix = blocks.new_zeros(size, size)
-            matrix.index_put_((at[:, :, None], at[:, None, :]), blocks[own], accumulate=True)
-            free = (vertices >= 0).repeat_interleave(3)
-            unknowns = (3 * vertices[:, None] + axes).ravel()[free]
-            out.append(Coupling(b, unknowns, matrix[free][:, free]))
+        launcher, device, free = self._potential, nodes.device, len(self.vertex_at)
+        keys, local = torch.where(nodes < 0, -1, environment[:, None] * free + nodes).unique(return_inverse=True)
+        if int(keys[0]) < 0:  # fixed vertices
+            keys, local = keys[1:], local - 1
+        row = keys // free
+        count = torch.bincount(row, minlength=self._potential.batch)
+        at = torch.arange(len(keys), device=device) - (count.cumsum(0) - count)[row]
+        # A size that depends on the environment alone, so that it is bit for bit what it is in another batch.
+        sizes = -(-count // _ROUNDED) * _ROUNDED
+        order = sizes.argsort(stable=True)
+        squares = (3 * sizes[order]) ** 2
+        first = torch.empty_like(sizes)
+        first[order] = squares.cumsum(0) - squares
+        values = blocks.new_zeros(int(squares.sum()))
+        entry = local.ravel().argsort(stable=True)
+        start = torch.searchsorted(local.ravel()[entry], torch.arange(len(keys) + 1, device=device))
+        rows = torch.stack([first[row], 3 * sizes[row], at], 1)
+        columns = torch.where(local < 0, -1, at[local.clamp_min(0)])
+        arrays = [(start, wp.int32), (entry, wp.int32), (rows.to(torch.int32), wp.vec3i), (columns.to(torch.int32), wp.vec4i)]
+        inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
+        inputs.append(warp_view(blocks, wp.float64))
+        launcher.launch(launcher.record(sum_blocks, (len(keys),), inputs, [warp_view(values, wp.float64)]))
+        unknowns = torch.full((len(sizes), int(sizes.max()), 3), -1, device=device)
+        unknowns[row, at] = 3 * (keys % free)[:, None] + torch.arange(3, device=device)
+        out, done = [], 0
+        for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
+            own, m = order[sizes[order] == size], 3 * size
+            if size:
+                matrices = values[done : done + number * m * m].view(number, m, m)
+                out.append(Coupling(own, unknowns[own, :size].flatten(1), matrices))
+                done += number * m * m
         return out
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:

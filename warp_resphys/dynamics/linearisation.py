@@ -118,8 +118,10 @@ class Linearisation:
             columns = scipy.sparse.csc_array(columns.cpu().numpy())
             matrix = scipy.sparse.csc_array(matrix + columns @ columns.T)
         for coupling in self._workspace.hessian(self._name).couplings(p.last_pair_tangents):
-            if coupling.environment == 0:
-                at, block = coupling.unknowns.cpu().numpy(), coupling.matrix.cpu().numpy()
+            for number in (coupling.environments == 0).nonzero().ravel():
+                used = coupling.unknowns[number] >= 0
+                at = coupling.unknowns[number][used].cpu().numpy()
+                block = coupling.matrices[number][used][:, used].cpu().numpy()
                 pairs = (block.ravel(), (np.repeat(at, len(at)), np.tile(at, len(at))))
                 matrix = scipy.sparse.csc_array(matrix + scipy.sparse.coo_array(pairs, matrix.shape))
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)

@@ -17,6 +17,7 @@ from ..mesh.mesh import Mesh, boundary_triangles
 from .launcher import Launcher, warp_view
 
 _FIRST_CAPACITY = 4096
+_REBUILT = 100  # Uses of a hierarchy of boxes after which it is made anew.
 _SPARE = 1.5  # radius within which pairs are sought, over the way of a vertex
 _PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
 
@@ -83,6 +84,29 @@ class Surface:
         return out
 
 
+class _Hierarchy:
+    """A hierarchy of boxes.
+
+    Args:
+        arrays: lower and upper corners, and environments, of the boxes.
+    """
+
+    def __init__(self, arrays: list[Any]) -> None:
+        self.arrays, self._uses = arrays, 0
+
+    def fitted(self) -> Any:
+        """Returns the hierarchy after a change of the boxes."""
+        if self._uses == 0:
+            low, high, group = self.arrays
+            self._tree = wp.Bvh(low, high, groups=group)
+        elif self._uses % _REBUILT == 0:
+            self._tree.rebuild()
+        else:
+            self._tree.refit()
+        self._uses += 1
+        return self._tree
+
+
 class PairList:
     """Pairs of a batch that may come within reach, with the positions and radii for which that holds.
 
@@ -132,6 +156,7 @@ class PairList:
         self._least_radius = 0.5 * reach
         self._capacity, self.version, self.count = _FIRST_CAPACITY, 0, 0
         self._origin: torch.Tensor | None = None
+        self._hierarchies: dict[int, _Hierarchy] = {}
         self._outer = self._inner = launcher.zeros(n)
 
     def covers(self, positions: torch.Tensor) -> bool:
@@ -182,14 +207,18 @@ class PairList:
         self._set(keys[:needed].sort().values, size, total)
 
     def _hierarchy(self, motion: Any, nodes: Any) -> Any:
-        """Returns boxes of triangles or edges of all environments."""
+        """Returns boxes of triangles or edges of all environments, valid until they are sought again.
+
+        Bodies keep together, so that a hierarchy serves for many positions.
+        """
         own, device = self._launcher, str(self._launcher.device)
-        size = own.batch * nodes.shape[0]
-        low, high = (wp.empty(size, dtype=wp.vec3, device=device) for _ in range(2))
-        group = wp.empty(size, dtype=int, device=device)
-        own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], [low, high, group]))
+        size, used = own.batch * nodes.shape[0], self._hierarchies.get(nodes.ptr)
+        if used is None:
+            arrays = [wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)]
+            used = self._hierarchies[nodes.ptr] = _Hierarchy(arrays)
+        own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], used.arrays))
         with wp.ScopedStream(launch_stream(own.device)):
-            return wp.Bvh(low, high, groups=group)
+            return used.fitted()
 
     def _set(self, keys: torch.Tensor, size: int, total: int) -> None:
         """Decodes the keys of pairs in ascending order."""

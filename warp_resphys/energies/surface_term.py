@@ -194,10 +194,8 @@ class SurfaceTerm(Term):
             stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
             inputs = [warp_view(indices, wp.int32), self._list.pairs, stiffness, wp.float64(self._reach), positions]
             out = [warp_view(blocks, wp.float64)]
-            own.launch(own.record(kernels.pair_tangents, (len(chosen),), inputs, out))
-            if clamp:
-                sizes, axes = torch.linalg.eigh(blocks)
-                blocks = (axes * sizes.clamp_min(0.0)[:, None]) @ axes.mT
+            kernel = kernels.pair_springs if clamp else kernels.pair_tangents
+            own.launch(own.record(kernel, (len(chosen),), inputs, out))
             parts.append(PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks))
         if (grips := self._grips) is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)

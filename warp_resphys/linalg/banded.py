@@ -59,6 +59,14 @@ class BandedCholesky:
         place = columns.data_ptr()
         self._solve(lower, n, width, ctypes.addressof(count), factor.data_ptr(), rows, place, n, ctypes.addressof(info))
 
+    def solve_block(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
+        """Overwrites contiguous right-hand sides (m, k) with the solutions of the block of rows (k, w + 1) alone."""
+        lower, _, width, rows = self._where
+        count, n, info = ctypes.c_int(len(columns)), ctypes.c_int(columns.shape[1]), ctypes.c_int()
+        size, place = ctypes.addressof(n), columns.data_ptr()
+        last = ctypes.addressof(info)
+        self._solve(lower, size, width, ctypes.addressof(count), factor.data_ptr(), rows, place, size, last)
+
 
 class BandedSolver(LinearSolver):
     """Banded Cholesky in reverse Cuthill-McKee order on the CPU, one environment at a time."""
@@ -77,6 +85,7 @@ class BandedSolver(LinearSolver):
         self.n_values = self.n * (self.bandwidth + 1)
         self.address = np.where(diagonal_upper, -1, j * (self.bandwidth + 1) + (i - j)).astype(np.int32)
         self.order = order
+        self.blocks = _blocks(i, j, self.n)
         self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
@@ -102,6 +111,18 @@ class _Cholesky(SeparateFactors):
     def _overwrite(self, factor: torch.Tensor, rows: torch.Tensor, exact: bool) -> None:
         self._solver.lapack.solve(factor, rows)
 
+    @override
+    def _overwrite_units(self, factor: torch.Tensor | None, rows: torch.Tensor, places: torch.Tensor) -> None:
+        if factor is None or len(self._solver.blocks) == 1:
+            super()._overwrite_units(factor, rows, places)
+            return
+        for start, end in self._solver.blocks:  # The solution is zero in the blocks of other bodies.
+            own = ((places >= start) & (places < end)).nonzero().ravel()
+            if len(own):
+                columns = rows[own, start:end]
+                self._solver.lapack.solve_block(factor[start:end], columns)
+                rows[own, start:end] = columns
+
 
 class _LU(SeparateFactors):
     _solver: BandedSolver
@@ -112,6 +133,14 @@ class _LU(SeparateFactors):
         (solve,) = scipy.linalg.get_lapack_funcs(("gbtrs",), (lu,))
         solved, _ = solve(lu, w, w, rows.numpy().T, pivots)
         rows.copy_(torch.from_numpy(solved.T))
+
+
+def _blocks(i: Indices, j: Indices, n: int) -> list[tuple[int, int]]:
+    """Returns the ranges of unknowns that no entry (i, j) of a matrix couples with others, as first and end."""
+    reach = np.arange(n)
+    np.maximum.at(reach, j.ravel(), i.ravel())
+    ends = np.flatnonzero(np.maximum.accumulate(reach) == np.arange(n)) + 1
+    return list(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True))
 
 
 def general_band(band: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -1,6 +1,6 @@
 """Factors of matrices with dense couplings between a few unknowns, from the factors without these."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,11 +10,25 @@ from .linear_solver import Factor
 
 @dataclass(frozen=True)
 class Coupling:
-    """A symmetric matrix K between a few unknowns of one environment."""
+    """Symmetric matrices K of one size between a few unknowns of some environments.
 
-    environment: int
-    unknowns: torch.Tensor  # (m,)
-    matrix: torch.Tensor  # (m, m)
+    Attributes:
+        environments: (G,) environments.
+        unknowns: (G, m) their unknowns; -1 in places that an environment does not need, where K is zero.
+        matrices: (G, m, m) K.
+    """
+
+    environments: torch.Tensor
+    unknowns: torch.Tensor
+    matrices: torch.Tensor
+
+    def parts(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """Environments, unknowns and matrices to be computed at once.
+
+        On a CPU, a product of one matrix and one of several are not the same in every bit.
+        """
+        size = 1 if self.matrices.device.type == "cpu" else len(self.matrices)
+        yield from zip(*(x.split(size) for x in (self.environments, self.unknowns, self.matrices)), strict=True)
 
 
 class CouplingSolver:
@@ -23,20 +37,26 @@ class CouplingSolver:
     The solutions S = A^-1 E are kept as long as the factor, so that other matrices K cost only dense algebra.
 
     Args:
+        batch: number of environments B.
         n: number of unknowns.
         like: tensor with device and dtype of the solutions.
     """
 
-    def __init__(self, n: int, like: torch.Tensor) -> None:
-        self._n, self._like = n, like
-        self._places: dict[int, torch.Tensor] = {}  # column of every unknown in S, or -1, by environment
-        self._solved: dict[int, torch.Tensor] = {}
+    def __init__(self, batch: int, n: int, like: torch.Tensor) -> None:
+        device = like.device
+        self._places = torch.full((batch, n), -1, device=device)  # column of every unknown in S, or -1
+        self._counts = torch.zeros(batch, device=device, dtype=torch.int64)  # columns of S
+        self._solved = like.new_zeros(batch, 0, n)  # columns of S as rows
 
-    def forget(self, environments: Sequence[int]) -> None:
-        """Drops the solutions of environments with a new factor."""
-        for b in environments:
-            self._places.pop(b, None)
-            self._solved.pop(b, None)
+    def forget(self, environments: torch.Tensor | None = None) -> None:
+        """Drops the solutions of environments (B,) with a new factor, or of all."""
+        kept = None if environments is None else ~environments
+        if kept is None or not bool(kept.any()):
+            self._places.fill_(-1)
+            self._counts.zero_()
+        else:
+            self._places.masked_fill_(~kept[:, None], -1)
+            self._counts.masked_fill_(~kept, 0)
 
     def correct(self, factor: Factor, couplings: Sequence[Coupling], x: torch.Tensor, order: torch.Tensor) -> None:
         """Turns solutions for A into those with couplings.
@@ -47,35 +67,32 @@ class CouplingSolver:
             x: (B, n, k) solutions for A, which are overwritten.
             order: (n,) unknowns in the order of x.
         """
-        self._solve_missing(factor, couplings, len(x))
+        self._solve_missing(factor, couplings)
         place = torch.empty_like(order)
         place[order] = torch.arange(len(order), device=order.device)
-        for coupling in couplings:
-            b, own = coupling.environment, coupling.unknowns
-            columns, solved, k = self._places[b][own], self._solved[b], coupling.matrix
-            small = torch.eye(len(own), device=x.device, dtype=k.dtype) + k @ solved[own[:, None], columns].to(k)
-            along = x.new_zeros(solved.shape[1], x.shape[2])
-            along[columns] = torch.linalg.solve(small, k @ x[b, place[own]].to(k)).to(x)
-            x[b] -= (solved @ along)[order]
+        for b, unknowns, k in (part for coupling in couplings for part in coupling.parts()):
+            own = unknowns.clamp_min(0)  # K is zero where there is none
+            solved = self._solved[b[:, None], self._places[b[:, None], own].clamp_min(0)]  # (G, m, n)
+            among = solved.gather(2, own[:, None].expand(-1, own.shape[1], -1)).to(k)
+            small = torch.eye(own.shape[1], device=x.device, dtype=k.dtype) + k @ among
+            along = torch.linalg.solve(small, k @ x[b[:, None], place[own]].to(k)).to(x)
+            x[b] -= (solved.mT @ along)[:, order]
 
-    def _solve_missing(self, factor: Factor, couplings: Sequence[Coupling], batch: int) -> None:
+    def _solve_missing(self, factor: Factor, couplings: Sequence[Coupling]) -> None:
         """Solves for unknowns that are not in S yet."""
-        missing = dict[int, torch.Tensor]()
+        needed = torch.zeros_like(self._places, dtype=torch.bool)
         for coupling in couplings:
-            b = coupling.environment
-            if b not in self._places:
-                self._places[b] = torch.full((self._n,), -1, device=self._like.device)
-                self._solved[b] = self._like.new_zeros(self._n, 0)
-            new = coupling.unknowns[self._places[b][coupling.unknowns] < 0]
-            if len(new):
-                missing[b] = new
-        if not missing:
+            rows, columns = (coupling.unknowns >= 0).nonzero(as_tuple=True)
+            needed[coupling.environments[rows], coupling.unknowns[rows, columns]] = True
+        rows, unknowns = (needed & (self._places < 0)).nonzero(as_tuple=True)
+        if not len(rows):
             return
-        right = self._like.new_zeros(batch, self._n, max(map(len, missing.values())))
-        for b, new in missing.items():
-            right[b, new, torch.arange(len(new), device=new.device)] = 1.0
-        solved = factor.solve(right)
-        for b, new in missing.items():
-            count = self._solved[b].shape[1]
-            self._places[b][new] = torch.arange(count, count + len(new), device=new.device)
-            self._solved[b] = torch.cat([self._solved[b], solved[b, :, : len(new)]], 1)
+        new = torch.bincount(rows, minlength=len(self._counts))
+        at = self._counts[rows] + torch.arange(len(rows), device=rows.device) - (new.cumsum(0) - new)[rows]
+        self._counts += new
+        spare = int(self._counts.max()) - self._solved.shape[1]
+        if spare > 0:
+            more = self._solved.new_zeros(len(self._counts), spare + spare // 2, self._solved.shape[2])
+            self._solved = torch.cat([self._solved, more], 1)
+        self._places[rows, unknowns] = at
+        self._solved[rows, at] = factor.columns(rows, unknowns, self._solved)

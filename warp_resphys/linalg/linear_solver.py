@@ -42,6 +42,20 @@ class Factor(ABC):
         """Overwrites (B, n) right-hand sides, in the solver's order of unknowns, with the solutions."""
         columns.copy_(self.solve(columns[:, :, None])[:, :, 0])
 
+    def columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+        """Returns columns (k, n) of the inverses.
+
+        Args:
+            environments: (k,) environments of the columns, in ascending order.
+            unknowns: (k,) their numbers.
+            like: (B, any, n) tensor of the type of right-hand sides.
+        """
+        count = torch.bincount(environments, minlength=len(like))
+        place = torch.arange(len(unknowns), device=unknowns.device) - (count.cumsum(0) - count)[environments]
+        right = like.new_zeros(len(like), like.shape[2], int(count.max()))
+        right[environments, unknowns, place] = 1.0
+        return self.solve(right)[environments, :, place]
+
 
 class CorrectedFactor(Factor):
     """A factor of A + C C^T from a factor of A (Sherman, Morrison and Woodbury).
@@ -126,6 +140,23 @@ class SeparateFactors(Factor):
         rows = rows.contiguous()
         self._overwrite_all(rows, exact=True)
         return rows.view(b, m, n).mT[:, self._solver.places]
+
+    @override
+    def columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+        out, place = like.new_zeros(len(unknowns), like.shape[2]), self._solver.places[unknowns]
+        out[torch.arange(len(out), device=out.device), place] = 1.0
+        for environment, count in zip(*(x.tolist() for x in environments.unique(return_counts=True)), strict=True):
+            first = int(torch.searchsorted(environments, environment))
+            number = environment if len(self.factors) > 1 else 0
+            self._overwrite_units(self.factors[number], out[first : first + count], place[first : first + count])
+        return out[:, self._solver.places]
+
+    def _overwrite_units(self, factor: Any, rows: torch.Tensor, places: torch.Tensor) -> None:
+        """Overwrites right-hand sides (m, n) that are zero but for a one at a place (m,) with the solutions."""
+        if factor is None:
+            rows.fill_(torch.nan)
+        else:
+            self._overwrite(factor, rows, exact=True)
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:

@@ -6,6 +6,7 @@ Our steps are those of a roll-out without gradients in float64; the peer compute
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -31,6 +32,7 @@ from .timing import now
 Positions = NDArray[np.float64]  # (T, N, 3) [m]
 Run = Callable[[], tuple[float, Positions]]  # returns seconds of a step and the positions of the vertices
 _CONVERGED: Final = 1e-11  # relative residual of our reference
+_IN_A_GRAPH: Final = 1000  # most iterations a step: CUDA refuses a graph of ten times as many
 
 
 class TimeStep(Settings):
@@ -123,7 +125,7 @@ def _ours(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callabl
 
 
 def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callable[[float], Run]:
-    """Prepares roll-outs of the peer for a number of iterations a step; a graph holds two steps."""
+    """Prepares roll-outs of the peer for a number of iterations a step; a graph holds two steps, if it can."""
     newton, device, modulus = _newton(), torch.device(study.device), study.youngs_modulus
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -9.80709))
     builder.add_soft_mesh(
@@ -155,9 +157,12 @@ def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Calla
                 before.clear_forces()
                 solver.step(before, after, control, None, step.size)
 
-        two_steps()  # compiles the kernels, which is not possible while a graph is captured
-        with wp.ScopedCapture(device=str(device)) as capture:
-            two_steps()
+        launch: Callable[[], object] = two_steps
+        if iterations <= _IN_A_GRAPH:
+            two_steps()  # compiles the kernels, which is not possible while a graph is captured
+            with wp.ScopedCapture(device=str(device)) as capture:
+                two_steps()
+            launch = partial(wp.capture_launch, capture.graph)
 
         def run() -> tuple[float, Positions]:
             for state in states:
@@ -165,7 +170,7 @@ def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Calla
             seconds, positions = 0.0, []
             for _ in range(-(-step.count // 2)):
                 began = now(device)
-                wp.capture_launch(capture.graph)
+                launch()
                 wp.synchronize_device(str(device))
                 seconds += now(device) - began
                 positions += [state.particle_q.numpy().astype(np.float64) for state in reversed(states)]

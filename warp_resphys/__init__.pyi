@@ -86,6 +86,8 @@ from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names
 from .robot.motion import Motion as Motion
 from .robot.robot import Robot as Robot
+from .robot.robot_scene import RobotScene as RobotScene
+from .robot.robot_scene import SceneState as SceneState
 from .robot.state import RobotState as RobotState
 from .robot.twin.estimator import TwinNoise as TwinNoise
 from .robot.twin.twin import Twin as Twin

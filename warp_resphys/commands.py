@@ -66,6 +66,11 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "benchmark gripper": Command(
             "a step of grippers in a grasp, beside one without contact", "studies.gripper:gripper_study"
         ),
+        "benchmark grasp": Command(
+            "two fingers of a run as a gripper, beside its laboratory's: errors in free air and in grasps",
+            "studies.grasp:grasp_study",
+            word="run",
+        ),
         "benchmark elements": Command("sag of a beam, by element and refinement", "studies.elements:element_study"),
         "benchmark locking": Command(
             "deflection of an arm, by element and refinement", "studies.locking:locking_study"

@@ -12,8 +12,8 @@ from typing_extensions import override
 from ..energies.base import PairTangents, PointSet
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
-from ..linalg.coupling import Coupling, CouplingSolver
 from ..kernels.assembly import sum_blocks
+from ..linalg.coupling import Coupling, CouplingSolver
 from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 
@@ -137,7 +137,7 @@ class ExactHessian(HessianApproximation):
         if not couplings:
             return
         if self._coupled is None:
-            self._coupled = CouplingSolver(*x.shape[:2], x)
+            self._coupled = CouplingSolver(len(x), x.shape[1], x)
         assert self._factor is not None
         self._coupled.correct(self._factor, couplings, x, order)
 
@@ -166,7 +166,12 @@ class ExactHessian(HessianApproximation):
         start = torch.searchsorted(local.ravel()[entry], torch.arange(len(keys) + 1, device=device))
         rows = torch.stack([first[row], 3 * sizes[row], at], 1)
         columns = torch.where(local < 0, -1, at[local.clamp_min(0)])
-        arrays = [(start, wp.int32), (entry, wp.int32), (rows.to(torch.int32), wp.vec3i), (columns.to(torch.int32), wp.vec4i)]
+        arrays = [
+            (start, wp.int32),
+            (entry, wp.int32),
+            (rows.to(torch.int32), wp.vec3i),
+            (columns.to(torch.int32), wp.vec4i),
+        ]
         inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
         inputs.append(warp_view(blocks, wp.float64))
         launcher.launch(launcher.record(sum_blocks, (len(keys),), inputs, [warp_view(values, wp.float64)]))

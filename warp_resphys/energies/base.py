@@ -21,6 +21,7 @@ import numpy as np
 import scipy.sparse
 import torch
 import warp as wp
+from numpy.typing import NDArray
 
 from ..fem.body import Body
 from ..fem.elements import Points
@@ -207,6 +208,16 @@ class Energy(ABC):
     @abstractmethod
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "Term":
         """Returns the energy's kernels for a batch."""
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Energy":
+        """Returns the energy of the body at R x + t; obstacles stay where they are.
+
+        Args:
+            rotation: (3, 3) R.
+            translation: (3,) t [m].
+        """
+        del rotation, translation
+        return self
 
     def bind(self, site: EnergySite) -> "BoundEnergy":
         """Returns the energy on a simulator's device; overridden by energies with memory or values of a step."""

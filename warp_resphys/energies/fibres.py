@@ -5,7 +5,7 @@ unit fibre and its length the stretch.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -46,6 +46,10 @@ class Fibres(Energy):
     # fibres are wound around the principal direction of a chamber nearest to this axis; None: around its longest one
     axis: Sequence[float] | None = None
     stiffness: Parameter = 0.0  # k [N/m], parameter ``fibre_stiffness``: a number, (C,), (B, 1) or (B, C) values
+
+    @override
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Fibres":
+        return self if self.axis is None else replace(self, axis=(rotation @ np.asarray(self.axis)).tolist())
 
     def __post_init__(self) -> None:
         """Checks the values.

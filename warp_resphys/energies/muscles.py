@@ -11,7 +11,7 @@ chamber whose walls are not modelled. Without inputs the fibres are a reinforcem
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -73,6 +73,11 @@ class Muscles(Energy):
     muscles: Sequence[Muscle]
     stiffness: Parameter = 0.0  # k [Pa], parameter ``muscle_stiffness``: a number, (A,), (B, 1) or (B, A) values
     toe: float = 1e-3  # strain at which a fibre reaches its full stiffness
+
+    @override
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Muscles":
+        turned = [replace(own, direction=np.asarray(own.direction) @ rotation.T) for own in self.muscles]
+        return replace(self, muscles=turned)
 
     def __post_init__(self) -> None:
         """Checks the values."""

@@ -71,6 +71,11 @@ class Tendons(Energy):
     bristle_length: Parameter = 1e-4  # slide over which friction reverses [m]
     entry_angle: ArrayLike = 0.0  # of contact before the first guide, such as around pulleys: one, or (T,) [rad]
 
+    @override
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Tendons":
+        directions = [[np.asarray(way) @ rotation.T for way in ways] for ways in self.directions]
+        return replace(self, routes=[route @ rotation.T + translation for route in self.guides], directions=directions)
+
     def __post_init__(self) -> None:
         """Checks the values."""
         if not len(self.routes):

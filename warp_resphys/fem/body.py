@@ -1,7 +1,7 @@
 """Body: the constant data of a simulation, as NumPy arrays on the host."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -33,6 +33,9 @@ class BodyEnergy(Protocol):
 
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
         """Sets of integration points on the rest shape."""
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "BodyEnergy":
+        """The energy of the body in another place."""
 
 
 def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
@@ -114,6 +117,24 @@ class Body:
         object.__setattr__(self, "energy_points", tuple(energy.points(self.mesh) for energy in self.energies))
         if self.rigid or self.glued or self.symmetry:
             self.coordinates  # noqa: B018  # Checks rigid parts, glue and planes.
+
+    def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Body":
+        """Returns the body at R x + t, with its actuators; obstacles stay where they are.
+
+        Args:
+            rotation: (3, 3) R.
+            translation: (3,) t [m].
+
+        Raises:
+            InputError: a body with a symmetry plane.
+        """
+        r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+        if self.symmetry:
+            raise InputError(
+                "a body with a symmetry plane stays in its place: leave the plane out, and model all of it."
+            )
+        mesh = replace(self.mesh, vertices=self.mesh.vertices @ r.T + t)
+        return replace(self, mesh=mesh, energies=[energy.moved(r, t) for energy in self.energies])
 
     @property
     def members(self) -> "Iterator[tuple[str, Body, int]]":

@@ -95,4 +95,4 @@ class CouplingSolver:
             more = self._solved.new_zeros(len(self._counts), spare + spare // 2, self._solved.shape[2])
             self._solved = torch.cat([self._solved, more], 1)
         self._places[rows, unknowns] = at
-        self._solved[rows, at] = factor.columns(rows, unknowns, self._solved)
+        self._solved[rows, at] = factor.inverse_columns(rows, unknowns, self._solved)

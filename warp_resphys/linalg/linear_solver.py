@@ -42,7 +42,7 @@ class Factor(ABC):
         """Overwrites (B, n) right-hand sides, in the solver's order of unknowns, with the solutions."""
         columns.copy_(self.solve(columns[:, :, None])[:, :, 0])
 
-    def columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    def inverse_columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         """Returns columns (k, n) of the inverses.
 
         Args:
@@ -142,7 +142,7 @@ class SeparateFactors(Factor):
         return rows.view(b, m, n).mT[:, self._solver.places]
 
     @override
-    def columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    def inverse_columns(self, environments: torch.Tensor, unknowns: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         out, place = like.new_zeros(len(unknowns), like.shape[2]), self._solver.places[unknowns]
         out[torch.arange(len(out), device=out.device), place] = 1.0
         for environment, count in zip(*(x.tolist() for x in environments.unique(return_counts=True)), strict=True):

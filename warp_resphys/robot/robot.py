@@ -23,6 +23,7 @@ from ..learning.parameters import check_names, constants_of, identifiable_parame
 from ..learning.predictors import LearnedPredictor
 from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
 from ..mesh.mesh import Mesh
+from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .commands import Commands
 from .description import Description
@@ -316,6 +317,35 @@ class Robot:
         hidden = None if predictor is None else predictor.hidden
         base = None if acting.base is None else acting.base[1:]
         return RobotState(body, acting.memory, hidden, base, left, now)
+
+    def drive(self, state: RobotState, **inputs: Given) -> tuple[Inputs, Callable[[State], RobotState]]:
+        """Returns a step's inputs with the learned force, and a map from the body's state after it to the robot's.
+
+        For a simulator of several bodies (`robot_scene.RobotScene`).
+
+        Args:
+            state: before the step.
+            inputs: by name, as for `step`.
+
+        Raises:
+            InputError: an invalid input, as for `step`.
+        """
+        acting = self._commands.act(state, self._read(inputs, state.batch))
+        own, left, hidden = acting.inputs, state.left, state.hidden
+        if self._learned is not None:
+            predictor = self._predictor(acting.conditions, acting.base)
+            predictor.hidden = hidden
+            force, hidden = predictor(state.body, 0), predictor.hidden
+            assert isinstance(force, torch.Tensor)
+            own = own.plus(force)
+            if predictor.left_at is not None:
+                left = left | (predictor.left_at >= 0)
+        base = None if acting.base is None else acting.base[1:]
+
+        def after(body: State) -> RobotState:
+            return RobotState(body, acting.memory, hidden, base, left, state.lost)
+
+        return own, after
 
     def rollout(
         self,

@@ -19,8 +19,8 @@ from ..energies.launcher import Launcher
 from ..energies.materials import Corotated
 from ..energies.obstacles import HalfSpace
 from ..energies.pairs import PairList, Surface
-from ..energies.tendons import Tendons
 from ..energies.surfaces import SurfaceContact
+from ..energies.tendons import Tendons
 from ..experiment.build import choose_device
 from ..fem.body import Body
 from ..fem.scene import Scene
@@ -55,9 +55,9 @@ class GripperStudy(Settings):
     device: Word
 
 
-def ball_mesh(radius: float, divisions: int) -> Mesh:
+def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
     """A cube of bricks whose points are moved onto those of a ball, with its middle at the origin."""
-    cube = box_hexahedra((2.0, 2.0, 2.0), (divisions,) * 3)
+    cube = box_hexahedra((2.0, 2.0, 2.0), (divisions,) * 3, nodes=nodes)
     x = cube.vertices - 1.0
     y2, z2 = np.roll(x, 1, axis=1) ** 2, np.roll(x, 2, axis=1) ** 2
     return replace(cube, vertices=radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0))
@@ -115,10 +115,11 @@ class Grasp:
     @torch.no_grad()
     def measure(self) -> dict[str, Any]:
         """Lifts the ball once: seconds of a step of all grippers, and the outcome."""
-        start = self.simulator.rest_state(len(self.tensions))
-        began = now(self.simulator.device)
-        path = self.simulator.rollout(start, self.steps, self.inputs)
-        seconds = (now(self.simulator.device) - began) / self.steps
+        start, inputs = self.simulator.rest_state(len(self.tensions)), self.inputs
+        device = start.q.device
+        began = now(device)
+        path = self.simulator.rollout(start, self.steps, inputs)
+        seconds = (now(device) - began) / self.steps
         ball = self.scene.vertex_slice("ball")
         height = path.q[-1, :, ball, 2].mean(1) - start.q[:, ball, 2].mean(1)
         result: dict[str, Any] = {
@@ -127,7 +128,7 @@ class Grasp:
             "held": int((height > 0.9 * RISE).sum()),
         }
         if self.contact:
-            pairs = PairList(Launcher(len(self.tensions), self.simulator.device), Surface.of(self.scene.mesh), D)
+            pairs = PairList(Launcher(len(self.tensions), device), Surface.of(self.scene.mesh), D)
             result["crossings"] = sum(int(pairs.crossings(q)[0].sum()) for q in path.q[:: self.steps // 10].double())
         return result
 

@@ -1,0 +1,70 @@
+"""A body in another place, with its actuators, moves as the first one does there."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.chambered import hollow_box
+from warp_resphys import (
+    Body,
+    Corotated,
+    Fibres,
+    Inputs,
+    Muscle,
+    Muscles,
+    Pressure,
+    Simulator,
+    SymmetryPlane,
+    Tendons,
+    box_hexahedra,
+    find_chambers,
+    select_vertices,
+)
+from warp_resphys.io.errors import InputError
+
+ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+SHIFT = np.array([0.1, -0.2, 0.05])  # m
+BOX = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
+CLAMPED = {"fixed": select_vertices(BOX, x=0.0)}
+HOLLOW = hollow_box("hexahedron")
+CHAMBER = [max(find_chambers(HOLLOW), key=lambda own: len(own.faces))]  # longer than it is wide
+ROUTE = [[0.0, 0.015, 0.01], [0.05, 0.015, 0.012], [0.1, 0.015, 0.01]]
+BODIES = {
+    "tendon": (
+        Body(BOX, energies=[Tendons([ROUTE], directions=[[[0.0, 0.0, 1.0]]])], **CLAMPED),
+        {"tendon_tension": 0.4},
+        {"tendon_offset_1": 2e-3},
+    ),
+    "muscle": (Body(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])], **CLAMPED), {"muscle_stress": 2e4}, {}),
+    "chamber": (
+        Body(
+            HOLLOW,
+            fixed=select_vertices(HOLLOW, x=0.0),
+            energies=[Pressure(CHAMBER), Fibres(CHAMBER, angles=[20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3)],
+        ),
+        {"pressure": 3e4},
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_motion_moves_with_the_body(name):
+    body, given, parameters = BODIES[name]
+    gravity = np.array([0.0, 3.0, -9.0])
+    material, ends = Corotated(2e5, 0.4), []
+    for own, pull in ((body, gravity), (body.moved(ROTATION, SHIFT), ROTATION @ gravity)):
+        simulator = Simulator(own, material, 0.01, tuple(pull), relative_tolerance=1e-11)
+        inputs = Inputs(**{key: simulator.tensor(np.full((1, simulator.counts[key]), v)) for key, v in given.items()})
+        parameters = {key: simulator.tensor([[value]]) for key, value in parameters.items()}
+        ends.append(simulator.rollout(simulator.rest_state(), 5, inputs, parameters).q[-1, 0].numpy())
+    without = Simulator(body, material, 0.01, tuple(gravity))
+    free = without.rollout(without.rest_state(), 5).q[-1, 0].numpy()
+    assert np.abs(ends[0] - free).max() > 1e-4  # The actuator does something.
+    np.testing.assert_allclose(ends[1], ends[0] @ ROTATION.T + SHIFT, rtol=0.0, atol=1e-9)
+
+
+def test_a_symmetric_body_stays():
+    plane = SymmetryPlane((0.0, 1.0, 0.0))
+    with pytest.raises(InputError, match="symmetry plane"):
+        Body(BOX, symmetry=[plane], **CLAMPED).moved(ROTATION, SHIFT)

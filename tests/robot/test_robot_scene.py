@@ -1,0 +1,122 @@
+"""Robots in one scene: without contact they move as they do alone; in contact they push one another."""
+
+import numpy as np
+import pytest
+import torch
+
+import warp_resphys
+from support.configured import settings
+from warp_resphys import Body, Corotated, RobotScene, SurfaceContact, box_hexahedra
+from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
+from warp_resphys.io.errors import InputError
+from warp_resphys.robot.description import Description
+from warp_resphys.robot.robot import Robot
+from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
+
+POSE = (0.02, -0.3, 0.1, 0.0, 0.0, 2.0)  # about the vertical, so that gravity is the same in both frames
+AWAY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SIZE = (0.1, 0.02, 0.02)  # m
+CONTACT = SurfaceContact(1e5, 0.3, distance=1e-3, slip_speed=1e-2)
+
+
+def beam(*given, model="corotated", **constants):
+    """A clamped beam as a robot without a learned force."""
+    run = settings(f"mesh={{kind:box_hexahedra,size:{list(SIZE)},divisions:[5,1,1]}}", "integrator=bdf2", *given)
+    own = MaterialSettings.model_validate({**run.simulation.plain(), "model": model, **constants})
+    return Robot(Description("beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, (5, 1, 1))))
+
+
+def tip_force(robot, *newtons):
+    """A force (N, 3) on the face of the tip."""
+    rest = robot.simulator.rest_positions
+    tip = rest[:, 0] > SIZE[0] - 1e-9
+    return tip[:, None] * torch.tensor(newtons, dtype=rest.dtype) / tip.sum()
+
+
+def test_robots_without_contact_move_as_alone(finished):
+    """Also with a learned force, a moving base, and another pose; every robot in its own frame."""
+    robot = warp_resphys.load(finished[0], "resphys")
+    scene = RobotScene({"one": (robot, AWAY), "two": (robot, POSE)})
+    push = 0.4 * torch.randn(robot.simulator.rest_positions.shape, generator=torch.Generator().manual_seed(0))
+    alone = {name: robot.begin(2) for name in scene.robots}
+    state = scene.begin(2)
+    for step in range(4):
+        base = [1e-4 * (step + 1), 0.0, 2e-4 * (step + 1), 0.0, 0.0, 0.002 * (step + 1)]
+        inputs = {"one": {"external_force": push}, "two": {"base": base}}
+        state = scene.step(state, inputs)
+        alone = {name: robot.step(own, **inputs[name]) for name, own in alone.items()}
+    for name, own in alone.items():
+        at = state.robots[name]
+        assert float((own.q - robot.begin().q).abs().max()) > 1e-4
+        torch.testing.assert_close(at.q, own.q, rtol=0.0, atol=1e-8)
+        torch.testing.assert_close(at.v, own.v, rtol=0.0, atol=1e-5)
+        assert torch.equal(at.left, own.left)
+    rotation = torch.tensor([[np.cos(2.0), -np.sin(2.0), 0], [np.sin(2.0), np.cos(2.0), 0], [0, 0, 1]])
+    placed = robot.observe(alone["two"]) @ rotation.mT + torch.tensor(POSE[:3], dtype=torch.float64)
+    torch.testing.assert_close(scene.observe(state)["two"], placed, rtol=0.0, atol=1e-8)
+
+
+def test_robots_in_contact_push_one_another():
+    """A beam is pushed against a second one, which stands across, and against a loose block beyond it."""
+    robot = beam()
+    block = box_hexahedra((0.02, 0.02, 0.02), (1, 1, 1))
+    moved = warp_resphys.Mesh(block.vertices + [0.07, -0.0215, 0.0], block.cells)
+    objects = {"block": (Body(moved, fixed=[0, 1]), Corotated(2e5, 0.4))}
+    pose = (SIZE[0], 0.0415, 0.0, 0.0, 0.0, np.pi)
+    scene = RobotScene({"first": (robot, AWAY), "second": (robot, pose)}, objects, CONTACT)
+    start = state = scene.begin()
+    for _ in range(12):
+        state, acting = scene.step_with_inputs(state, {"first": {"external_force": tip_force(robot, 0.0, 0.5, 0.0)}})
+    way = (state.body.q - start.body.q)[0]
+    assert float(way[scene.scene.vertex_slice("second"), 1].max()) > 1e-3  # by the first one
+    assert float(way[scene.scene.vertex_slice("block"), 1].abs().max()) < 1e-3
+    assert float(state.robots["second"].q[0, :, 1].min()) < -1e-3  # in its own frame, which is turned
+    forces = scene.simulator.contacts(state.body, scene.step(state).body, acting, scene.constants)["surfaces"]
+    assert 0.0 < float(forces.gap.min()) < CONTACT.distance
+
+
+def test_gradient_of_a_push_through_contact():
+    """Against a difference."""
+    robot = beam("solver.relative_tolerance=1e-11")
+    scene = RobotScene(
+        {"first": (robot, AWAY), "second": (robot, (SIZE[0], 0.0415, 0.0, 0.0, 0.0, np.pi))}, {}, CONTACT
+    )
+
+    def deflection(size):
+        state, force = scene.begin(), {"first": {"external_force": size * tip_force(robot, 0.0, 0.5, 0.02)}}
+        for _ in range(8):
+            state = scene.step(state, force)
+        return state.robots["second"].q[0, :, 1].sum()
+
+    size = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(deflection(size), size)
+    with torch.no_grad():
+        expected = float(deflection(1.0 + 1e-6) - deflection(1.0 - 1e-6)) / 2e-6
+    assert abs(expected) > 1e-4
+    assert float(slope) == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_does_not_fit_is_refused(finished):
+    robot = beam()
+    with pytest.raises(InputError, match="no robot"):
+        RobotScene({})
+    with pytest.raises(InputError, match="pose of one is"):
+        RobotScene({"one": (robot, (0.0, 0.0, 0.1))})
+    with pytest.raises(InputError, match="only a network"):
+        RobotScene({"one": (warp_resphys.load(finished[0], "simfree"), AWAY)})
+    with pytest.raises(InputError, match="one time step and integrator, these have one 10 ms and bdf2, two 5 ms"):
+        RobotScene({"one": (robot, AWAY), "two": (beam("time_step=0.005"), POSE)})
+    scene = RobotScene({"one": (robot, AWAY)})
+    with pytest.raises(InputError, match="no robot 'hand' in the scene: it has one"):
+        scene.begin(inputs={"hand": {}})
+    with pytest.raises(InputError, match="surfaces of the bodies cross"):
+        RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
+
+
+def test_a_turned_robot_with_fibres_is_refused(monkeypatch):
+    robot = beam()
+    family = FibreFamily(0.0, 0.0, tension=1e4)
+    wound = ConvexMaterial(4e4, bulk_1=4e6, density=1000.0, fibres=[family])
+    monkeypatch.setitem(robot.simulator.__dict__, "material", wound)
+    with pytest.raises(InputError, match="has fibres"):
+        RobotScene({"one": (robot, POSE)})

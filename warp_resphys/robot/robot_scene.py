@@ -1,0 +1,207 @@
+"""Robots, and things that they touch, in one scene."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ..dynamics.simulator import Simulator
+from ..energies.materials import Material
+from ..energies.surfaces import SurfaceContact
+from ..fem.body import Body
+from ..fem.scene import Scene
+from ..io.errors import InputError
+from ..learning.parameters import constants_of
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .inputs import Given
+from .robot import Robot
+from .state import RobotState
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """The state of B environments of a `RobotScene`.
+
+    Attributes:
+        body: positions (B, N, 3) [m] and velocities [m/s] of all vertices, and memory of materials and contacts.
+        robots: states of the robots in their own frames, by name.
+    """
+
+    body: State
+    robots: Mapping[str, RobotState]
+
+
+class RobotScene:
+    """Robots with their learned forces, and other bodies, in one simulator, where they touch.
+
+    A robot's force was learned on the robot alone. It acts in the robot's own frame, from which a pose leads to the
+    scene. All robots have the same time step and integrator.
+
+    Args:
+        robots: robots by name, and their poses (6,): translation [m] and rotation vector [rad].
+        objects: other bodies by name, with their materials; they begin at rest.
+        contact: of all surfaces with one another; None for none.
+        relative_tolerance: of the solver; that of the first robot if omitted.
+
+    Raises:
+        InputError: no robot, one whose network replaces the simulator, robots of different time steps, or a body that
+            cannot touch others (`energies.surfaces.SurfaceContact`).
+
+    Attributes:
+        scene: the bodies.
+        simulator: of the scene.
+        constants: of the simulator, with the robots' identified parameters.
+    """
+
+    def __init__(
+        self,
+        robots: Mapping[str, tuple[Robot, ArrayLike]],
+        objects: Mapping[str, tuple[Body, Material]] | None = None,
+        contact: SurfaceContact | None = None,
+        relative_tolerance: float | None = None,
+    ) -> None:
+        if not robots:
+            raise InputError("a scene of robots has no robot: give them by name, with their poses.")
+        self.robots = {name: robot for name, (robot, _) in robots.items()}
+        self._poses = {name: _pose(name, pose) for name, (_, pose) in robots.items()}
+        for name, robot in self.robots.items():
+            if robot.is_data_driven:
+                raise InputError(f"{name} has no simulator, only a network for its mesh: load another model.")
+        first = next(iter(self.robots.values())).simulator
+        others = {name: (robot.simulator.time_step, robot.simulator.integrator) for name, robot in self.robots.items()}
+        if len(set(others.values())) > 1:
+            raise InputError(
+                "robots of a scene have one time step and integrator, these have "
+                f"{', '.join(f'{name} {1e3 * h:g} ms and {own}' for name, (h, own) in others.items())}."
+            )
+        bodies, materials = dict[str, Body](), dict[str, Any]()
+        for name, robot in self.robots.items():
+            self._check_fibres(name)
+            body = robot.simulator.body.moved(*self._poses[name])
+            own = [energy for energy in body.energies if contact is None or not isinstance(energy, SurfaceContact)]
+            bodies[name], materials[name] = replace(body, energies=own), robot.simulator.material
+        for name, (body, material) in (objects or {}).items():
+            bodies[name], materials[name] = body, material
+        self.scene = Scene(bodies, contact)
+        name = next(iter(self.robots))
+        self.simulator: Simulator = replace(
+            first,
+            body=self.scene,
+            material=materials,
+            gravity=tuple(self._poses[name][0] @ np.asarray(first.gravity)),
+            solver=first.settings,
+            relative_tolerance=relative_tolerance,
+        )
+        tensor = self.simulator.tensor
+        self._frames = {name: (tensor(rotation), tensor(shift)) for name, (rotation, shift) in self._poses.items()}
+        parameters = dict[str, torch.Tensor]()
+        for name, robot in self.robots.items():
+            own_constants = constants_of(robot.simulator, robot.parameters)
+            parameters |= {f"{name}_{key}": value for key, value in own_constants.items() if key != "gravity"}
+        self.constants = self.simulator.prepare(parameters)
+
+    def _check_fibres(self, name: str) -> None:
+        """Raises InputError for a turned robot whose material has fibres."""
+        turned = not np.allclose(self._poses[name][0], np.eye(3))
+        if turned and any(getattr(own, "fibres", ()) for own in self.robots[name].simulator.materials.values()):
+            raise InputError(
+                f"the material of {name} has fibres, whose directions would have to turn with it: give it a pose "
+                "without rotation."
+            )
+
+    def begin(self, batch: int = 1, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> SceneState:
+        """Returns the state with every robot in its equilibrium on its own, and objects at rest in their places.
+
+        Args:
+            batch: B.
+            inputs: constant inputs by robot and by name, as for `Robot.step`.
+
+        Raises:
+            InputError: an unknown robot, or an invalid input.
+            ConvergenceError: a robot has no equilibrium.
+        """
+        given = self._checked(inputs)
+        rest, own = self.simulator.rest_state(batch), dict[str, RobotState]()
+        parts = []
+        for name, _, _ in self.scene.members:
+            at = self.scene.vertex_slice(name)
+            if name in self.robots:
+                own[name] = self.robots[name].begin(batch, **given.get(name, {}))
+                parts.append(self._placed(name, own[name].q))
+            else:
+                parts.append(rest.q[:, at])
+        return SceneState(self.simulator.state(torch.cat(parts, 1)), own)
+
+    def step(self, state: SceneState, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> SceneState:
+        """Returns the state after one time step; differentiable.
+
+        Args:
+            state: before the step.
+            inputs: during the step by robot and by name, as for `Robot.step`; omitted ones are zero.
+
+        Raises:
+            InputError: an unknown robot, an invalid input, or surfaces that cross.
+            ConvergenceError: the step failed.
+        """
+        return self.step_with_inputs(state, inputs)[0]
+
+    def step_with_inputs(
+        self, state: SceneState, inputs: Mapping[str, Mapping[str, Given]] | None = None
+    ) -> tuple[SceneState, Inputs]:
+        """Returns the state after one time step as `step`, and the simulator's inputs, as for `Simulator.contacts`."""
+        given, by_body = self._checked(inputs), dict[str, Inputs]()
+        after = dict[str, Callable[[State], RobotState]]()
+        for name, robot in self.robots.items():
+            acting, after[name] = robot.drive(state.robots[name], **given.get(name, {}))
+            by_body[name] = self._inputs_in_scene(name, acting)
+        if any(own.fixed_positions is not None for own in by_body.values()):
+            for name, robot in self.robots.items():
+                if by_body[name].fixed_positions is None:
+                    rest = robot.simulator.rest_positions[robot.simulator.fixed]
+                    places = self._placed(name, rest).expand(state.body.batch, -1, -1)
+                    by_body[name] = by_body[name].replace(fixed_positions=places)
+        acting = self.scene.inputs(by_body)
+        body, _ = self.simulator.step(state.body, acting, self.constants)
+        return SceneState(body, {name: after[name](self._own(name, body)) for name in self.robots}), acting
+
+    def observe(self, state: SceneState) -> dict[str, torch.Tensor]:
+        """Returns markers (B, M, 3) of the robots in the frame of the scene, by name [m]."""
+        return {name: self._placed(name, robot.observe(state.robots[name])) for name, robot in self.robots.items()}
+
+    def _checked(self, inputs: Mapping[str, Mapping[str, Given]] | None) -> Mapping[str, Mapping[str, Given]]:
+        given = inputs or {}
+        for name in given:
+            if name not in self.robots:
+                raise InputError(f"there is no robot {name!r} in the scene: it has {', '.join(self.robots)}.")
+        return given
+
+    def _placed(self, name: str, points: torch.Tensor) -> torch.Tensor:
+        """Positions (..., 3) in the scene, from those in a robot's own frame [m]."""
+        rotation, shift = self._frames[name]
+        return points @ rotation.mT + shift
+
+    def _own(self, name: str, body: State) -> State:
+        """State of a robot in its own frame."""
+        (rotation, shift), at = self._frames[name], self.scene.vertex_slice(name)
+        return State((body.q[:, at] - shift) @ rotation, body.v[:, at] @ rotation)
+
+    def _inputs_in_scene(self, name: str, own: Inputs) -> Inputs:
+        fields: dict[str, torch.Tensor | None] = {}
+        if own.external_force is not None:
+            fields["external_force"] = own.external_force @ self._frames[name][0].mT
+        if own.fixed_positions is not None:
+            fields["fixed_positions"] = self._placed(name, own.fixed_positions)
+        return own.replace(**fields)
+
+
+def _pose(name: str, pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and translation (3,) of a pose (6,)."""
+    values = np.asarray(pose, dtype=np.float64)
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise InputError(f"the pose of {name} is {pose!r}: give six numbers, a translation in m and a rotation vector.")
+    return Rotation.from_rotvec(values[3:]).as_matrix(), values[:3]

@@ -150,8 +150,10 @@ class ExactHessian(HessianApproximation):
         blocks = torch.cat([part.blocks for part in parts])
         launcher, device, free = self._potential, nodes.device, len(self.vertex_at)
         keys, local = torch.where(nodes < 0, -1, environment[:, None] * free + nodes).unique(return_inverse=True)
-        if int(keys[0]) < 0:  # fixed vertices
-            keys, local = keys[1:], local - 1
+        fixed = int((keys < 0).sum())  # all fixed vertices have one key
+        keys, local = keys[fixed:], local - fixed
+        if not len(keys):
+            return []
         row = keys // free
         count = torch.bincount(row, minlength=self._potential.batch)
         at = torch.arange(len(keys), device=device) - (count.cumsum(0) - count)[row]

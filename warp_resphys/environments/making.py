@@ -22,15 +22,17 @@ from ..io.errors import InputError
 from ..io.progress import Progress
 from ..io.settings import parse
 from ..io.stages import finished_record
+from ..robot.gripper import laboratory_robot
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..settings.stages import LaboratoryStage
+from .grasp import RISE, SPEED, GraspWorld
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
 from .worlds import ReducedWorld, RobotWorld
 
-TASKS: Final = ("reach", "follow", "swing_up")
+TASKS: Final = ("reach", "follow", "swing_up", "grasp")
 WORLDS: Final = ("simulator", "reduced", "laboratory")
 _PLACES: Final = 64  # number of equilibria that sample the reachable places
 _RISE: Final = 0.1  # time in which an input can go from its least to its greatest value [s]
@@ -61,7 +63,7 @@ def make_vector(
     """Makes a vector environment of robots of a run, or of a file, with a task.
 
     Args:
-        task: ``reach``, ``follow``, or ``swing_up``, which moves the base.
+        task: ``reach``, ``follow``, ``swing_up``, which moves the base, or ``grasp``, by two fingers (`GraspWorld`).
         run: the run folder, or a file of `Robot.save`.
         num_envs: B.
         model: of the run; ``resphys`` if omitted.
@@ -97,7 +99,10 @@ def make_vector(
     swings = task == "swing_up"
     if swings and (BASE not in robot.inputs or world != "simulator"):
         raise InputError("swing_up moves the base of a simulated robot: choose a robot with fixed vertices.")
-    actions, shown = max(round(seconds / action_time), 1), None if robot.labels else _spread_vertices(robot)
+    actions = max(round(seconds / action_time), 1)
+    if task == "grasp":
+        return _grasp(robot, run, num_envs, world, frames, actions, noise, autoreset_mode, render_mode)
+    shown = None if robot.labels else _spread_vertices(robot)
     bodies: World
     if world == "simulator":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
@@ -127,6 +132,36 @@ def make_vector(
         mapping = ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
     noise = noise if bodies.noise is None else bodies.noise
     return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
+
+
+def _grasp(
+    robot: Robot,
+    run: str | Path,
+    count: int,
+    world: str,
+    frames: int,
+    actions: int,
+    noise: float,
+    autoreset_mode: str | gym.vector.AutoresetMode,
+    render_mode: str | None,
+) -> RobotVectorEnv:
+    """Makes grippers of two fingers each, whose reward is the height of a ball."""
+    driven = driven_input(robot)
+    if world == "reduced" or len(driven.parts) != 1:
+        raise InputError(
+            "grasp needs a finger with one input, in the world simulator or laboratory, as reduced models have no "
+            f"contact: this robot has {', '.join(driven.parts)}."
+        )
+    finger = robot if world == "simulator" else laboratory_robot(run, "count")
+    grippers = GraspWorld(finger, driven.name, count, robot.time_step)
+    markers, up = grippers.markers()[0], _up(robot)
+    point = np.zeros((3, markers.size))
+    point[:, -3:] = np.eye(3)
+    low, high = np.append(np.array(driven.low), 0.0), np.append(np.array(driven.high), RISE)
+    rate = np.array([(high[0] - low[0]) / _RISE, SPEED])
+    mapping = ActionMapping(low, high, rate, np.zeros(2), frames)
+    task = SwingTask(count, up, markers[-1], RISE)
+    return RobotVectorEnv(grippers, task, mapping, point, actions, noise, autoreset_mode, render_mode, up)
 
 
 def _reach(

@@ -21,6 +21,7 @@ Policy = Callable[[Observation], NDArray[np.float32]]
 _NETWORK: Final = 128  # width of the policy's layers
 _ORDER: Final = 2  # of the polynomial from actions to equilibria
 _EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
+_STILL = 0.1  # observed change of positions in an action
 _ITERATIONS, _STRIDE = 16, 0.25  # Gauss-Newton iterations, and the largest change of an action in one
 
 
@@ -67,6 +68,20 @@ class ScriptedPolicy:
             moved = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
             actions = np.clip(actions + np.clip(moved, -_STRIDE, _STRIDE), -1.0, 1.0)
         return actions
+
+
+class ScriptedGrasp:
+    """Closes a gripper with a share of the range of its input, and lifts when its fingers stand still."""
+
+    def __init__(self, share: float) -> None:
+        self._action = 2.0 * share - 1.0
+
+    def __call__(self, seen: Observation) -> NDArray[np.float32]:
+        """Returns actions (B, 2) for observations (B, width)."""
+        displacements, command, height = (seen.shape[1] - 3) // 2, seen[:, -3], seen[:, -2]
+        still = np.abs(seen[:, displacements:-3]).max(axis=1) < _STILL
+        lifts = (height > -1.0) | (still & (command > self._action - 1e-3))
+        return np.stack([np.full(len(seen), self._action), np.where(lifts, 1.0, -1.0)], 1).astype(np.float32)
 
 
 def errors_mm(

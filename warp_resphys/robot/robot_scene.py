@@ -30,10 +30,18 @@ class SceneState:
     Attributes:
         body: positions (B, N, 3) [m] and velocities [m/s] of all vertices, and memory of materials and contacts.
         robots: states of the robots in their own frames, by name.
+        lost: (B,) bool, whether a step has failed; only where the first robot counts failures.
     """
 
     body: State
     robots: Mapping[str, RobotState]
+    lost: torch.Tensor
+
+    def where(self, chosen: torch.Tensor, other: "SceneState") -> "SceneState":
+        """Joins two states of a scene: this one where chosen (B,) bool, the other one elsewhere."""
+        body = RobotState(self.body).where(chosen, RobotState(other.body)).body
+        robots = {name: own.where(chosen, other.robots[name]) for name, own in self.robots.items()}
+        return SceneState(body, robots, torch.where(chosen, self.lost, other.lost))
 
 
 class RobotScene:
@@ -135,7 +143,8 @@ class RobotScene:
                 parts.append(self._placed(name, own[name].q))
             else:
                 parts.append(rest.q[:, at])
-        return SceneState(self.simulator.state(torch.cat(parts, 1)), own)
+        body = self.simulator.state(torch.cat(parts, 1))
+        return SceneState(body, own, torch.zeros(batch, dtype=torch.bool, device=body.q.device))
 
     def step(self, state: SceneState, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> SceneState:
         """Returns the state after one time step; differentiable.
@@ -166,8 +175,9 @@ class RobotScene:
                     places = self._placed(name, rest).expand(state.body.batch, -1, -1)
                     by_body[name] = by_body[name].replace(fixed_positions=places)
         acting = self.scene.inputs(by_body)
-        body, _ = self.simulator.step(state.body, acting, self.constants)
-        return SceneState(body, {name: after[name](self._own(name, body)) for name in self.robots}), acting
+        body, report = self.simulator.step(state.body, acting, self.constants)
+        robots = {name: after[name](self._own(name, body)) for name in self.robots}
+        return SceneState(body, robots, state.lost | ~report.converged), acting
 
     def observe(self, state: SceneState) -> dict[str, torch.Tensor]:
         """Returns markers (B, M, 3) of the robots in the frame of the scene, by name [m]."""

@@ -28,7 +28,8 @@ from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
 from ..io.settings import Natural, Positive, Settings, Some, Word, setting
-from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
+from ..mesh.mesh import box_hexahedra, select_vertices
+from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .beam import Divisions
 from .tables import Sheet, show
@@ -55,14 +56,6 @@ class GripperStudy(Settings):
     device: Word
 
 
-def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
-    """A cube of bricks whose points are moved onto those of a ball, with its middle at the origin."""
-    cube = box_hexahedra((2.0, 2.0, 2.0), (divisions,) * 3, nodes=nodes)
-    x = cube.vertices - 1.0
-    y2, z2 = np.roll(x, 1, axis=1) ** 2, np.roll(x, 2, axis=1) ** 2
-    return replace(cube, vertices=radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0))
-
-
 def finger(side: float, divisions: Divisions) -> Body:
     """A finger that hangs beside the ball, with a tendon 3 mm below its inner face."""
     box = box_hexahedra((SIDE, SIDE, LENGTH), divisions)
@@ -84,7 +77,7 @@ class Grasp:
     @staticmethod
     def of(study: GripperStudy, batch: int, device: torch.device, contact: bool = True) -> "Grasp":
         """Grippers whose tensions are spread evenly."""
-        ball = ball_mesh(RADIUS, study.ball)
+        ball = thing_mesh("ball", RADIUS, study.ball)
         ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
         table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
         bodies = {"left": finger(-1.0, study.fingers), "right": finger(1.0, study.fingers)}

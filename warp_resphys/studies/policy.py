@@ -21,18 +21,24 @@ from .tables import Sheet, show
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at
+_SHARES: Final = (0.5, 0.75, 1.0)  # of the range of the input, with which a scripted policy closes a gripper
 
 
 class Policies(Settings):
     """The configuration ``train_policy``: policies that are learned, and their test."""
 
     run: Word = setting(description="folder of a run with a laboratory")
-    skill: Literal["reach", "follow"]
+    skill: Literal["reach", "follow", "grasp"]
     models: Labels = setting(description="on which policies learn, such as sysid and resphys")
     steps: Natural = setting(description="actions of all robots together")
     robots: Natural = setting(description="that learn at once")
     episodes: Natural = setting(description="of the test")
     seeds: Annotated[Some[Count], AfterValidator(different)] = setting(description="of the policies")
+
+    @property
+    def learned_on(self) -> str:
+        """World on which policies learn: reduced models have no contact."""
+        return "simulator" if self.skill == "grasp" else "reduced"
 
 
 def train_policy(settings: Policies, folder: Path) -> None:
@@ -53,12 +59,12 @@ def train_policy(settings: Policies, folder: Path) -> None:
         raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
     wp.config.log_level = wp.LOG_WARNING
     run, task, models = Path(settings.run).expanduser(), settings.skill, settings.models
-    reaches = {}
+    reaches, learned_on = {}, settings.learned_on
     for model in models:
-        goal = make_vector(task, run, 1, model, "reduced").task
-        assert isinstance(goal, GoalTask)
-        reaches[model] = goal.reach
-    worlds = {f"reduced {model}": (model, "reduced") for model in models} | {"laboratory": (models[-1], "laboratory")}
+        goal = make_vector(task, run, 1, model, learned_on).task
+        reaches[model] = goal.reach if isinstance(goal, GoalTask) else None
+    worlds = {f"{learned_on} {model}": (model, learned_on) for model in models}
+    worlds["laboratory"] = (models[-1], "laboratory")
     # Goals and the units of observations are the same for all policies.
     environments = {
         name: make_vector(task, run, settings.episodes, model, world, reach=reaches[models[-1]])
@@ -100,7 +106,7 @@ def _policies(
 ) -> tuple[dict[str, _Policy], dict[str, list[float]]]:
     """Scripted and trained policies by name, and actions a second of the training by model."""
     from ..environments.making import make_vector
-    from ..environments.policies import ScriptedPolicy, acting, learn, load_model
+    from ..environments.policies import ScriptedGrasp, ScriptedPolicy, acting, learn, load_model
 
     task, models = settings.skill, settings.models
     origin = {"run": finished_record(run, "evaluate")["fingerprint"], "last": models[-1]}
@@ -108,11 +114,16 @@ def _policies(
     speeds: dict[str, list[float]] = {model: [] for model in models}
     for model in models:
         robots = make_vector(
-            task, run, settings.robots, model, "reduced", autoreset_mode="SameStep", reach=reaches[models[-1]]
+            task, run, settings.robots, model, settings.learned_on, autoreset_mode="SameStep", reach=reaches[models[-1]]
         )
-        for ahead in range(_PREVIEWS):
-            name = f"scripted, {model}, place {ahead + 1}"
-            policies[name] = _Policy(name, ScriptedPolicy(robots, ahead, reaches[model]), origin)
+        if (reach := reaches[model]) is None:
+            for share in _SHARES:
+                name = f"scripted, {share:.0%} of the range"
+                policies[name] = _Policy(name, ScriptedGrasp(share), origin)
+        else:
+            for ahead in range(_PREVIEWS):
+                name = f"scripted, {model}, place {ahead + 1}"
+                policies[name] = _Policy(name, ScriptedPolicy(robots, ahead, reach), origin)
         for seed in settings.seeds:
             saved, about = (run / "policies" / f"{task}_{model}_{seed}{suffix}" for suffix in (".zip", ".json"))
             asked = {"steps": settings.steps, "robots": settings.robots, "seed": seed, **origin}

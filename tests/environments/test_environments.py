@@ -32,7 +32,7 @@ def played(environment, steps=6, seed=3):
 
 class TestGymnasium:
     @pytest.mark.usefixtures("can_draw")
-    @pytest.mark.parametrize("task", TASKS)
+    @pytest.mark.parametrize("task", [task for task in TASKS if task != "grasp"])  # by two fingers: test_grasps.py
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
         environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)

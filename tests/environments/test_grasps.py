@@ -1,0 +1,85 @@
+"""Two fingers of a small run as a gripper: the environment, scripted policies, and the study of its errors."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from support.command_line import outcome
+from support.main_job import IN_RUN, run_without_report
+from warp_resphys.environments.making import make_vector, register
+from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import read_json
+
+BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
+RUN = [
+    "experiment=finger",
+    *("mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"),
+    *("data.steps=30", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
+    *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
+    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06", "identify.grid=null"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
+    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
+    *("actuation.filter_time_constants=[0.1]", "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+]
+
+
+@pytest.fixture(scope="module")
+def fingers(tmp_path_factory):
+    register()
+    return run_without_report(tmp_path_factory.mktemp("grasps"), *RUN)
+
+
+@pytest.mark.usefixtures("can_draw")
+def test_gymnasiums_checker_passes(fingers):
+    environment = gym.make(
+        "warp_resphys/Grasp-v0", run=fingers, model="sysid", seconds=0.2, action_time=0.05, render_mode="rgb_array"
+    )
+    check_env(environment.unwrapped)
+    environment.close()
+
+
+@pytest.mark.parametrize("world", ["simulator", "laboratory"])
+def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
+    grippers = make_vector("grasp", fingers, 2, "sysid", world, seconds=1.0)
+    assert errors_mm(grippers, ScriptedGrasp(1.0), 0)[-1].max() < 8.0  # of 20 mm
+    assert errors_mm(grippers, ScriptedGrasp(0.05), 0)[-1].min() > 18.0
+
+
+def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
+    together = make_vector("grasp", fingers, 3, "resphys", seconds=0.3)
+    alone = make_vector("grasp", fingers, 1, "resphys", seconds=0.3)
+    actions = np.array([[[-0.5, -1.0], [0.4, 0.0], [1.0, 1.0]]] * 4, dtype=np.float32)
+    together.reset(seed=0)
+    alone.reset(seed=1)
+    for action in actions:
+        seen, own = together.step(action)[0], alone.step(action[1:2])[0]
+    moved = np.abs(seen - together.reset(seed=0)[0]).max()
+    assert moved > 0.1
+    # Noise differs: 0.05 mm of 20.
+    np.testing.assert_allclose(seen[1, :39], own[0, :39], atol=0.02)
+
+
+def test_the_study_compares_models_with_the_laboratory(fingers, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    short = ["closing=0.15", "lifting=0.05", "shaking=0.05", "models=[simulation,resphys]", "things=[box]"]
+    out = outcome("benchmark", "grasp", f"run={fingers}", *short).out
+    assert "laboratory in free air" in out
+    (written,) = tmp_path.rglob("grasp_study.json")
+    rows = {(row["thing"], row["model"]): row for row in read_json(written)["rows"]}
+    assert set(rows) == {
+        *((("nothing", model)) for model in ("no tension", "simulation", "resphys")),
+        *((("box", model)) for model in ("laboratory in free air", "simulation", "resphys")),
+    }
+    # In the grasp the box stops the fingers, of the models too.
+    assert rows["box", "simulation"]["error_mm"] < 0.5 * rows["box", "laboratory in free air"]["error_mm"]
+    assert rows["nothing", "simulation"]["error_mm"] < 0.5 * rows["nothing", "no tension"]["error_mm"]
+
+
+def test_what_cannot_grasp_is_refused(fingers, folder):
+    with pytest.raises(InputError, match="reduced models have no contact"):
+        make_vector("grasp", fingers, 1, world="reduced")
+    with pytest.raises(InputError, match="this robot has front, left, right"):
+        make_vector("grasp", folder, 1)
+    assert "a finger of a gripper has one" in outcome("benchmark", "grasp", f"run={folder}").err

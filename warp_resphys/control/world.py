@@ -22,6 +22,7 @@ class World(ABC):
         input: name of the commanded input.
         parts: number n of its values.
         noise: standard deviation of observed markers [m]; None if the caller chooses it.
+        travel: (3,) way by which commands may move a body as a whole [m].
     """
 
     count: int
@@ -29,6 +30,7 @@ class World(ABC):
     input: str
     parts: int
     noise: float | None = None
+    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @abstractmethod
     def begin(self, chosen: BoolArray) -> None:

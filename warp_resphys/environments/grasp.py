@@ -31,7 +31,7 @@ class GraspWorld(World):
         thing: that is grasped.
     """
 
-    parts = 2
+    parts, travel = 2, (0.0, 0.0, RISE)
 
     def __init__(
         self,

@@ -183,7 +183,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             # The frame of the first robot, with the size of the task to all sides.
             middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
-            seen = np.concatenate([self.rests[0], vertices[0], *wanted, middle + around])
+            ways = np.stack([np.zeros(3), self.world.travel])[:, None]
+            seen = np.concatenate([self.rests[0], *(vertices[0] + ways), *wanted, middle + around])
             self._camera = Camera(self._up, seen, self.world.obstacles())
         errors = self._errors()
         seconds = number * self.world.time_step * self._mapping.frames

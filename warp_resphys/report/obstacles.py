@@ -41,10 +41,11 @@ class ObstacleSurface:
             parameters: Identified values by name, such as `obstacle_x_bar`; others are zero.
         """
         known, points, triangles = parameters or {}, [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)]
-        contacts = [energy for energy in body.energies if isinstance(energy, Contact)]
+        energies = [energy for _, own, _ in body.members for energy in own.energies]
+        contacts = [energy for energy in energies if isinstance(energy, Contact)]
         obstacles = [own for contact in contacts for own in contact.obstacles.items()]
         for name, obstacle in obstacles:
-            own, faces = surface_of(obstacle, _value(known, GROWTH.name, name), body.mesh.vertices)
+            own, faces = surface_of(obstacle, _value(known, GROWTH.name, name), body.vertices)
             triangles.append(faces + sum(map(len, points)))
             points.append(own)
         offsets = np.array(

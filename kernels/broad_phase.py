@@ -1,7 +1,7 @@
 """Pairs of a surface of triangles that may come near one another, by a hierarchy of boxes.
 
 Vertices move by at most a radius from the positions for which pairs are sought: pairs within one piece of the surface
-by one around the mean motion of the piece, other pairs by another.
+by one around the mean motion of the piece, other pairs by another around the mean motion of all.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ class Sweep:
     """Positions of a batch, and radii around them."""
 
     origin: wp.array2d[wp.vec3d]  # (B, N) [m]
-    outer: wp.array2d[wp.float64]  # (B, N) radius [m]
+    outer: wp.array2d[wp.float64]  # (B, N) radius around the mean motion of all [m]
     inner: wp.array2d[wp.float64]  # (B, N) radius around the mean motion of a piece [m]
     piece: wp.array[int]  # (N)
     reach: wp.float64  # distance within which pairs count [m]

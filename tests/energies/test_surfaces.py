@@ -218,9 +218,12 @@ def test_pairs_are_all_pairs_within_reach():
         listed = zip(pairs.kind[own][found].tolist(), pairs.nodes[own][found].tolist(), strict=True)
         assert {(k, *n) for k, n in listed} == near
         assert len(near) > 300
-    pairs.find(x, 1e-3 * torch.ones_like(x))
-    assert pairs.covers(x + 1e-3)
-    assert not pairs.covers(x + 1e-2)
+    way = torch.zeros_like(x)
+    way[:, len(PLATE.vertices) :] = 1e-3
+    pairs.find(x, way)
+    assert pairs.covers(x + way)
+    assert not pairs.covers(x + 10.0 * way)
+    assert pairs.covers(x + 1.0)  # Motion of all together changes no distance.
 
 
 def test_crossings_are_seen(device):

@@ -136,9 +136,11 @@ class PairList:
         self.vertices = tensor(surface.vertices)
         self._triangles, self._edges = tensor(surface.triangles), tensor(surface.edges)
         self._pieces = tensor(surface.pieces)
-        self._per_piece = torch.zeros(int(surface.pieces.max()) + 1, n, device=device, dtype=torch.float64)
         own = self._pieces[self.vertices]
-        self._per_piece[own, self.vertices] = 1.0 / torch.bincount(own, minlength=len(self._per_piece))[own].double()
+        # Weights of the mean over every piece, and in the last row over all.
+        self._means = torch.zeros(int(surface.pieces.max()) + 2, n, device=device, dtype=torch.float64)
+        self._means[own, self.vertices] = 1.0 / torch.bincount(own, minlength=len(self._means))[own].double()
+        self._means[-1, self.vertices] = 1.0 / len(own)
         self._degree = tensor(surface.degree, torch.float64)
         # Both surfaces in contact have vertices, for half of its area, and edges, for an eighth.
         self._vertex_area = tensor(0.5 * surface.vertex_areas(), torch.float64)
@@ -164,27 +166,22 @@ class PairList:
         if self._origin is None:
             return False
         way, relative = self._ways(positions - self._origin)
-        inside = relative <= self._inner
-        if len(self._per_piece) > 1:
-            inside &= way <= self._outer
+        inside = (relative <= self._inner) & (way <= self._outer)
         return bool(inside[:, self.vertices].all())
 
     def lengths(self, ways: torch.Tensor) -> torch.Tensor:
-        """Returns the lengths (B, P) of ways (B, N, 3), relative to their mean where there is one piece [m]."""
-        absolute, relative = self._ways(ways)
-        return (absolute if len(self._per_piece) > 1 else relative)[:, self.vertices]
+        """Returns the lengths (B, P) of ways (B, N, 3), relative to their mean [m]."""
+        return self._ways(ways)[0][:, self.vertices]
 
     def _ways(self, ways: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns lengths (B, N) of ways (B, N, 3), and of the ways relative to the mean of a piece [m]."""
-        mean = torch.einsum("cn,bnk->bck", self._per_piece, ways)
-        return ways.norm(dim=-1), (ways - mean[:, self._pieces]).norm(dim=-1)
+        """Returns lengths (B, N) of ways (B, N, 3) relative to the mean of all, and to that of their piece [m]."""
+        mean = torch.einsum("cn,bnk->bck", self._means, ways)
+        return (ways - mean[:, -1:]).norm(dim=-1), (ways - mean[:, self._pieces]).norm(dim=-1)
 
     def find(self, origin: torch.Tensor, ways: torch.Tensor) -> None:
         """Makes the list for positions (B, N, 3) and around ways (B, N, 3) from there [m]."""
         own, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
-        if len(self._per_piece) == 1:  # Only motion within the piece matters.
-            outer = inner
         self._origin, self._outer, self._inner = origin.clone(), outer, inner
         motion = broad_phase.Sweep()
         motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)

@@ -380,7 +380,7 @@ def test_a_body_touches_itself(device):
 
 
 def test_batch_is_what_its_environments_are_alone(device):
-    """Sixteen environments with different contacts in one batch are bit for bit what they are alone."""
+    """Sixteen environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)
     velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (16, 3)))
     spin = torch.linspace(-4.0, 4.0, 16, dtype=torch.float64)
@@ -390,7 +390,9 @@ def test_batch_is_what_its_environments_are_alone(device):
     for b in range(16):
         alone = landing(solver=settings, device=device)
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
-        assert torch.equal(own.q[:, 0], path.q[:, b])
+        if device == "cpu":
+            assert torch.equal(own.q[:, 0], path.q[:, b])
+        torch.testing.assert_close(own.q[:, 0], path.q[:, b], rtol=0.0, atol=1e-8)
 
 
 def leaning():

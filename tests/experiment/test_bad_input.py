@@ -91,7 +91,7 @@ def test_absent_cuda_device():
 )
 def test_body(options, message):
     with refused(message):
-        Body(MESH, **options)
+        Simulator(Body(MESH, **options))
 
 
 @pytest.mark.parametrize(

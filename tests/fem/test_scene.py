@@ -63,6 +63,22 @@ def test_forces_and_clamps_go_to_the_body_that_is_named():
         scene.inputs({"c": Inputs()})
 
 
+def test_a_body_may_be_driven_as_a_whole_but_not_all_of_them():
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
+    driven = Body(mesh, fixed=np.arange(len(mesh.vertices)))
+    scene = Scene({"tool": driven, "finger": finger()})
+    simulator = Simulator(scene, SOFT)
+    places = simulator.rest_positions[simulator.fixed].clone()
+    places[: len(mesh.vertices), 1] += 0.2
+    path = simulator.rollout(simulator.rest_state(), 3, Inputs(fixed_positions=places[None]))
+    assert torch.equal(path.q[-1][:, scene.vertex_slice("tool")], places[None, : len(mesh.vertices)])
+    alone = Simulator(finger(), SOFT)
+    own = alone.rollout(alone.rest_state(), 3)
+    torch.testing.assert_close(path.q[:, :, scene.vertex_slice("finger")], own.q, rtol=0.0, atol=1e-9)
+    with pytest.raises(InputError, match="every vertex is fixed"):
+        Simulator(Scene({"tool": driven, "other": driven}), SOFT)
+
+
 def test_materials_and_the_joined_mesh_of_a_scene():
     scene = Scene({"a": finger(), "b": finger()})
     assert scene.mesh.region("b").tolist() == [4, 5, 6, 7]

@@ -80,6 +80,8 @@ def test_the_smallest_check_passes_and_writes_a_page(folder):
         "Bodies thrown at one another",
         "Momentum of bodies",
         "An arch",
+        "A house of cards",
+        "Surfaces that must not cross",
     ):
         assert title in text
     assert "warp-resphys verify contact" in text

@@ -107,6 +107,8 @@ class Simulator:
         body = self.body
         self.rest_positions = self.tensor(body.vertices)  # (N, 3) [m]
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
+        if len(self.fixed) == body.n_vertices:
+            raise InputError("every vertex is fixed: leave some free to move.")
         if settings.name == "projective_dynamics" and len(body.coordinates.sliding):
             raise InputError("solver is projective_dynamics, which knows no symmetry planes: choose quasi_newton.")
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):

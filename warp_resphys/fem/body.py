@@ -107,8 +107,6 @@ class Body:
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
         fixed = np.unique(_vertex_indices(self.fixed, self.n_vertices, "fixed vertices"))
-        if len(fixed) == self.n_vertices:
-            raise InputError("every vertex is fixed: leave some free to move.")
         object.__setattr__(self, "fixed", fixed)
         names = [quantity.name for energy in self.energies for quantity in (*energy.parameters, *energy.inputs)]
         duplicates = [name for name in names if names.count(name) > 1]

@@ -8,6 +8,8 @@ sphere, cylinder    are pressed into a bonded layer with the forces of theory (`
 throws, plates      no vertex of a surface penetrates, and every solve converges
 energy              implicit Euler gains none
 bodies              on one another (`surface_check`)
+cases               of Erleben, a mat, rollers, a funnel and a clip, whose surfaces never cross; a house of cards stands
+                    and falls by its friction (`contact_cases`)
 ==================  ==================================================================================================
 """
 
@@ -41,7 +43,7 @@ from ..io.settings import Count, Natural, Positive, Settings, Some, Word, settin
 from ..mesh.mesh import Mesh, box_hexahedra, select_vertices
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from . import surface_check
+from . import contact_cases, surface_check
 from .beam import beam_mesh, clamped
 from .device_check import Check, run_checks
 from .indentation import DEPTHS, cylinder_errors, measured, pressure, sphere_error
@@ -118,6 +120,8 @@ def contact_check(settings: ContactStudy, folder: Path) -> None:
         "Bodies thrown at one another": partial(surface_check.throw_checks, study.body_throws, study.seed, device),
         "Momentum of bodies": partial(surface_check.momentum_checks, device),
         "An arch": partial(surface_check.arch_checks, study.stones, device),
+        "A house of cards": partial(contact_cases.card_checks, study.quick, device),
+        "Surfaces that must not cross": partial(contact_cases.case_checks, study.quick, device),
     }
     sections += [run_checks(title, checks) for title, checks in between.items()]
     times = time_sheet(study, device)

@@ -1,0 +1,99 @@
+"""Cases of contact that must not cross: they touch and pass with contact, and cross without; a house of cards."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.energies.launcher import Launcher
+from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.mesh.mesh import check_mesh
+from warp_resphys.mesh.quality import cell_volumes
+from warp_resphys.studies import contact_cases
+from warp_resphys.studies.contact_cases import card_drop, card_friction, card_house, cases, check_case, run_case
+
+CPU = torch.device("cpu")
+CASES = cases()
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("mat", "rollers")])
+def test_surfaces_cross_without_contact_alone(name):
+    """A case passes; without contact its surfaces cross."""
+    case = replace(CASES[name], steps=min(CASES[name].steps, 40))
+    check = check_case(name, case, CPU)
+    assert check.passed, check
+    assert "touches" in check.expected
+    free = run_case(replace(case, contact=None), CPU)
+    assert free.crossings > 0 == free.failed
+
+
+def test_rollers_draw_by_friction_alone():
+    """The block passes between rollers with friction, and stays before them without."""
+    case = CASES["rollers"]
+    assert check_case("rollers", case, CPU).passed
+    smooth = replace(case, steps=40, time_step=0.015, contact=replace(case.contact, friction=0.0))
+    check = check_case("smooth", smooth, CPU)
+    assert "0 crossings" in check.result
+    assert "0 failed" in check.result
+    assert not check.passed
+
+
+def test_a_mat_is_turned_until_it_touches_itself():
+    case = CASES["mat"]
+    end = case.inputs(case.simulator(CPU)).fixed_positions[-1, 0].numpy()
+    far = end[:, 0] > 0.05
+    assert np.ptp(end[far], 0)[0] == np.ptp(end[~far], 0)[0] == 0.0  # Both ends stay plane.
+    assert end[far, 0].min() - end[~far, 0].max() == pytest.approx(0.07)
+    short = replace(case, steps=24, time_step=0.1)
+    assert check_case("mat", short, CPU).passed
+    assert not check_case("free", replace(short, contact=None), CPU).passed
+
+
+def test_an_error_is_a_failed_check():
+    """Rollers that would turn by a third of their circumference in a step."""
+    check = check_case("rollers", replace(CASES["rollers"], steps=2, time_step=0.3), CPU)
+    assert not check.passed
+    assert "move" in check.result
+
+
+def test_both_programs_find_the_same_crossings(monkeypatch):
+    """Two spikes pushed through one another step by step, by ipctk and by the project's own search."""
+    pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
+    case = replace(CASES["spikes"], contact=None)
+    s = case.simulator(CPU)
+    surface = Surface.of(s.body.mesh)
+    positions = s.rest_positions.expand(20, -1, -1).clone()
+    upper = s.body.vertex_slice("upper")
+    positions[:, upper, :2] += torch.tensor([0.003, 0.001], dtype=torch.float64)
+    positions[:, upper, 2] -= torch.linspace(0.0, 0.1, 20, dtype=torch.float64)[:, None]
+    pairs = PairList(Launcher(1, CPU), surface, 1e-4)
+    theirs = contact_cases.crossing_steps(surface, positions, pairs)
+    monkeypatch.setattr(contact_cases, "find_spec", lambda _: None)
+    ours = contact_cases.crossing_steps(surface, positions, pairs)
+    assert theirs[1] == "ipctk" != ours[1]
+    assert 0 < theirs[0] == ours[0] < 20
+
+
+def test_meshes_are_whole():
+    """Cells are upright, and those that are cut from a box or a prism have the volume that is left."""
+    for case in CASES.values():
+        for body in case.bodies.values():
+            check_mesh(body.mesh)
+    volume = {n: float(cell_volumes(CASES[n].bodies["lower"].mesh).sum()) for n in ("spike in hole", "wedge in crack")}
+    assert volume["spike in hole"] == pytest.approx(0.2 * 0.2 * 0.1 - 0.2 * 0.2 * 0.06 / 3.0)
+    assert volume["wedge in crack"] == pytest.approx(0.2 * 0.2 * 0.1 - 0.2 * 0.12 * 0.06 / 2.0)
+
+
+@pytest.mark.parametrize("degrees", [15.0, 35.0])
+def test_the_friction_of_cards_balances_moments(degrees):
+    """About the edge on which a card stands, with its weight in its middle and the other card's force at its top."""
+    angle = math.radians(degrees)
+    scene = card_house(angle, 0.3)
+    x = scene.vertices[scene.vertex_slice("left")]
+    foot, top, middle = x[x[:, 2].argmin()], x[x[:, 0].argmax()], x.mean(0)
+    assert top[0] < 0.0  # The other card begins at the plane x = 0.
+    need = (middle[0] - foot[0]) / (top[2] - foot[2])
+    assert card_friction(angle) == pytest.approx(need, rel=1e-9)
+    assert card_drop(angle, 1.05 * need, CPU) < 1e-3 < 1e-2 < card_drop(angle, 0.95 * need, CPU)

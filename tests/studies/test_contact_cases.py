@@ -30,14 +30,16 @@ def test_surfaces_cross_without_contact_alone(name):
 
 
 def test_rollers_draw_by_friction_alone():
-    """The block passes between rollers with friction, and stays before them without."""
-    case = CASES["rollers"]
-    assert check_case("rollers", case, CPU).passed
-    smooth = replace(case, steps=40, time_step=0.015, contact=replace(case.contact, friction=0.0))
-    check = check_case("smooth", smooth, CPU)
-    assert "0 crossings" in check.result
-    assert "0 failed" in check.result
-    assert not check.passed
+    """The block passes where friction exceeds the slope at which its edges meet the rollers, and not with less.
+
+    The middles of the rollers are 21 mm from that of the block, which is 16 mm high, and their radius is 15 mm.
+    """
+    case, slope = CASES["rollers"], math.tan(math.acos((21.0 - 8.0) / 15.0))
+    for friction, draws in ((1.15 * slope, True), (0.85 * slope, False)):
+        check = check_case("rollers", replace(case, contact=replace(case.contact, friction=friction)), CPU)
+        assert "0 crossings" in check.result
+        assert "0 failed" in check.result
+        assert check.passed == draws, check
 
 
 def test_a_mat_is_turned_until_it_touches_itself():

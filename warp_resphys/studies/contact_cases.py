@@ -173,7 +173,7 @@ def check_case(name: str, case: Case, device: torch.device) -> Check:
     except ResphysError as error:
         return Check(name, str(error), expected, False)
     result = f"{case.steps} steps, {out.crossings} crossings ({out.checked_by}), {out.failed} failed, "
-    result += f"{out.iterations} iterations at most, gap {1e6 * out.gap:.2g} um"
+    result += f"{out.iterations} iterations at most, gap {1e6 * out.gap:.3g} um"
     passed = out.crossings == out.failed == 0 and out.gap < case.distance
     if case.passes is not None:
         body, least = case.passes
@@ -284,8 +284,11 @@ def mat() -> Case:
 
 
 def rollers() -> Case:
-    """Returns the case of a soft block that two rollers draw through a gap narrower than itself."""
-    radius, gap, width, distance = 0.015, 0.01, 0.03, 5e-4
+    """Returns the case of a soft block that two rollers draw through a gap narrower than itself.
+
+    Rigid rollers would draw it in where friction exceeds the slope at which its edges meet them, here 0.58.
+    """
+    radius, gap, width, distance = 0.015, 0.012, 0.03, 5e-4
     speed, steps, step = 0.1, 120, 0.005
     roller = rod(width * np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0]]), radius, 3, core=4, nodes=8)
     block = box_hexahedra((0.03, 0.016, 0.016), (6, 3, 3))
@@ -322,20 +325,17 @@ def funnel() -> Case:
 
 
 def clip() -> Case:
-    """Returns the case of a U whose ends are pressed on one another."""
-    mesh, distance = clip_mesh(), 1e-3
-    end = mesh.vertices[:, 0] > 0.029
-    side = np.where(mesh.vertices[:, 2] > 0.014, -1.0, 1.0) * end
-    force = np.outer(0.3 * side / (0.5 * end.sum()), (0.0, 0.0, 1.0))
+    """Returns the case of a U with legs of two lengths, whose ends are pressed on one another."""
+    bar, height, distance, press = 0.006, 0.028, 1e-3, 0.3
+    legs = {1.0: ((0.0, 0.0, 0.0), (0.03, bar, bar)), -1.0: ((0.0, 0.0, height - bar), (0.026, bar, height))}
+    mesh = boxes_hexahedra([*legs.values(), ((0.0, 0.0, 0.0), (bar, bar, height))], 0.003)
+    force = np.zeros_like(mesh.vertices)
+    for side, (low, high) in legs.items():
+        end = select_vertices(mesh, x=high[0], z=(low[2], high[2]))
+        force[end, 2] = side * press / len(end)
     body = {"clip": Body(mesh, fixed=select_vertices(mesh, x=0.0))}
     contact = SurfaceContact(1e5, 0.3, distance)
     return Case(body, contact, distance, 40, 0.004, SOFT, (0.0, 0.0, 0.0), force=force)
-
-
-def clip_mesh() -> Mesh:
-    """Returns a U of three bars, whose ends stand 16 mm apart."""
-    bars = [((0.0, 0.0, low), (0.03, 0.006, low + 0.006)) for low in (0.0, 0.022)]
-    return boxes_hexahedra([((0.0, 0.0, 0.0), (0.006, 0.006, 0.028)), *bars], 0.003)
 
 
 def card_friction(angle: float) -> float:

@@ -1,6 +1,7 @@
 """Differentiable minimisation of an incremental potential, with an implicit adjoint."""
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +24,7 @@ T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
 
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
+_LEAST_WAY, _MOST_PARTS = 1e-2, 32  # of the way of fixed vertices that bodies bar: a part of it, and their number
 _REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: target, and limit if rounding prevents the target
 
 
@@ -260,14 +262,26 @@ def _solve(
     fixed_positions: Any,
     *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport]:
-    """Returns the minimiser and the report of one shard."""
-    workspace.potential.set_terms(_terms(names, terms))
-    if len(workspace.fixed):
+    """Returns the minimiser and the report of one shard.
+
+    Where bodies bar the way of fixed vertices, these go as far as they can, and the others give way to them by a solve,
+    again and again; the last solve has every fixed vertex in its place. A batch of which that holds agrees with its
+    environments alone within the tolerance, not bit for bit.
+    """
+    potential, fixed = workspace.potential, workspace.fixed
+    potential.set_terms(_terms(names, terms))
+    potential.check_start(follows is not None and bool(follows.all()))
+    parts: list[SolveReport] = []
+    while not potential.place_fixed(fixed, fixed_positions, _LEAST_WAY if len(parts) < _MOST_PARTS else 1.0):
+        assert potential.feasible is not None
+        parts.append(solver.solve(potential.coordinates.hold(potential.feasible.clone())))
+        potential.feasible.copy_(potential.positions)
+    if len(fixed):
         start = start.clone()
-        start[:, workspace.fixed] = fixed_positions
-    workspace.potential.check_start(workspace.fixed, fixed_positions, follows is not None and bool(follows.all()))
-    report = solver.solve(workspace.potential.coordinates.hold(start.double()).to(start), follows)
-    return workspace.potential.positions.to(start.dtype, copy=True), report
+        start[:, fixed] = fixed_positions
+    report = solver.solve(potential.coordinates.hold(start.double()).to(start), None if parts else follows)
+    work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
+    return potential.positions.to(start.dtype, copy=True), replace(report, **work)
 
 
 def _adjoint(

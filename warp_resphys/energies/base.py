@@ -385,10 +385,17 @@ class Term(ABC):
 
         Args:
             values: buffers of the values.
-            start: (B, N, 3) `feasible` positions of all terms, fixed vertices where they are in the solve [m].
+            start: (B, N, 3) `feasible` positions of all terms, fixed vertices where they were before [m].
             follows: whether the step begins where the last one ended.
         """
         del values, start, follows
+
+    def free_way(self, origin: torch.Tensor, end: torch.Tensor, share: torch.Tensor) -> None:
+        """Lowers the share (B,) of the way between two positions (B, N, 3) [m] that bodies do not bar to one another.
+
+        Unlike `bounds`, it is for ways of vertices that do not yield.
+        """
+        del origin, end, share
 
     def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor] | None:
         """Returns positions of finite energy, if there are others; a solve does not pass by those.

@@ -17,6 +17,7 @@ import torch
 import warp as wp
 
 from ..fem.coordinates import Coordinates, DeviceCoordinates
+from ..io.errors import InputError
 from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import PairTangents, PointSet, Term
@@ -252,22 +253,52 @@ class IncrementalPotential(Launcher):
         """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
         return self._feasible[0][0] if self._feasible else None
 
-    def check_start(self, fixed: torch.Tensor, fixed_positions: torch.Tensor, follows: bool) -> None:
-        """Completes `feasible` by the fixed vertices in their places, and checks it (`Term.check_start`).
+    def check_start(self, follows: bool) -> None:
+        """Checks `feasible`, with fixed vertices where they were before (`Term.check_start`).
 
         Args:
-            fixed: (D,) fixed vertices.
-            fixed_positions: (1 or B, D, 3) their positions in the solve [m].
             follows: whether the step begins where the last one ended.
 
         Raises:
             InputError: the solve cannot start there.
         """
-        if self.feasible is None:
-            return
-        self.feasible[:, fixed] = fixed_positions.to(self.feasible)
-        for term, values in zip(self.energies, self.own_values, strict=True):
-            term.check_start(values, self.feasible, follows)
+        if self.feasible is not None:
+            for term, values in zip(self.energies, self.own_values, strict=True):
+                term.check_start(values, self.feasible, follows)
+
+    def place_fixed(self, fixed: torch.Tensor, places: torch.Tensor, least: float) -> bool:
+        """Moves the fixed vertices of `feasible` to their places, or towards them as far as bodies let them.
+
+        Args:
+            fixed: (D,) fixed vertices.
+            places: (1 or B, D, 3) their positions in the solve [m].
+            least: share of the way that must be free.
+
+        Returns:
+            Whether they arrived.
+
+        Raises:
+            InputError: less is free.
+        """
+        if (feasible := self.feasible) is None:
+            return True
+        origin, share = feasible.clone(), self.zeros() + 1.0
+        feasible[:, fixed] = places.to(feasible)
+        way = feasible - origin
+        for term in self.energies:
+            term.free_way(origin, feasible, share)
+        if bool((share < least).any()):
+            b = int(share.argmin())
+            vertex = int(way[b].norm(dim=-1).argmax())
+            raise InputError(
+                f"fixed vertices move through the gap between surfaces in a step, in environment {b} by up to "
+                f"{1e3 * float(way[b, vertex].norm()):.3g} mm, at vertex {vertex}: move them less in a step, or go "
+                "there by several equilibria, one after another."
+            )
+        arrived = bool((share == 1.0).all())
+        if not arrived:
+            feasible.copy_(origin + share[:, None, None] * way)
+        return arrived
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""

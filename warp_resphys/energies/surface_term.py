@@ -120,22 +120,27 @@ class SurfaceTerm(Term):
                     f"the surfaces of the bodies cross at the start of a step, near vertex {vertex} in environment "
                     f"{b}: give a state in which they are apart."
                 )
-        if torch.equal(given, start):
-            return
-        share, way = self.launcher.zeros() + 1.0, start - given
-        if not (ours.covers(given) and ours.covers(start)):
-            ours.find(given, way)
-        if ours.count:
-            ends = (warp_view(given, wp.vec3d), warp_view(start, wp.vec3d))
-            self.launcher.launch(self._bound(*ends, warp_view(share, wp.float64)))
+        share = self.launcher.zeros() + 1.0
+        self.free_way(given, start, share)
         if bool((share < 1.0).any()):
             b = int(share.argmin())
-            vertex = int(way[b].norm(dim=-1).argmax())
+            way = (start - given)[b].norm(dim=-1)
             raise InputError(
-                f"fixed vertices or an obstacle move through the gap between surfaces in a step, in environment {b} by "
-                f"up to {1e3 * float(way[b, vertex].norm()):.3g} mm, at vertex {vertex}: move them less in a step, or "
-                "go there by several equilibria, one after another."
+                f"an obstacle moves a body through the gap to another one in a step, in environment {b} by up to "
+                f"{1e3 * float(way.max()):.3g} mm, at vertex {int(way.argmax())}: let it move less in a step, or go "
+                "there by several equilibria, one after another."
             )
+
+    @override
+    def free_way(self, origin: torch.Tensor, end: torch.Tensor, share: torch.Tensor) -> None:
+        ours = self._list
+        if torch.equal(origin, end):
+            return
+        if not (ours.covers(origin) and ours.covers(end)):
+            ours.find(origin, end - origin)
+        if ours.count:
+            ends = (warp_view(origin, wp.vec3d), warp_view(end, wp.vec3d))
+            self.launcher.launch(self._bound(*ends, warp_view(share, wp.float64)))
 
     def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
         """Returns launches of forces and energies at positions."""

@@ -468,7 +468,7 @@ def test_driven_vertices_push_and_never_pass(own):
 
 @pytest.mark.parametrize("rise", [2e-3, 0.03])
 def test_driven_vertices_push_in_one_step(rise, device):
-    """A plate that goes up through the gap below a cube, and by more than its height, lifts it; momentum and gradient."""
+    """A plate that goes up by more than the gap below a cube, or its height, lifts it; momentum and gradient."""
     simulator = landing(device=device)
     rest = simulator.rest_state()
     place = simulator.rest_positions[simulator.fixed].clone()

@@ -391,9 +391,9 @@ class Term(ABC):
         del values, start, follows
 
     def free_way(self, origin: torch.Tensor, end: torch.Tensor, share: torch.Tensor) -> None:
-        """Lowers the share (B,) of the way between two positions (B, N, 3) [m] that bodies do not bar to one another.
+        """Lowers the share (B,) of the way of fixed vertices, between positions (B, N, 3) [m], that others leave free.
 
-        Unlike `bounds`, it is for ways of vertices that do not yield.
+        Up to that share, no barrier is passed, although no other vertex moves.
         """
         del origin, end, share
 

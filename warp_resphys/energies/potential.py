@@ -282,9 +282,11 @@ class IncrementalPotential(Launcher):
         """
         if (feasible := self.feasible) is None:
             return True
-        origin, share = feasible.clone(), self.zeros() + 1.0
+        origin = feasible.clone()
         feasible[:, fixed] = places.to(feasible)
-        way = feasible - origin
+        if not (self.has_pairs and len(fixed)):
+            return True
+        way, share = feasible - origin, self.zeros() + 1.0
         for term in self.energies:
             term.free_way(origin, feasible, share)
         if bool((share < least).any()):

@@ -317,6 +317,30 @@ def add_block(out: wp.array3d[wp.float64], a: int, i: int, j: int, block: wp.mat
             out[a, 3 * i + r, 3 * j + s] += block[r, s]
 
 
+@wp.func
+def add_parallelism(out: wp.array3d[wp.float64], a: int, x: Corners, factor: wp.float64, whole: wp.float64):
+    """Adds the second derivatives of c = |a x b|^2 (`parallelism`) times a factor.
+
+    Those are 2 J^T J, with J of a x b, and the curvature of a x b; `whole` is zero without the latter.
+    """
+    e, f = x[1] - x[0], x[3] - x[2]
+    ee = -wp.outer(f, f)
+    ff = -wp.outer(e, e)
+    ef = (ONE + whole) * wp.outer(e, f) - whole * wp.outer(f, e)
+    for r in range(3):
+        ee[r, r] = ee[r, r] + wp.length_sq(f)
+        ff[r, r] = ff[r, r] + wp.length_sq(e)
+        ef[r, r] = ef[r, r] - wp.dot(e, f)
+    for i in range(4):
+        for j in range(4):
+            curved = wp.where(j < 2, ee, ef)
+            if i >= 2:
+                curved = wp.where(j < 2, wp.transpose(ef), ff)
+            if (i + j) % 2 == 1:
+                curved = -curved
+            add_block(out, a, i, j, (TWO * factor) * curved)
+
+
 @wp.kernel
 def pair_tangents(
     chosen: wp.array[int],  # (A) pairs
@@ -364,24 +388,11 @@ def pair_tangents(
                     add_block(out, a, i, j, at.w[i] * at.w[j] * block - bend * slid)
     if m[0] < ONE:
         plain, slope = pair_barrier(pairs, c, x, stiffness[b, 0], reach), parallelism_slope(x)
-        e, f = x[1] - x[0], x[3] - x[2]
-        ee = -wp.outer(f, f)
-        ff = -wp.outer(e, e)
-        ef = TWO * wp.outer(e, f) - wp.outer(f, e)
-        for r in range(3):
-            ee[r, r] = ee[r, r] + wp.length_sq(f)
-            ff[r, r] = ff[r, r] + wp.length_sq(e)
-            ef[r, r] = ef[r, r] - wp.dot(e, f)
+        add_parallelism(out, a, x, plain.energy * m[1], ONE)
         for i in range(4):
             for j in range(4):
-                curved = wp.where(j < 2, ee, ef)
-                if i >= 2:
-                    curved = wp.where(j < 2, wp.transpose(ef), ff)
-                if (i + j) % 2 == 1:
-                    curved = -curved
                 outer = wp.outer(slope[i], plain.slope[j]) + wp.outer(plain.slope[i], slope[j])
-                block = m[1] * outer + plain.energy * m[2] * wp.outer(slope[i], slope[j])
-                add_block(out, a, i, j, block + (TWO * plain.energy * m[1]) * curved)
+                add_block(out, a, i, j, m[1] * outer + plain.energy * m[2] * wp.outer(slope[i], slope[j]))
 
 
 @wp.kernel
@@ -393,22 +404,26 @@ def pair_springs(
     positions: wp.array2d[wp.vec3d],
     out: wp.array3d[wp.float64],  # (A, 12, 12), zero before
 ):
-    """`pair_tangents` by the change of the distance of the nearest points alone, if it is stable against that."""
+    """The positive part of `pair_tangents` along the shortest distance, and by the angle of almost parallel edges."""
     a = wp.tid()
     c = chosen[a]
     b, kind = pairs.environment[c], pairs.kind[c]
     x = corners(positions, b, pairs.nodes[c])
     first = nearest(kind, 0, x)
-    sum = wp.float64(0.0)
+    curvature = wp.float64(0.0)
     for feature in range(features(kind)):
         at = nearest(kind, feature, x)
         if at.d < reach and at.d > ZERO:
             by = wp.dot(first.w, at.w) * wp.dot(first.n, at.n)
-            sum += part(kind, feature, pairs.degree[c]) * barrier(at.d / reach)[2] * by * by
+            curvature += part(kind, feature, pairs.degree[c]) * barrier(at.d / reach)[2] * by * by
     if kind == EDGE_EDGE:
-        sum *= mollifier(parallelism(x), pairs.parallel[c])[0]
+        m = mollifier(parallelism(x), pairs.parallel[c])
+        curvature *= m[0]
+        if m[0] < ONE:
+            plain = pair_barrier(pairs, c, x, stiffness[b, 0], reach)
+            add_parallelism(out, a, x, wp.max(plain.energy, ZERO) * m[1], ZERO)
     size = wp.dot(first.w, first.w)
-    factor = wp.max(sum, ZERO) * stiffness[b, 0] * pairs.area[c] / (reach * size * size)
+    factor = wp.max(curvature, ZERO) * stiffness[b, 0] * pairs.area[c] / (reach * size * size)
     block = factor * wp.outer(first.n, first.n)
     for i in range(4):
         for j in range(4):

@@ -552,3 +552,21 @@ def test_refusals():
     crossing[simulator.body.vertex_slice("cube"), 2] -= 0.008
     with pytest.raises(InputError, match="cross at the start of a step"):
         simulator.step(simulator.state(crossing))
+
+
+@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+@pytest.mark.parametrize("shift", [0.0, 1e-5])
+def test_edges_in_line_take_few_iterations(name, shift):
+    """Two boxes, one above the other, whose faces at the gap are fixed: free ends of edges move them out of line."""
+    box = box_hexahedra((0.01, 0.01, 0.01), (1, 1, 1))
+    above = replace(box, vertices=box.vertices + [shift, 0.7 * shift, 0.0102])
+    aside = replace(box, vertices=box.vertices + [0.5, 0.0, 0.0])
+    bodies = {
+        "below": Body(box, fixed=select_vertices(box, z=0.01)),
+        "above": Body(above, fixed=select_vertices(above, z=0.0102)),
+        "falling": Body(aside),  # whose motion does not wait for theirs
+    }
+    scene = Scene(bodies, SurfaceContact(5e4, 0.5, distance=5e-4, slip_speed=5e-3))
+    simulator = Simulator(scene, SOFT, time_step=0.01, solver=SolverSettings(name, relative_tolerance=1e-8))
+    path = simulator.rollout(simulator.rest_state(), 5)
+    assert max(int(report.iterations.max()) for report in path.reports) <= 4

@@ -40,9 +40,9 @@ from ..io.errors import ResphysError
 from ..mesh.boxes import boxes_hexahedra
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from ..mesh.rod import rod
+from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .device_check import Check
-from .gripper import ball_mesh
 from .surface_check import SOFT, STONE, G
 
 FloatArray = NDArray[np.float64]
@@ -318,7 +318,7 @@ def funnel() -> Case:
     x, r = levels[np.round(level).astype(int)].T
     ring = np.stack([x, (r + depth) * np.cos(turn), (r + depth) * np.sin(turn)], axis=1)
     walls = merged(ring[tube.cells])
-    ball = placed(ball_mesh(radius, 4), (-0.02, 0.0, 0.0))
+    ball = placed(thing_mesh("ball", radius, 4), (-0.02, 0.0, 0.0))
     bodies = {"funnel": Body(walls, fixed=np.arange(len(walls.vertices))), "ball": Body(ball)}
     contact, soft = SurfaceContact(1e5, 0.1, distance), replace(_RUBBER, youngs_modulus=2e4)
     return Case(bodies, contact, distance, 40, 1e-3, soft, (40.0 * G, 0.0, 0.0), passes=("ball", 0.015))

@@ -104,7 +104,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CaseOutcome:
     """What happened to a case.
 
     Attributes:
@@ -124,7 +124,7 @@ class Outcome:
     end: FloatArray
 
 
-def run_case(case: Case, device: torch.device) -> Outcome:
+def run_case(case: Case, device: torch.device) -> CaseOutcome:
     """Simulates a case and checks every step for crossings."""
     s = case.simulator(device)
     start = s.rest_state()
@@ -142,7 +142,7 @@ def run_case(case: Case, device: torch.device) -> Outcome:
         gap = min(gap, float(pairs.distances(q).min())) if pairs.count else gap
     failed = sum(int((~report.converged).sum()) for report in path.reports)
     most = max(int(report.iterations.max()) for report in path.reports)
-    return Outcome(crossed, checked_by, failed, most, gap, path.q[-1, 0].cpu().numpy())
+    return CaseOutcome(crossed, checked_by, failed, most, gap, path.q[-1, 0].cpu().numpy())
 
 
 def crossing_steps(surface: Surface, positions: torch.Tensor, pairs: PairList) -> tuple[int, str]:

@@ -96,8 +96,41 @@ def test_gradient_of_a_push_through_contact():
     assert float(slope) == pytest.approx(expected, rel=1e-5)
 
 
+def test_a_base_moves_beside_an_object_that_is_fixed():
+    robot, block = beam(), box_hexahedra((0.02, 0.02, 0.02), (1, 1, 1))
+    moved = warp_resphys.Mesh(block.vertices + [0.0, 0.5, 0.0], block.cells)
+    scene = RobotScene({"one": (robot, AWAY)}, {"block": (Body(moved, fixed=[0, 1, 2, 3]), Corotated(2e5, 0.4))})
+    state = scene.step(scene.begin(), {"one": {"base": [1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]}})
+    way = (state.body.q[0] - scene.simulator.rest_positions).abs()
+    fixed = scene.simulator.fixed
+    assert float(way[fixed[: len(robot.simulator.fixed)]].amax(0)[0]) == pytest.approx(1e-3)
+    assert float(way[fixed[len(robot.simulator.fixed) :]].max()) < 1e-12
+
+
+def test_a_lost_environment_stands_at_rest():
+    """A force that no solve bears, in one of two environments whose robots count failures."""
+    robot = beam()
+    robot = Robot(robot.description, on_failure="count")
+    scene, rest = RobotScene({"one": (robot, AWAY)}), robot.simulator.rest_positions
+    force = torch.stack([0.0 * rest, tip_force(robot, 0.0, 0.0, 1e9)])
+    state = scene.begin(2)
+    for _ in range(3):
+        state = scene.step(state, {"one": {"external_force": force}})
+    assert state.lost.tolist() == state.robots["one"].lost.tolist() == [False, True]
+    assert torch.equal(state.body.q[1], rest)
+    assert float((state.body.q[0] - rest).abs().max()) > 1e-4
+
+
 def test_what_does_not_fit_is_refused(finished):
     robot = beam()
+    with pytest.raises(InputError, match="gravity of one is"):
+        RobotScene({"one": (robot, AWAY), "two": (robot, (0.0, 0.5, 0.0, np.pi, 0.0, 0.0))})
+    with pytest.raises(InputError, match="pose of one is 'abc'"):
+        RobotScene({"one": (robot, "abc")})
+    with pytest.raises(InputError, match="give a robot and its pose"):
+        RobotScene({"one": robot})
+    with pytest.raises(InputError, match="a robot and an object"):
+        RobotScene({"one": (robot, AWAY)}, {"one": (Body(box_hexahedra()), Corotated())})
     with pytest.raises(InputError, match="no robot"):
         RobotScene({})
     with pytest.raises(InputError, match="pose of one is"):
@@ -111,6 +144,15 @@ def test_what_does_not_fit_is_refused(finished):
         scene.begin(inputs={"hand": {}})
     with pytest.raises(InputError, match="surfaces of the bodies cross"):
         RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
+
+
+def test_an_identified_tilt_of_gravity_counts():
+    robot = beam().with_parameters(gravity_tilt_1=0.2)
+    scene = RobotScene({"one": (robot, AWAY)})
+    start = state = scene.begin()
+    for _ in range(5):
+        state = scene.step(state)
+    torch.testing.assert_close(state.body.q, start.body.q, rtol=0.0, atol=1e-8)
 
 
 def test_a_turned_robot_with_fibres_is_refused(monkeypatch):

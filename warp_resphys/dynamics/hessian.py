@@ -12,11 +12,13 @@ from typing_extensions import override
 from ..energies.base import PairTangents, PointSet
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
+from ..io.errors import InputError
 from ..kernels.assembly import sum_blocks
 from ..linalg.coupling import Coupling, CouplingSolver
-from ..linalg.linear_solver import Factor, LinearSolver
+from ..linalg.linear_solver import Factor, LinearSolver, numbered
 from .assembly import BlockPattern, HessianAssembly
 
+_MOST_VALUES = 2**31 - 1  # Warp's offsets here are 32-bit.
 _ROUNDED = 8  # Numbers of vertices with couplings are rounded up to multiples of it.
 
 
@@ -148,37 +150,25 @@ class ExactHessian(HessianApproximation):
         environment = torch.cat([part.environment for part in parts])
         nodes = self._place[torch.cat([part.nodes for part in parts])]
         blocks = torch.cat([part.blocks for part in parts])
-        launcher, device, free = self._potential, nodes.device, len(self.vertex_at)
-        keys, local = torch.where(nodes < 0, -1, environment[:, None] * free + nodes).unique(return_inverse=True)
+        device, n_free = nodes.device, len(self.vertex_at)
+        keys, local = torch.where(nodes < 0, -1, environment[:, None] * n_free + nodes).unique(return_inverse=True)
         fixed = int((keys < 0).sum())  # all fixed vertices have one key
         keys, local = keys[fixed:], local - fixed
         if not len(keys):
             return []
-        row = keys // free
-        count = torch.bincount(row, minlength=self._potential.batch)
-        at = torch.arange(len(keys), device=device) - (count.cumsum(0) - count)[row]
-        # A size that depends on the environment alone, so that it is bit for bit what it is in another batch.
+        row = keys // n_free
+        count, at = numbered(row, self._potential.batch)
+        # A size that depends on the environment alone, so that on a CPU it is bit for bit what it is in another batch.
         sizes = -(-count // _ROUNDED) * _ROUNDED
         order = sizes.argsort(stable=True)
         squares = (3 * sizes[order]) ** 2
         first = torch.empty_like(sizes)
         first[order] = squares.cumsum(0) - squares
-        values = blocks.new_zeros(int(squares.sum()))
-        entry = local.ravel().argsort(stable=True)
-        start = torch.searchsorted(local.ravel()[entry], torch.arange(len(keys) + 1, device=device))
         rows = torch.stack([first[row], 3 * sizes[row], at], 1)
         columns = torch.where(local < 0, -1, at[local.clamp_min(0)])
-        arrays = [
-            (start, wp.int32),
-            (entry, wp.int32),
-            (rows.to(torch.int32), wp.vec3i),
-            (columns.to(torch.int32), wp.vec4i),
-        ]
-        inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
-        inputs.append(warp_view(blocks, wp.float64))
-        launcher.launch(launcher.record(sum_blocks, (len(keys),), inputs, [warp_view(values, wp.float64)]))
+        values = self._summed(blocks, local, rows, columns, int(squares.sum()))
         unknowns = torch.full((len(sizes), int(sizes.max()), 3), -1, device=device)
-        unknowns[row, at] = 3 * (keys % free)[:, None] + torch.arange(3, device=device)
+        unknowns[row, at] = 3 * (keys % n_free)[:, None] + torch.arange(3, device=device)
         out, done = [], 0
         for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
             own, m = order[sizes[order] == size], 3 * size
@@ -187,6 +177,35 @@ class ExactHessian(HessianApproximation):
                 out.append(Coupling(own, unknowns[own, :size].flatten(1), matrices))
                 done += number * m * m
         return out
+
+    def _summed(
+        self, blocks: torch.Tensor, local: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, size: int
+    ) -> torch.Tensor:
+        """Returns the values of the matrices (``kernels.assembly.sum_blocks``).
+
+        Args:
+            blocks: (A, 12, 12) second derivatives of pairs.
+            local: (A, 4) rows of their vertices, negative for those that are left out.
+            rows: (R, 3) first value, size and number in its matrix, of every row.
+            columns: (A, 4) numbers of their vertices in the matrices.
+            size: number of values.
+
+        Raises:
+            InputError: more values than a kernel addresses.
+        """
+        if size > _MOST_VALUES:
+            raise InputError(
+                f"the matrices of contact have {size:.1e} numbers, beyond the {_MOST_VALUES:.1e} that a kernel "
+                "addresses: take fewer environments, or coarser surfaces."
+            )
+        launcher, values = self._potential, blocks.new_zeros(size)
+        entry = local.ravel().argsort(stable=True)
+        start = torch.searchsorted(local.ravel()[entry], torch.arange(len(rows) + 1, device=local.device))
+        arrays = [(start, wp.int32), (entry, wp.int32), (rows, wp.vec3i), (columns, wp.vec4i)]
+        inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
+        inputs.append(warp_view(blocks, wp.float64))
+        launcher.launch(launcher.record(sum_blocks, (len(rows),), inputs, [warp_view(values, wp.float64)]))
+        return values
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m), zero at fixed vertices."""

@@ -11,7 +11,6 @@ from ..mesh.mesh import boundary_triangles
 from ..report.obstacles import ObstacleSurface
 from ..robot.gripper import THING, GripperSettings, Thing, finger_inputs, gripper
 from ..robot.robot import Robot
-from ..robot.robot_scene import SceneState
 
 RISE: Final = 0.02  # of the gripper [m], which lifts a thing
 SPEED: Final = 0.1  # of the gripper [m/s]
@@ -52,10 +51,7 @@ class GraspWorld(World):
     @override
     def begin(self, chosen: BoolArray) -> None:
         self._height = np.where(chosen, 0.0, self._height)
-        self._put_to_rest(torch.as_tensor(chosen, device=self._rest.body.q.device))
-
-    def _put_to_rest(self, chosen: torch.Tensor) -> None:
-        self._state = self._rest.where(chosen, self._state)
+        self._state = self._rest.where(torch.as_tensor(chosen, device=self._rest.body.q.device), self._state)
 
     @override
     @torch.no_grad()
@@ -64,17 +60,9 @@ class GraspWorld(World):
         for part in range(1, self._substeps + 1):
             moved = np.zeros((self.count, 3))
             moved[:, 2] = height + (commands[:, 1] - height) * part / self._substeps
-            lost = self._state.lost
             self._state = self._scene.step(self._state, finger_inputs(self.input, commands[:, :1], moved))
-            if bool((self._state.lost | lost).any()):
-                self._state = self._failed(self._state)
         self._height = commands[:, 1].copy()
         return np.asarray(self._state.lost.cpu().numpy())
-
-    def _failed(self, state: SceneState) -> SceneState:
-        """The state with failed grippers at rest, and still counted as failed."""
-        back = self._rest.where(state.lost, state)
-        return SceneState(back.body, back.robots, state.lost)
 
     @override
     def markers(self) -> FloatArray:

@@ -147,10 +147,12 @@ def _grasp(
 ) -> RobotVectorEnv:
     """Makes grippers of two fingers each, whose reward is the height of a ball."""
     driven = driven_input(robot)
-    if world == "reduced" or len(driven.parts) != 1:
+    if world == "reduced":
+        raise InputError("a grasp needs contact, which reduced models lack: choose world simulator or laboratory.")
+    if len(driven.parts) != 1 or BASE not in robot.inputs:
         raise InputError(
-            "grasp needs a finger with one input, in the world simulator or laboratory, as reduced models have no "
-            f"contact: this robot has {', '.join(driven.parts)}."
+            "a grasp needs a finger that is fixed at its base and has one input: this robot has "
+            f"{', '.join(driven.parts)}."
         )
     finger = robot if world == "simulator" else laboratory_robot(run, "count")
     grippers = GraspWorld(finger, driven.name, count, robot.time_step)

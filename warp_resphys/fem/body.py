@@ -117,16 +117,20 @@ class Body:
             self.coordinates  # noqa: B018  # Checks rigid parts, glue and planes.
 
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Body":
-        """Returns the body at R x + t, with its actuators; obstacles stay where they are.
+        """Returns the body at R x + t, with its actuators; obstacles, and fibres of a material, stay as they are.
 
         Args:
             rotation: (3, 3) R.
             translation: (3,) t [m].
 
         Raises:
-            InputError: a body with a symmetry plane.
+            InputError: a body with a symmetry plane, or a matrix that is no rotation.
         """
         r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+        if r.shape != (3, 3) or not np.allclose(r @ r.T, np.eye(3), atol=1e-9) or np.linalg.det(r) < 0.0:
+            raise InputError(f"the rotation is {r.tolist()}: give a (3, 3) matrix of orthogonal rows, without mirror.")
+        if t.shape != (3,) or not np.isfinite(t).all():
+            raise InputError(f"the translation is {t.tolist()}: give three numbers, in m.")
         if self.symmetry:
             raise InputError(
                 "a body with a symmetry plane stays in its place: leave the plane out, and model all of it."

@@ -5,7 +5,8 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
 
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh, join
@@ -82,6 +83,10 @@ class Scene(Body):
     def attached_mass(self) -> NDArray[np.float64]:
         """(N,) mass of the attached weights [kg]."""
         return np.concatenate([body.attached_mass for body in self.bodies.values()])
+
+    @override
+    def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Scene":
+        return Scene({name: body.moved(rotation, translation) for name, body in self.bodies.items()}, self.contact)
 
     def vertex_slice(self, name: str) -> slice:
         """Returns the range of a body's vertices in the scene, as in ``state.q[:, scene.vertex_slice("ball")]``.

@@ -53,19 +53,17 @@ class BandedCholesky:
         return info.value == 0
 
     def solve(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
-        """Overwrites contiguous right-hand sides, (n,) or (m, n), with the solutions."""
-        lower, n, width, rows = self._where
-        count, info = ctypes.c_int(1 if columns.ndim == 1 else len(columns)), ctypes.c_int()
-        place = columns.data_ptr()
-        self._solve(lower, n, width, ctypes.addressof(count), factor.data_ptr(), rows, place, n, ctypes.addressof(info))
+        """Overwrites contiguous right-hand sides with the solutions.
 
-    def solve_block(self, factor: torch.Tensor, columns: torch.Tensor) -> None:
-        """Overwrites contiguous right-hand sides (m, k) with the solutions of the block of rows (k, w + 1) alone."""
+        Args:
+            factor: (n, w + 1), or contiguous rows of it that are coupled with no others.
+            columns: (n,) or (m, n) right-hand sides of these rows.
+        """
         lower, _, width, rows = self._where
-        count, n, info = ctypes.c_int(len(columns)), ctypes.c_int(columns.shape[1]), ctypes.c_int()
-        size, place = ctypes.addressof(n), columns.data_ptr()
-        last = ctypes.addressof(info)
-        self._solve(lower, size, width, ctypes.addressof(count), factor.data_ptr(), rows, place, size, last)
+        count, size = ctypes.c_int(1 if columns.ndim == 1 else len(columns)), ctypes.c_int(columns.shape[-1])
+        n, info = ctypes.addressof(size), ctypes.c_int()
+        many, place = ctypes.addressof(count), columns.data_ptr()
+        self._solve(lower, n, width, many, factor.data_ptr(), rows, place, n, ctypes.addressof(info))
 
 
 class BandedSolver(LinearSolver):
@@ -120,7 +118,7 @@ class _Cholesky(SeparateFactors):
             own = ((places >= start) & (places < end)).nonzero().ravel()
             if len(own):
                 columns = rows[own, start:end]
-                self._solver.lapack.solve_block(factor[start:end], columns)
+                self._solver.lapack.solve(factor[start:end], columns)
                 rows[own, start:end] = columns
 
 

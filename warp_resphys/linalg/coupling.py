@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from .linear_solver import Factor
+from .linear_solver import Factor, numbered
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class CouplingSolver:
         rows, unknowns = (needed & (self._places < 0)).nonzero(as_tuple=True)
         if not len(rows):
             return
-        new = torch.bincount(rows, minlength=len(self._counts))
-        at = self._counts[rows] + torch.arange(len(rows), device=rows.device) - (new.cumsum(0) - new)[rows]
+        new, number = numbered(rows, len(self._counts))
+        at = self._counts[rows] + number
         self._counts += new
         spare = int(self._counts.max()) - self._solved.shape[1]
         if spare > 0:

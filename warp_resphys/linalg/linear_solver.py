@@ -50,8 +50,7 @@ class Factor(ABC):
             unknowns: (k,) their numbers.
             like: (B, any, n) tensor of the type of right-hand sides.
         """
-        count = torch.bincount(environments, minlength=len(like))
-        place = torch.arange(len(unknowns), device=unknowns.device) - (count.cumsum(0) - count)[environments]
+        count, place = numbered(environments, len(like))
         right = like.new_zeros(len(like), like.shape[2], int(count.max()))
         right[environments, unknowns, place] = 1.0
         return self.solve(right)[environments, :, place]
@@ -264,6 +263,17 @@ class LinearSolver(ABC):
         """Returns the scalar row and column, (E, block^2) each, of every entry of every block."""
         r, c = np.divmod(np.arange(self.block**2), self.block)
         return rows[:, None] * self.block + r, cols[:, None] * self.block + c
+
+
+def numbered(groups: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the sizes (count,) of groups, and the number of every entry in its own.
+
+    Args:
+        groups: (k,) number of the group of every entry, in ascending order.
+        count: number of groups.
+    """
+    sizes = torch.bincount(groups, minlength=count)
+    return sizes, torch.arange(len(groups), device=groups.device) - (sizes.cumsum(0) - sizes)[groups]
 
 
 def bandwidth(rows: Indices, cols: Indices, n_nodes: int) -> int:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from .inputs import Given
 from .robot import Robot
 from .state import RobotState
 
+FloatArray = NDArray[np.float64]
+_SAME_GRAVITY: Final = 1e-3  # [m/s^2]
+
 
 @dataclass(frozen=True)
 class SceneState:
@@ -29,8 +32,8 @@ class SceneState:
 
     Attributes:
         body: positions (B, N, 3) [m] and velocities [m/s] of all vertices, and memory of materials and contacts.
-        robots: states of the robots in their own frames, by name.
-        lost: (B,) bool, whether a step has failed; only where the first robot counts failures.
+        robots: states of the robots in their own frames, by name, without memory of materials: for `Robot.observe`.
+        lost: (B,) bool, whether a step has failed, where the robots count failures; all bodies stand at rest then.
     """
 
     body: State
@@ -48,7 +51,7 @@ class RobotScene:
     """Robots with their learned forces, and other bodies, in one simulator, where they touch.
 
     A robot's force was learned on the robot alone. It acts in the robot's own frame, from which a pose leads to the
-    scene. All robots have the same time step and integrator.
+    scene. All robots have the same time step, integrator and gravity, turned by their poses.
 
     Args:
         robots: robots by name, and their poses (6,): translation [m] and rotation vector [rad].
@@ -57,8 +60,9 @@ class RobotScene:
         relative_tolerance: of the solver; that of the first robot if omitted.
 
     Raises:
-        InputError: no robot, one whose network replaces the simulator, robots of different time steps, or a body that
-            cannot touch others (`energies.surfaces.SurfaceContact`).
+        InputError: no robot, one whose network replaces the simulator, robots of different time steps or gravity, a
+            name that stands for two bodies, a pose that is none, or a body that cannot touch others
+            (`energies.surfaces.SurfaceContact`).
 
     Attributes:
         scene: the bodies.
@@ -75,11 +79,15 @@ class RobotScene:
     ) -> None:
         if not robots:
             raise InputError("a scene of robots has no robot: give them by name, with their poses.")
-        self.robots = {name: robot for name, (robot, _) in robots.items()}
-        self._poses = {name: _pose(name, pose) for name, (_, pose) in robots.items()}
-        for name, robot in self.robots.items():
-            if robot.is_data_driven:
+        self.robots, self._poses = dict[str, Robot](), dict[str, tuple[FloatArray, FloatArray]]()
+        for name, given in robots.items():
+            if not (isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Robot)):
+                raise InputError(f"{name} is {given!r}: give a robot and its pose, as in (robot, (x, y, z, 0, 0, 0)).")
+            self.robots[name], self._poses[name] = given[0], _pose(name, given[1])
+            if given[0].is_data_driven:
                 raise InputError(f"{name} has no simulator, only a network for its mesh: load another model.")
+            if name in (objects or {}):
+                raise InputError(f"{name} is a robot and an object: give them different names.")
         first = next(iter(self.robots.values())).simulator
         others = {name: (robot.simulator.time_step, robot.simulator.integrator) for name, robot in self.robots.items()}
         if len(set(others.values())) > 1:
@@ -96,12 +104,11 @@ class RobotScene:
         for name, (body, material) in (objects or {}).items():
             bodies[name], materials[name] = body, material
         self.scene = Scene(bodies, contact)
-        name = next(iter(self.robots))
         self.simulator: Simulator = replace(
             first,
             body=self.scene,
             material=materials,
-            gravity=tuple(self._poses[name][0] @ np.asarray(first.gravity)),
+            gravity=self._gravity(),
             solver=first.settings,
             relative_tolerance=relative_tolerance,
         )
@@ -112,6 +119,22 @@ class RobotScene:
             own_constants = constants_of(robot.simulator, robot.parameters)
             parameters |= {f"{name}_{key}": value for key, value in own_constants.items() if key != "gravity"}
         self.constants = self.simulator.prepare(parameters)
+
+    def _gravity(self) -> tuple[float, ...]:
+        """Gravity (3,) of the scene [m/s^2], with the identified tilt of the robots' gravity."""
+        pulls = {}
+        for name, robot in self.robots.items():
+            own = constants_of(robot.simulator, robot.parameters).get("gravity")
+            pull = np.asarray(robot.simulator.gravity) if own is None else own[0].detach().double().cpu().numpy()
+            pulls[name] = self._poses[name][0] @ pull
+        first, pull = next(iter(pulls.items()))
+        for name, other in pulls.items():
+            if not np.allclose(other, pull, atol=_SAME_GRAVITY):
+                raise InputError(
+                    f"gravity of {first} is {np.round(pull, 3).tolist()} m/s^2 in the scene, and that of {name} "
+                    f"{np.round(other, 3).tolist()}: give poses by which they are the same."
+                )
+        return tuple(pull.tolist())
 
     def _check_fibres(self, name: str) -> None:
         """Raises InputError for a turned robot whose material has fibres."""
@@ -169,15 +192,19 @@ class RobotScene:
             acting, after[name] = robot.drive(state.robots[name], **given.get(name, {}))
             by_body[name] = self._inputs_in_scene(name, acting)
         if any(own.fixed_positions is not None for own in by_body.values()):
-            for name, robot in self.robots.items():
-                if by_body[name].fixed_positions is None:
-                    rest = robot.simulator.rest_positions[robot.simulator.fixed]
-                    places = self._placed(name, rest).expand(state.body.batch, -1, -1)
-                    by_body[name] = by_body[name].replace(fixed_positions=places)
+            for name, body, first in self.scene.members:
+                own = by_body.get(name, Inputs())
+                if own.fixed_positions is None and len(body.fixed_vertices):
+                    places = self.simulator.rest_positions[first + body.fixed_vertices]
+                    by_body[name] = own.replace(fixed_positions=places.expand(state.body.batch, -1, -1))
         acting = self.scene.inputs(by_body)
-        body, report = self.simulator.step(state.body, acting, self.constants)
-        robots = {name: after[name](self._own(name, body)) for name in self.robots}
-        return SceneState(body, robots, state.lost | ~report.converged), acting
+        new, report = self.simulator.step(state.body, acting, self.constants)
+        lost = state.lost | ~report.converged
+        if bool(lost.any()):
+            rest = self.simulator.rest_state(state.body.batch)
+            new = RobotState(rest).where(lost, RobotState(new)).body
+        robots = {name: replace(after[name](self._own(name, new)), lost=lost) for name in self.robots}
+        return SceneState(new, robots, lost), acting
 
     def observe(self, state: SceneState) -> dict[str, torch.Tensor]:
         """Returns markers (B, M, 3) of the robots in the frame of the scene, by name [m]."""
@@ -209,9 +236,12 @@ class RobotScene:
         return own.replace(**fields)
 
 
-def _pose(name: str, pose: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pose(name: str, pose: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) and translation (3,) of a pose (6,)."""
-    values = np.asarray(pose, dtype=np.float64)
+    try:
+        values = np.asarray(pose, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
     if values.shape != (6,) or not np.isfinite(values).all():
         raise InputError(f"the pose of {name} is {pose!r}: give six numbers, a translation in m and a rotation vector.")
     return Rotation.from_rotvec(values[3:]).as_matrix(), values[:3]

@@ -66,7 +66,7 @@ def finger(side: float, divisions: Divisions) -> Body:
 
 
 @dataclass(frozen=True)
-class Grasp:
+class SoftGrasp:
     """Grippers that close on a ball and lift it, one for every tension; without contact the fingers pass through it."""
 
     scene: Scene
@@ -75,7 +75,7 @@ class Grasp:
     contact: bool
 
     @staticmethod
-    def of(study: GripperStudy, batch: int, device: torch.device, contact: bool = True) -> "Grasp":
+    def of(study: GripperStudy, batch: int, device: torch.device, contact: bool = True) -> "SoftGrasp":
         """Grippers whose tensions are spread evenly."""
         ball = thing_mesh("ball", RADIUS, study.ball)
         ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
@@ -86,8 +86,8 @@ class Grasp:
         solver = SolverSettings(relative_tolerance=study.relative_tolerance, factors=study.factors)
         simulator = Simulator(scene, RUBBER, study.time_step, solver=solver, device=device)
         least, largest = study.tensions
-        shares = np.arange(batch) / max(batch - 1, 1) if batch > 1 else np.array([1.0])
-        return Grasp(scene, simulator, simulator.tensor(least + (largest - least) * shares), contact)
+        shares = np.linspace(0.0, 1.0, batch) if batch > 1 else np.ones(1)
+        return SoftGrasp(scene, simulator, simulator.tensor(least + (largest - least) * shares), contact)
 
     @property
     def steps(self) -> int:
@@ -122,7 +122,9 @@ class Grasp:
         }
         if self.contact:
             pairs = PairList(Launcher(len(self.tensions), device), Surface.of(self.scene.mesh), D)
-            result["crossings"] = sum(int(pairs.crossings(q)[0].sum()) for q in path.q[:: self.steps // 10].double())
+            result["crossings"] = sum(
+                int(pairs.crossings(q)[0].sum()) for q in path.q[:: max(self.steps // 10, 1)].double()
+            )
         return result
 
 
@@ -137,7 +139,7 @@ def gripper_study(study: GripperStudy, folder: Path) -> None:
     batches = study.batches[device.type]
     with Progress("grasps", len(batches) * 2 * (1 + study.repeats), "grasps") as progress:
         for batch in batches:
-            grasps = [Grasp.of(study, batch, device, contact) for contact in (True, False)]
+            grasps = [SoftGrasp.of(study, batch, device, contact) for contact in (True, False)]
             results: list[list[Mapping[str, Any]]] = [[], []]
             for turn in range(1 + study.repeats):
                 for own, grasp in zip(results, grasps, strict=True):
@@ -165,7 +167,7 @@ def gripper_study(study: GripperStudy, folder: Path) -> None:
             )
     columns = (
         "grippers {batch} | unknowns {unknowns} | grasp [ms] {grasp_ms:.4g} | without contact [ms] {free_ms:.4g} | "
-        "steps/s {rate:.4g} | of that without contact {share:.0%} | iterations {iterations:.1f} | "
+        "steps/s {rate:.4g} | speed, of that without contact {share:.0%} | iterations {iterations:.1f} | "
         "without contact {free_iterations:.1f} | hold the ball {held} | crossings {crossings}"
     )
     title = f"A step of {1e3 * study.time_step:g} ms of all grippers"

@@ -1,4 +1,4 @@
-"""Inputs that drive a body, such as pressures: smooth random sequences, and a check of recorded ones."""
+"""Inputs that drive a body, such as pressures: smooth random sequences, waves, and a check of recorded ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,6 +84,31 @@ class InputSequences:
                 f"no inputs of {parts} parts have the correlation {self.correlation}: it must lie above "
                 f"{-1.0 / max(parts - 1, 1):.3g} and below 1, or be a positive definite matrix."
             ) from None
+
+
+@dataclass(frozen=True)
+class InputWaves:
+    """Periodic inputs, such as a gait: sinusoids of one frequency f, clipped to the range from zero to the limit.
+
+    The input of a part with the phase p is ``mean + amplitude sin(2 pi f (t - start) + p)`` from the start on, times a
+    factor that grows from zero to one over the ramp, with zero slope at both ends.
+    """
+
+    frequency: float  # f [Hz]
+    phases: Sequence[float]  # of each part [rad]
+    mean: float  # in the unit of the input
+    amplitude: float  # in the unit of the input
+    limit: float  # in the unit of the input
+    start: float = 0.0  # [s]
+    ramp: float = 0.0  # [s]
+
+    def series(self, steps: int, time_step: float) -> FloatArray:
+        """Returns the inputs (K + 1, C) of C parts at the times 0, h, ..., K h [s]."""
+        since = time_step * np.arange(steps + 1)[:, None] - self.start
+        turns = 2.0 * np.pi * self.frequency * since + np.asarray(self.phases, dtype=np.float64)
+        grown = np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else (since >= 0.0).astype(np.float64)
+        rise = grown**2 * (3.0 - 2.0 * grown)
+        return np.asarray(rise * np.clip(self.mean + self.amplitude * np.sin(turns), 0.0, self.limit))
 
 
 def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: float, source: str | Path) -> FloatArray:

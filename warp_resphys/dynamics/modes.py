@@ -125,14 +125,14 @@ class RestStiffness:
     """The stiffness K of a body at rest, and its inverse.
 
     Args:
-        simulator: simulator of a clamped body.
+        simulator: simulator of a body that is held (`Simulator.is_held`).
 
     Raises:
-        InputError: the body has no fixed vertices.
+        InputError: the body is not held.
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        if not (len(simulator.fixed) or len(simulator.body.coordinates.sliding)):
+        if not simulator.is_held(simulator.rest_state()):
             raise InputError("a body without fixed vertices follows any force without end: fix some vertices.")
         stiffness, _, free = _about_rest(simulator)
         self._matrix = stiffness

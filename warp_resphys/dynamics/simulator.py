@@ -37,6 +37,8 @@ GRAVITY = (0.0, 0.0, -9.80709)
 _NO_INPUTS = Inputs()
 # Steps of a roll-out on a GPU after which the host checks their convergence: it waits for the GPU only then.
 _STEPS_TO_CHECK = 32
+_SHIFT = 1e-6  # m, along every axis, against which friction acts
+_HELD_BY = 3  # vertices with friction, against all displacements and turns
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
@@ -333,6 +335,24 @@ class Simulator:
         terms, stage = self.workspace(state.batch).potential.energies, self.method.stage(state, self.time_step)
         return self._energies.contacts(state, stage, inputs, constants, terms, after.q)
 
+    def is_held(
+        self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
+    ) -> bool:
+        """Returns whether loads have an equilibrium: vertices are fixed, or friction holds three in every environment.
+
+        Args:
+            state: positions in which vertices are pressed against obstacles.
+            inputs: inputs, of which the poses of obstacles matter.
+            parameters: parameters or prepared constants (`prepare`).
+        """
+        if len(self.fixed) or len(self.body.coordinates.sliding):
+            return True
+        with torch.no_grad():
+            moved = replace(state, q=state.q + _SHIFT)
+            contacts = self.contacts(state, moved, inputs, parameters).values()
+            rubbing = [own.friction for own in contacts if isinstance(own, ContactForces)]
+            return any(bool(((own != 0.0).any(-1).any(-1).sum(-1) >= _HELD_BY).all()) for own in rubbing)
+
     def obstacle_motions(
         self, states: Sequence[State], parameters: Parameters | Constants | None = None
     ) -> tuple[ObstacleMotion, ...]:
@@ -388,12 +408,10 @@ class Simulator:
                 it has there: to press a body and shear it, press first, then shear after that equilibrium.
 
         Raises:
-            InputError: wrong shapes, values that are not finite, or a body without fixed vertices.
+            InputError: wrong shapes, values that are not finite, or a body that is not held (`is_held`) in ``after``.
             ConvergenceError: no equilibrium was found, or the body grows without bound, like an inflated one whose
                 material cannot resist the pressure.
         """
-        if not (len(self.fixed) or len(self.body.coordinates.sliding)):
-            raise InputError("a body without fixed vertices has no static equilibrium: fix some vertices.")
         inputs = _NO_INPUTS if inputs is None else inputs
         constants = self.prepare(parameters)
         if batch is None:
@@ -405,6 +423,11 @@ class Simulator:
         self._checked(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
+        if not self.is_held(state, inputs, constants):
+            raise InputError(
+                "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle "
+                "with friction, within the distance of contact."
+            )
         solve = partial(self._balance, inputs, constants, state)
         limited = self.settings.max_iterations < MOST_ITERATIONS
         rest = self.rest_positions.expand_as(state.q)

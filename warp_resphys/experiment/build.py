@@ -201,7 +201,7 @@ def _built_body(content: str, place: str | None, files: tuple[str | None, ...]) 
 def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
     mesh = _with_regions(mesh, settings)
     energies = build_actuators(settings, mesh, payload_at)
-    fixed = select_vertices(mesh, **settings.fixed.arguments())
+    fixed = () if settings.fixed is None else select_vertices(mesh, **settings.fixed.arguments())
     rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
     glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
     planes = _symmetry_planes(settings.symmetry)

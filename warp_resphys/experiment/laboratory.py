@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
-from ..data.actuation import InputSequences
+from ..data.actuation import InputSequences, InputWaves
 from ..data.base_motion import in_frame, rigid
 from ..data.recordings.arrays import write_recording
 from ..data.recordings.recording import ARM, Recording
@@ -141,7 +141,7 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
         positions = np.concatenate([positions, seen], axis=1)
         noise = np.concatenate([noise, laboratory.noise * draw.standard_normal(seen.shape)], axis=1)
     actuation = None
-    if trial.sequence is not None:
+    if trial.is_driven:
         least = getattr(driving_quantity(laboratory), "lower", -np.inf)
         actuation = np.maximum(_inputs_of(settings, trial) + _zero_of(settings, trial), least)
     if actuation is not None and len(actuation) != len(positions):
@@ -244,12 +244,16 @@ def input_sequences(settings: PlayedSettings) -> InputSequences:
 
 
 def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
-    """(K + 1, C) inputs of a trial at the frames, drawn from the seed and the number of its sequence."""
+    """(K + 1, C) inputs of a trial at the frames: its waves, or drawn from the seed and the number of its sequence."""
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
     assert settings.data.steps is not None
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
-    drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)[before:]
+    if trial.waves is not None:
+        drawn = InputWaves(limit=settings.data.input_limit, **dict(trial.waves)).series(steps, settings.time_step)
+    else:
+        drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)
+    drawn = drawn[before:]
     if trial.is_released:
         drawn = np.zeros_like(drawn)
     elif trial.begins == STATIC:
@@ -294,7 +298,7 @@ class _Played(ResumableRollout):
         )
         self._driven: torch.Tensor | None = None
         quantity = driving_quantity(settings.laboratory)
-        if self._trials[0].sequence is not None and quantity is not None:
+        if self._trials[0].is_driven and quantity is not None:
             self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
             self._name = quantity.name
         self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}

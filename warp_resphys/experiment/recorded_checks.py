@@ -43,6 +43,7 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     drive = drive_of(run, body)
     if drive is not None:
         _check_inputs(data, drive)
+    _check_waves(run, trials, drive)
     if begins & {*RESTING} and data.steps is not None and data.horizons:
         length = data.steps * run.time_step
         if data.horizons[-1] > length + 1e-9:
@@ -156,6 +157,25 @@ def _check_inputs(data: RecordedData, drive: Drive) -> None:
         )
     if data.parts is not None and max(data.parts) > count:
         raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {count}.")
+
+
+def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None) -> None:
+    """Refuses waves of recordings, of bodies without inputs, of trials without motion, and of other parts."""
+    for trial in [trial for trial in trials if trial.waves is not None]:
+        assert trial.waves is not None
+        key, count = f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves", len(trial.waves.phases)
+        if not run.is_laboratory:
+            raise InputError(f"{key} is of simulated trials, and recordings have their own inputs: leave it out.")
+        if drive is None or trial.begins not in RESTING:
+            why = "the body has no inputs" if drive is None else f"the trial begins {trial.begins}"
+            raise InputError(f"{key} is set, but {why}: leave it out.")
+        if count != len(drive.parts):
+            raise InputError(f"{key}.phases has {count} values: give one for every {drive.per}, {len(drive.parts)}.")
+        if 2.0 * trial.waves.frequency * run.time_step >= 1.0:
+            raise InputError(
+                f"{key}.frequency is {trial.waves.frequency:g}: steps of {run.time_step:g} s resolve less than "
+                f"{0.5 / run.time_step:g} Hz."
+            )
 
 
 def _check_laboratory(

@@ -217,7 +217,7 @@ class Robot:
     def begin(self, batch: int = 1, **inputs: Given) -> RobotState:
         """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
 
-        Trials begin with it. A body without fixed vertices keeps its rest shape.
+        Trials begin with it. A body that nothing holds (`Simulator.is_held`) keeps its rest shape.
 
         Args:
             batch: B.
@@ -229,9 +229,9 @@ class Robot:
         """
         given = self._read(inputs, batch)
         state = self._commands.begin(self.simulator.rest_state(batch), given)
-        if not len(self.simulator.fixed):
-            return state
         acting = self._commands.act(state, given).inputs
+        if not self.simulator.is_held(state.body, acting, self.constants):
+            return state
         return replace(state, body=self.simulator.static_equilibrium(acting, self.constants, batch=batch))
 
     def settle(self, batch: int = 1, **inputs: Given) -> RobotState:

@@ -245,7 +245,7 @@ class BodySettings(Settings):
     glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
-    fixed: PlaceSettings = setting(description="fixed vertices")
+    fixed: PlaceSettings | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers")

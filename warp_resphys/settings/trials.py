@@ -61,6 +61,17 @@ class MotionSettings(Settings):
         return self
 
 
+class WaveSettings(Settings):
+    """Periodic inputs, `data.actuation.InputWaves`."""
+
+    frequency: Positive = setting(unit="Hz")
+    phases: Some[float] = setting(description="at the start, of each chamber, tendon or muscle", unit="rad")
+    mean: float = setting(description="in the unit of the input")
+    amplitude: Positive = setting(description="in the unit of the input")
+    start: NotNegative = setting(0.0, "before which there are no inputs", "s")
+    ramp: NotNegative = setting(0.0, "duration in which they grow from zero", "s")
+
+
 BaseMotion = MotionSettings | Literal["recorded", "reference"] | None
 ObstacleMotions = dict[str, MotionSettings]  # by obstacle
 
@@ -76,6 +87,7 @@ class TrialSettings(Settings):
     labels: Labels | None = setting(None, "of the markers of its file, in their order; null: those of the file")
     session: Word | None = setting(None, "in which it was recorded; null: one session")
     payload: NotNegative = setting(0.0, "mass that hangs on the body", "kg")
+    waves: WaveSettings | None = setting(None, "periodic inputs of a simulated trial, in place of random ones")
     pull: Vector | None = setting(None, "force at the tip that holds a simulated body before its release", "N")
     base_motion: MotionSettings | None = setting(None, "of this trial, in place of data.base_motion")
     obstacle_motion: ObstacleMotions = setting({}, "of this trial, in place of data.obstacle_motion, by obstacle")
@@ -108,6 +120,7 @@ class Trial(Settings):
     payload: float = 0.0  # mass that hangs on the body [kg]
     pull: Vector | None = None  # force that holds the body before the release, in a simulated laboratory [N]
     sequence: int | None = None  # number of its random inputs, or None
+    waves: WaveSettings | None = None  # its periodic inputs, in place of random ones
     scale: float = 1.0  # factor of these inputs
     amount: float = 0.0  # parameter of a simulated trial: a weight [kg], an angle [rad] or a factor of a motion
     inputs: Many[float] | None = None  # as in `TrialSettings`
@@ -122,6 +135,11 @@ class Trial(Settings):
     def is_released(self) -> bool:
         """Whether the body is released at time zero."""
         return self.begins in ("held", "released")
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether a simulated laboratory makes inputs for it."""
+        return self.sequence is not None or self.waves is not None
 
     def tracked(self, labels: Any) -> list[int]:
         """Returns the indices of the labels of tracked markers that the trial has."""

@@ -163,7 +163,10 @@ def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None)
     """Refuses waves of recordings, of bodies without inputs, of trials without motion, and of other parts."""
     for trial in [trial for trial in trials if trial.waves is not None]:
         assert trial.waves is not None
-        key, count = f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves", len(trial.waves.phases)
+        key, count = (
+            f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves",
+            len(trial.waves.phases),
+        )
         if not run.is_laboratory:
             raise InputError(f"{key} is of simulated trials, and recordings have their own inputs: leave it out.")
         if drive is None or trial.begins not in RESTING:

@@ -442,6 +442,9 @@ def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[s
     seen = np.isfinite(places).all(axis=1)
     feet = np.full_like(places, np.nan)
     feet[seen] = closest_points(mesh, places[seen]).points
+    if run.fixed is None:  # Reference markers stand beside the body.
+        standing = np.isin(labels, [*run.markers.reference])
+        feet[standing] = places[standing]
     return Recordings(
         quality=read_json(path.with_name(QUALITY)),
         residuals=residuals,

@@ -387,6 +387,8 @@ class SeenPoses:
         if own.mesh is not None and self.data.order == 2:
             mesh = quadratic(mesh)
         clamps = tuple(_with_midpoints(mesh, clamp) for clamp in scene.clamps)
+        if not clamps and self.settings.fixed is None:
+            raise InputError(f"{scene.path} has no clamps, and fixed is null: give the body one of them.")
         return mesh, clamps or (select_vertices(mesh, **self.settings.fixed.arguments()),)
 
 

@@ -124,7 +124,7 @@ class Recordings:
     residual_mm: FloatArray  # (M,) [mm] distance from the nominal positions.
     outliers: tuple[str, ...]  # Labels of markers that were left out of the fit, as they were too far off.
     nominal: FloatArray  # (M, 3) [m] nominal positions.
-    feet: FloatArray  # (M, 3) [m] closest points of the body.
+    feet: FloatArray  # (M, 3) [m] closest points of the body; of markers that stand beside a free one, their places.
     mesh: Mesh  # The body at rest.
 
 
@@ -279,9 +279,9 @@ def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
 
     Args:
         bound: (M, 3) [m] on the undeformed body.
-        clamped: (F, 3) [m] vertices of the clamped end.
+        clamped: (F, 3) [m] vertices of the clamped end; of a free body none, whose first marker takes their place.
     """
-    start = clamped.mean(axis=0)
+    start = clamped.mean(axis=0) if len(clamped) else bound[0]
     axis = bound.mean(axis=0) - start
     length = float(np.linalg.norm(axis))
     along: FloatArray = (bound - start) @ (axis / length) if length > 0.0 else np.zeros(len(bound))

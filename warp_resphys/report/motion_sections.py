@@ -236,9 +236,8 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     quantity, markers = driven.quantity, len(trials.labels)
     parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
     dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
-    caption = (
-        f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}. Dark: clamped."
-    )
+    dark = " Dark: clamped." if len(data.fixed) else ""
+    caption = f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}.{dark}"
     alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
     def body(path: Path) -> Drawn:

@@ -97,7 +97,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> No
     layers = registration_layers(recordings.mesh, fixed, recordings.positions[seen], recordings.feet[seen], radius)
     pictures = [frames[0] for frames in draw(*(panel.scene(layers) for panel in panels))]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
-        figure = _compose(panels, pictures, recordings, radius)
+        figure = _compose(panels, pictures, recordings, radius, bool(len(fixed)))
         with atomic_path(path) as partial:
             figure.savefig(partial, dpi=_DPI, format="png", facecolor="white", bbox_inches="tight", pad_inches=_PAD)
 
@@ -136,7 +136,9 @@ def registration_layers(
     return layers
 
 
-def _compose(panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Recordings, radius: float) -> Figure:
+def _compose(
+    panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Recordings, radius: float, is_clamped: bool
+) -> Figure:
     """Composes the views, stacked or side by side, with names, rings, axes and a scale.
 
     The figure is one inch wide and high, so that all positions are in inches; it is cropped to its content when saved.
@@ -161,7 +163,7 @@ def _compose(panels: Sequence[Panel], pictures: Sequence[Pixels], recordings: Re
         _rings(axes, panel, recordings, radius)
         _names(axes, panel, recordings, radius)
     _scale(axes, panel, margin)
-    handles = _legend()
+    handles = _legend(is_clamped)
     place, columns = (middle, lowest - _STRIP), len(handles)
     figure.legend(handles=handles, loc="upper center", bbox_to_anchor=place, ncols=columns, frameon=False, fontsize=9)
     return figure
@@ -237,7 +239,7 @@ def spread(heights: FloatArray, least: float) -> FloatArray:
     return isotonic_regression(heights - apart).x + apart if len(heights) else heights
 
 
-def _legend() -> list[Any]:
+def _legend(is_clamped: bool) -> list[Any]:
     """Handles of the legend."""
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5}
@@ -245,6 +247,6 @@ def _legend() -> list[Any]:
         Line2D([], [], **none, markersize=7, color=MEASURED, label="measured, with residual"),
         Line2D([], [], marker="o", markersize=3.5, markevery=[0], linewidth=1.4, color=INK, label="stem and its foot"),
         Line2D([], [], **none, **hollow, markersize=9, color=NOMINAL, label="nominal"),
-        Patch(facecolor=CLAMPED, alpha=0.8, label="clamped"),
+        *([Patch(facecolor=CLAMPED, alpha=0.8, label="clamped")] if is_clamped else []),
         Patch(facecolor=BODY, alpha=0.6, label="body at rest"),
     ]

@@ -46,9 +46,8 @@ MESSAGES = {
     ),
     "swing.h5 does not exist: check the path, or run the stage that writes it": lambda: wr.read_recording("swing.h5"),
     "youngs_modulus is -100000: it must be positive, in Pa.": lambda: wr.Corotated(-1e5),
-    "a body without fixed vertices has no static equilibrium: fix some vertices.": (
-        lambda: beam(FREE).static_equilibrium()
-    ),
+    "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle with "
+    "friction, within the distance of contact.": (lambda: beam(FREE).static_equilibrium()),
 }
 
 

@@ -496,6 +496,37 @@ def test_gradients_of_a_leaning_beam_with_friction():
     compare(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
 
 
+def test_a_free_block_rests_on_a_floor_by_friction():
+    """It carries its weight, goes aside by less than the slip under which friction holds a push, and has gradients."""
+    weight = DENSITY * SIDE**3 * G
+    s = simulator({"floor": resting_floor(weight)}, 0.5, solver=TIGHT)
+    push = torch.zeros(1, s.body.n_vertices, 3, dtype=torch.float64)
+    push[..., 0] = 0.3 * weight / s.body.n_vertices
+    lying, pushed = s.static_equilibrium(), s.static_equilibrium(Inputs(push))
+    assert float((lying.q - s.rest_positions).abs().max()) < 2e-5
+    aside = (pushed.q - lying.q)[:, select_vertices(BLOCK, z=0.0), 0]
+    assert 0.0 < float(aside.min()) < float(aside.max()) < 1e-3 * 5e-3  # m: slip speed times step
+    forces = s.contacts(s.rest_state(), pushed)[""]
+    assert float(forces.normal.sum((1, 2))[0, 2]) == pytest.approx(weight, rel=1e-9)
+    assert float(forces.friction.sum((1, 2))[0, 0]) == pytest.approx(-0.3 * weight, rel=1e-9)
+    weights = torch.randn(push.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def solve(values):
+        given = {"contact_friction": values["friction"], "youngs_modulus": values["young"]}
+        return (weights * s.static_equilibrium(Inputs(values["push"]), given).q).flatten(1).sum(1)
+
+    values = {"push": push, "friction": vector([0.5]), "young": vector([264e3])}
+    compare(solve, values, {"push": 1e-6, "friction": 1e-4, "young": 10.0})
+
+
+@pytest.mark.parametrize(("mu", "gap"), [(0.0, 0.95e-3), (0.5, 1.1e-3)])
+def test_a_free_block_that_no_friction_holds_is_refused(mu, gap):
+    s = simulator({"floor": HalfSpace(position=(0.0, 0.0, -gap))}, mu)
+    assert not s.is_held(s.rest_state())
+    with pytest.raises(InputError, match="lay it on an obstacle with friction, within the distance of contact"):
+        s.static_equilibrium()
+
+
 def test_refusals():
     with pytest.raises(InputError, match=r"within the obstacle 'floor' at rest: vertex 0 by 2 mm"):
         simulator(

@@ -89,6 +89,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
         ),
         (["muscles=null", "laboratory.muscles=null"], r"waves is set, but the body has no inputs"),
         (["fixed={x: 1.0}"], r"no vertex lies within"),
+        (["data.base_motion=reference"], r"data\.base_motion moves the fixed vertices, but fixed is null"),
     ],
 )
 def test_trials_and_places_that_do_not_fit_are_refused(given, said):

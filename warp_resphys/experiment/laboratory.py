@@ -250,6 +250,7 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
     if trial.waves is not None:
+        assert settings.data.input_limit is not None
         drawn = InputWaves(limit=settings.data.input_limit, **dict(trial.waves)).series(steps, settings.time_step)
     else:
         drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)

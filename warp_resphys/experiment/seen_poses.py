@@ -387,9 +387,11 @@ class SeenPoses:
         if own.mesh is not None and self.data.order == 2:
             mesh = quadratic(mesh)
         clamps = tuple(_with_midpoints(mesh, clamp) for clamp in scene.clamps)
-        if not clamps and self.settings.fixed is None:
-            raise InputError(f"{scene.path} has no clamps, and fixed is null: give the body one of them.")
-        return mesh, clamps or (select_vertices(mesh, **self.settings.fixed.arguments()),)
+        if clamps:
+            return mesh, clamps
+        if self.settings.fixed is None:
+            raise InputError(f"{scene.path} has no clamps, and fixed is null: give one of them.")
+        return mesh, (select_vertices(mesh, **self.settings.fixed.arguments()),)
 
 
 def _with_midpoints(mesh: Mesh, corners: NDArray[np.int64]) -> NDArray[np.int64]:

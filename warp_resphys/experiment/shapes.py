@@ -21,6 +21,7 @@ from ..io.stages import StageContext
 from ..learning.metrics import marker_errors, summarise
 from ..mesh.mesh import select_vertices
 from ..settings.body import BodySettings, SimulatorSettings
+from ..settings.mesh import PlaceSettings
 from ..settings.shapes import ShapeSettings
 from ..settings.stages import ShapesStage
 from ..stepping.inputs import Inputs
@@ -165,7 +166,7 @@ def _target(settings: ShapesStage, shape: ShapeSettings) -> Simulator:
 def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     """Returns the state before the release."""
     if shape.held is not None:
-        return held_alone(simulator, shape.held, shape.held.at or shape.fixed, "held.at")
+        return held_alone(simulator, shape.held, shape.held.at or shape.fixed or PlaceSettings(), "held.at")
     quantity = driving_quantity(shape)
     assert quantity is not None
     return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))

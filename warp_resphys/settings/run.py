@@ -373,6 +373,17 @@ class RunSettings(SimulatorSettings):
         return motions
 
     @model_validator(mode="after")
+    def _holds_its_base(self) -> Self:
+        moved = [key for key in self.motions() if key.endswith("base_motion")]
+        moved += ["data.base_motion"] if self.data.base_motion is not None else []
+        for prefix, body in self.bodies.items():
+            if moved and body.fixed is None:
+                raise ValueError(
+                    f"{moved[0]} moves the fixed vertices, but {prefix}fixed is null: name some, or leave it out."
+                )
+        return self
+
+    @model_validator(mode="after")
     def _moves_obstacles(self) -> Self:
         common = self.data.obstacle_motion
         recorded = [name for name, motion in common.items() if motion == "recorded"]

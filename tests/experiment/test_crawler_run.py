@@ -45,14 +45,10 @@ def _here(folder, no_report):
 def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothing():
     code, err = run(*CRAWLS, "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN)
     assert (code, err[-600:] if code else "") == (0, "")
-    results, dataset, configured = (
-        json.loads(Path("run/metrics.json").read_text()),
-        read_dataset(Path("run/dataset.h5")),
-        settings(*CRAWLS),
-    )
-    ways = dict(
-        zip(dataset.names, 1e3 * (dataset.observed[:, -1] - dataset.observed[:, 0])[..., 0].mean(-1), strict=True)
-    )
+    results = json.loads(Path("run/metrics.json").read_text())
+    dataset, configured = read_dataset(Path("run/dataset.h5")), settings(*CRAWLS)
+    moved = 1e3 * (dataset.observed[:, -1] - dataset.observed[:, 0])[..., 0].mean(-1)
+    ways = dict(zip(dataset.names, moved, strict=True))
     assert ways["faster"] > 4.0  # mm
     assert ways["back"] < -2.0
     for row, name in enumerate(dataset.names):
@@ -77,7 +73,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     [
         (
             ["laboratory.trials.fast.waves.phases=[0,1]"],
-            r"laboratory\.trials\.fast\.waves\.phases has 2 values: give one for every muscle, 3",
+            r"laboratory\.trials\.fast\.waves\.phases has 2 values, but the body has 3 muscles: give a phase for each",
         ),
         (
             ["laboratory.trials.fast.waves.frequency=60"],
@@ -87,6 +83,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
             ["+laboratory.trials.fast.begins=static"],
             r"laboratory\.trials\.fast\.waves is set, but the trial begins static",
         ),
+        (["laboratory.trials.fast.waves=null"], r"laboratory\.trials\.fast\.waves is missing, which other trials have"),
         (["muscles=null", "laboratory.muscles=null"], r"waves is set, but the body has no inputs"),
         (["fixed={x: 1.0}"], r"no vertex lies within"),
         (["data.base_motion=reference"], r"data\.base_motion moves the fixed vertices, but fixed is null"),

@@ -38,7 +38,7 @@ class TestBadInput:
             ("dtype=float16", "dtype is"),
             ("seed=-1", "seed is"),
             ("gravity=[0,0]", "gravity is"),
-            ("fixed=null", "fixed is"),
+            ("fixed=null", "fixed is null, and obstacles has none that the body lies on"),
             ("fixed.x=0.5", "no vertex lies within 1e-09 m of x = 0.5 m"),
             ("data.steps=0", "data.steps"),
             ("solver.relative_tolerance=1", "solver.relative_tolerance"),

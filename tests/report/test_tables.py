@@ -205,6 +205,7 @@ class TestWhatIsShown:
         bound = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, -0.27], [0.01, 0.0, -0.265], [0.0, 0.0, -0.15]])
         assert tip_markers(bound, clamped).tolist() == [1, 2]
         np.testing.assert_allclose(along_body(bound, clamped)[0], 0.1, atol=1e-3)
+        np.testing.assert_array_equal(along_body(bound, clamped[:0]), along_body(bound, bound[:1]))
         measured = np.repeat(bound[None], 5, axis=0)
         measured[2, 2, 0] += 0.02
         measured[3, :2, 0] += 0.01

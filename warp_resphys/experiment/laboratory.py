@@ -238,9 +238,13 @@ def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simul
 
 def input_sequences(settings: PlayedSettings) -> InputSequences:
     """Distribution of the laboratory's random inputs, so that recorded ones stay within the limit."""
+    return InputSequences(limit=_largest_input(settings), **dict(settings.laboratory.sequences))
+
+
+def _largest_input(settings: PlayedSettings) -> float:
+    """Largest input, in its unit, that is recorded within the limit with any zero."""
     assert settings.data.input_limit is not None
-    limit = settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
-    return InputSequences(limit=limit, **dict(settings.laboratory.sequences))
+    return settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
 
 
 def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
@@ -250,8 +254,7 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
     if trial.waves is not None:
-        assert settings.data.input_limit is not None
-        drawn = InputWaves(limit=settings.data.input_limit, **dict(trial.waves)).series(steps, settings.time_step)
+        drawn = InputWaves(limit=_largest_input(settings), **dict(trial.waves)).series(steps, settings.time_step)
     else:
         drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)
     drawn = drawn[before:]
@@ -299,7 +302,7 @@ class _Played(ResumableRollout):
         )
         self._driven: torch.Tensor | None = None
         quantity = driving_quantity(settings.laboratory)
-        if self._trials[0].is_driven and quantity is not None:
+        if all(trial.is_driven for trial in self._trials) and quantity is not None:
             self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
             self._name = quantity.name
         self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}

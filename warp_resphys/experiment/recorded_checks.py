@@ -161,24 +161,26 @@ def _check_inputs(data: RecordedData, drive: Drive) -> None:
 
 def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None) -> None:
     """Refuses waves of recordings, of bodies without inputs, of trials without motion, and of other parts."""
-    for trial in [trial for trial in trials if trial.waves is not None]:
-        assert trial.waves is not None
-        key, count = (
-            f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves",
-            len(trial.waves.phases),
-        )
+    for trial in trials:
+        if trial.waves is None:
+            continue
+        key = f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves"
         if not run.is_laboratory:
             raise InputError(f"{key} is of simulated trials, and recordings have their own inputs: leave it out.")
         if drive is None or trial.begins not in RESTING:
             why = "the body has no inputs" if drive is None else f"the trial begins {trial.begins}"
             raise InputError(f"{key} is set, but {why}: leave it out.")
+        count, wanted = len(trial.waves.phases), number_of(len(drive.parts), drive.per)
         if count != len(drive.parts):
-            raise InputError(f"{key}.phases has {count} values: give one for every {drive.per}, {len(drive.parts)}.")
+            raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give a phase for each.")
         if 2.0 * trial.waves.frequency * run.time_step >= 1.0:
             raise InputError(
                 f"{key}.frequency is {trial.waves.frequency:g}: steps of {run.time_step:g} s resolve less than "
                 f"{0.5 / run.time_step:g} Hz."
             )
+    without = [trial.name for trial in trials if trial.begins in RESTING and not trial.is_driven]
+    if without and any(trial.waves is not None for trial in trials):
+        raise InputError(f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it.")
 
 
 def _check_laboratory(

@@ -265,6 +265,8 @@ class BodySettings(Settings):
     def _touches(self) -> Self:
         if not self.obstacles and self.contact != ContactSettings():
             raise ValueError("contact is set, but obstacles has none: name an obstacle, or leave contact out.")
+        if self.fixed is None and not self.obstacles and self.symmetry is None:
+            raise ValueError("fixed is null, and obstacles has none that the body lies on: name fixed vertices.")
         for key in ("stiffness", "friction"):
             values = getattr(self.contact, key)
             if isinstance(values, dict) and values.keys() != self.obstacles.keys():

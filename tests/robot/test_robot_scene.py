@@ -108,17 +108,16 @@ def test_a_base_moves_beside_an_object_that_is_fixed():
 
 
 def test_a_lost_environment_stands_at_rest():
-    """A force that no solve bears, in one of two environments whose robots count failures."""
-    robot = beam()
-    robot = Robot(robot.description, on_failure="count")
+    """A force for which a solve has too few iterations, in one of two environments whose robots count failures."""
+    robot = Robot(beam("solver.max_iterations=6").description, on_failure="count")
     scene, rest = RobotScene({"one": (robot, AWAY)}), robot.simulator.rest_positions
-    force = torch.stack([0.0 * rest, tip_force(robot, 0.0, 0.0, 1e9)])
+    force = torch.stack([0.0 * rest, tip_force(robot, 0.0, 0.0, 300.0)])
     state = scene.begin(2)
     for _ in range(3):
         state = scene.step(state, {"one": {"external_force": force}})
     assert state.lost.tolist() == state.robots["one"].lost.tolist() == [False, True]
     assert torch.equal(state.body.q[1], rest)
-    assert float((state.body.q[0] - rest).abs().max()) > 1e-4
+    assert float((state.body.q[0] - rest).abs().max()) > 1e-5
 
 
 def test_what_does_not_fit_is_refused(finished):

@@ -13,7 +13,7 @@ from ..robot.gripper import THING, GripperSettings, Thing, finger_inputs, grippe
 from ..robot.robot import Robot
 
 RISE: Final = 0.02  # of the gripper [m], which lifts a thing
-SPEED: Final = 0.1  # of the gripper [m/s]
+SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes
 
 
 class GraspWorld(World):

@@ -108,23 +108,24 @@ def grasp_study(study: GraspStudy, folder: Path) -> None:
             for name, robot in robots.items():
                 others[name] = Grasp.of(study, robot, thing, driven.name, h)
                 progress.advance()
-            rows += [_row(thing, name, truth, grasp) for name, grasp in others.items()]
+            shaken = round((study.closing + study.lifting) / h)
+            rows += [_row(thing, name, truth, grasp, shaken) for name, grasp in others.items()]
             write_json(folder / "grasp_study.json", {"hardware": hardware(), "study": study.plain(), "rows": rows})
     columns = (
-        "between the fingers {thing} | model {model} | error [mm] {error_mm:.2f} | at the end [mm] {end_mm:.2f} | "
+        "between the fingers {thing} | model {model} | error [mm] {error_mm:.2f} | while shaken [mm] {shaken_mm:.2f} | "
         "lifted [mm] {lifted} | in the laboratory [mm] {real} | left its training {left}"
     )
     show(Sheet.of("Two fingers, beside those of the laboratory", columns, rows))
 
 
-def _row(thing: Thing | None, model: str, truth: Grasp, grasp: Grasp) -> dict[str, Any]:
+def _row(thing: Thing | None, model: str, truth: Grasp, grasp: Grasp, shaken: int) -> dict[str, Any]:
     error = 1e3 * np.linalg.norm(grasp.markers - truth.markers, axis=2).mean(axis=1)
     lifted, real = (None if own.height is None else f"{1e3 * own.height[-1]:.1f}" for own in (grasp, truth))
     return {
         "thing": thing or "nothing",
         "model": model,
-        "error_mm": float(error.mean()),
-        "end_mm": float(error[-1]),
+        "error_mm": float(error[:shaken].mean()),
+        "shaken_mm": float(error[shaken:].mean()),
         "lifted": lifted or "",
         "real": real or "",
         "left": "yes" if grasp.left else "",

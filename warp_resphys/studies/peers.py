@@ -158,8 +158,8 @@ def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Calla
                 solver.step(before, after, control, None, step.size)
 
         launch: Callable[[], object] = two_steps
+        two_steps()  # compiles the kernels, which is not possible while a graph is captured
         if iterations <= _IN_A_GRAPH:
-            two_steps()  # compiles the kernels, which is not possible while a graph is captured
             with wp.ScopedCapture(device=str(device)) as capture:
                 two_steps()
             launch = partial(wp.capture_launch, capture.graph)

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
+from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.coupling import Coupling, CouplingSolver
 from warp_resphys.linalg.linear_solver import Factor
 
@@ -17,6 +19,27 @@ class DenseFactor(Factor):
     def solve(self, rhs):
         self.count += rhs.shape[2]
         return torch.linalg.solve(self.matrices, rhs)
+
+
+@pytest.mark.parametrize("name", ["banded", "tiled", "dense", "sparse"])
+def test_columns_of_inverses(name):
+    """Of a matrix of two blocks that are not coupled, in two environments, beside those of the dense inverse."""
+    random = np.random.default_rng(1)
+    rows = np.concatenate([np.arange(5), np.arange(1, 3), np.array([4])])
+    cols = np.concatenate([np.arange(5), np.arange(2), np.array([3])])
+    solver = make_linear_solver(name, rows, cols, 5, 3, torch.device("cpu"), torch.float64)
+    pattern = np.kron(scipy.sparse.coo_array((np.ones(len(rows)), (rows, cols))).toarray(), np.ones((3, 3)))
+    pattern = (pattern + pattern.T) > 0
+    matrices = np.stack([np.where(pattern, symmetric(random, 15, True), 0.0) + 30.0 * np.eye(15) for _ in range(2)])
+    values = torch.zeros(2, solver.n_values, dtype=torch.float64)
+    for e, (i, j) in enumerate(zip(rows, cols, strict=True)):
+        block = matrices[:, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3].reshape(2, 9)
+        stored = solver.address[e] >= 0
+        values[:, solver.address[e][stored]] = torch.tensor(block[:, stored])
+    environments, unknowns = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([2, 14, 0, 9, 13])
+    actual = solver.factor(values).inverse_columns(environments, unknowns, values.new_zeros(2, 0, 15))
+    expected = np.linalg.inv(matrices)[environments, unknowns]
+    np.testing.assert_allclose(actual.numpy(), expected, rtol=0.0, atol=1e-12)
 
 
 def symmetric(random, size, definite):

@@ -39,7 +39,7 @@ class GripperSettings(Settings):
     size: Positive = setting(0.02, "diameter or edge of the thing", "m")
     mass: Positive = setting(0.01, "of the thing", "kg")
     gap: Positive = setting(1.5e-3, "between the fingers and the thing at rest", "m")
-    height: float = setting(-0.0815, "of the table; the bases of the fingers are at 0", "m")
+    below: Positive = setting(1.5e-3, "distance of the table from the fingers", "m")
     friction: NotNegative = setting(0.8, "coefficient, everywhere")
     stiffness: Positive = setting(5e4, "of the contact", "Pa")
     distance: Positive = setting(5e-4, "at which contact begins", "m")
@@ -83,7 +83,7 @@ def gripper(robot: Robot, settings: GripperSettings, thing: Thing | None = "ball
     if thing is None:
         return RobotScene(robots, relative_tolerance=settings.relative_tolerance)
     contact = SurfaceContact(settings.stiffness, settings.friction, settings.distance, settings.slip_speed)
-    objects = {THING: _thing(settings, thing, mesh.cells.shape[1])}
+    objects = {THING: _thing(settings, thing, float(mesh.vertices[:, 2].min()) - settings.below, mesh.cells.shape[1])}
     return RobotScene(robots, objects, contact, settings.relative_tolerance)
 
 
@@ -114,11 +114,11 @@ def thing_mesh(thing: Thing, radius: float, divisions: int, nodes: int = 8) -> M
     return Mesh(radius * x * shrunk, cube.cells)
 
 
-def _thing(settings: GripperSettings, thing: Thing, nodes: int) -> tuple[Body, Corotated]:
-    """A hard thing on a table, and its material."""
+def _thing(settings: GripperSettings, thing: Thing, height: float, nodes: int) -> tuple[Body, Corotated]:
+    """A hard thing on a table at a height [m], and its material."""
     mesh, radius = thing_mesh(thing, 0.5 * settings.size, 2, nodes), 0.5 * settings.size
-    mesh = replace(mesh, vertices=mesh.vertices + [0.0, 0.0, settings.height + radius + 0.9 * settings.distance])
-    below = {"table": HalfSpace(position=(0.0, 0.0, settings.height))}
+    mesh = replace(mesh, vertices=mesh.vertices + [0.0, 0.0, height + radius + 0.9 * settings.distance])
+    below = {"table": HalfSpace(position=(0.0, 0.0, height))}
     table = Contact(below, settings.stiffness, settings.friction, settings.distance, settings.slip_speed)
     density = settings.mass / float(Body(mesh).discretisation.element_volumes.sum())
     return Body(mesh, energies=[table]), Corotated(density=density, youngs_modulus=5e6, poissons_ratio=0.3)

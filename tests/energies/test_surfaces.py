@@ -29,6 +29,7 @@ from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
+from warp_resphys.robot.gripper import thing_mesh
 
 CPU = torch.device("cpu")
 SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)
@@ -288,6 +289,81 @@ def test_gradients_of_an_oblique_impact(integrator, device):
             expected = (loss({**values, name: value + way}) - loss({**values, name: value - way})) / 2.0
         actual = (slopes[name] * way).reshape(16, -1).sum(1)
         assert float((actual - expected).abs().max()) < 1e-6 * float(expected.abs().max()), name
+
+
+def directional(loss, values, sizes):
+    """Compares the gradient of a loss by every value, along a random direction, with a central difference."""
+    given = {name: value.clone().requires_grad_() for name, value in values.items()}
+    slopes = dict(zip(given, torch.autograd.grad(loss(given), list(given.values())), strict=True))
+    for name, value in values.items():
+        way = sizes[name] * torch.tensor(np.random.default_rng(7).uniform(0.5, 1.0, value.shape))
+        with torch.no_grad():
+            expected = float(loss({**values, name: value + way}) - loss({**values, name: value - way})) / 2.0
+        assert abs(expected) > 0.0
+        assert float((slopes[name] * way).sum()) == pytest.approx(expected, rel=1e-6), name
+
+
+def test_gradients_of_a_ball_that_rolls():
+    """A ball that is thrown along a plate without spin: it slides, and rolls after some steps."""
+    ball = thing_mesh("ball", 0.01, 2)
+    ball = replace(ball, vertices=ball.vertices + [0.012, 0.0203, 0.0207])
+    mesh = box_hexahedra((0.04, 0.04, 0.01), (4, 4, 1))
+    plate = Body(mesh, fixed=select_vertices(mesh, z=0.0))
+    scene = Scene({"plate": plate, "ball": Body(ball)}, SurfaceContact(KAPPA, 0.5, slip_speed=1e-2))
+    simulator = Simulator(scene, SOFT, time_step=0.004, solver=FINE)
+    own, rest = scene.vertex_slice("ball"), simulator.rest_state()
+    weights = simulator.tensor(np.random.default_rng(3).normal(size=(own.stop - own.start, 3)))
+
+    def rolled(given):
+        v = torch.zeros_like(rest.v)
+        v[:, own] = given["velocity"]
+        parameters = {"surface_friction": given["surface_friction"]}
+        return simulator.rollout(State(rest.q, v), 14, parameters=parameters)
+
+    values = {
+        "velocity": torch.tensor([0.15, 0.01, -0.1], dtype=torch.float64),
+        "surface_friction": torch.tensor([[0.5]], dtype=torch.float64),
+    }
+    with torch.no_grad():
+        last = rolled(values)
+    arm = (last.q[-1] - last.q[-1][:, own].mean(1, keepdim=True))[0, own]
+    spin = torch.linalg.lstsq(  # v - mean(v) = omega x arm
+        torch.cat([torch.linalg.cross(axis.expand_as(arm), arm)[..., None] for axis in torch.eye(3).double()], 2).view(
+            -1, 3
+        ),
+        (last.v[-1] - last.v[-1][:, own].mean(1, keepdim=True))[0, own].reshape(-1, 1),
+    ).solution
+    assert float(spin[1]) > 0.3 * float(last.v[-1][0, own, 0].mean()) / 0.01  # It turns about y.
+    directional(
+        lambda given: 1e2 * (rolled(given).q[-1][0, own] * weights).sum(),
+        values,
+        {"velocity": 1e-6, "surface_friction": 1e-6},
+    )
+
+
+def test_gradients_of_a_body_that_rubs_on_itself():
+    """The ends of a clip are pressed together, and one of them is pulled along the other."""
+    mesh = clip()
+    ends = mesh.vertices[:, 0] > 0.029
+    upper, lower = ends & (mesh.vertices[:, 2] > 0.014), ends & (mesh.vertices[:, 2] < 0.014)
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[SurfaceContact(KAPPA, 0.3, slip_speed=1e-2)])
+    simulator = Simulator(body, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0), solver=FINE)
+    weights = simulator.tensor(np.random.default_rng(4).normal(size=(len(mesh.vertices), 3)))
+
+    def pressed(given):
+        force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
+        force[0, upper] = given["force"] / upper.sum()
+        force[0, lower] = -given["force"] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) / lower.sum()
+        parameters = {"surface_friction": given["surface_friction"]}
+        return simulator.rollout(simulator.rest_state(), 14, Inputs(external_force=force), parameters)
+
+    values = {
+        "force": torch.tensor([0.0, 0.02, -0.06], dtype=torch.float64),
+        "surface_friction": torch.tensor([[0.3]], dtype=torch.float64),
+    }
+    directional(
+        lambda given: 1e2 * (pressed(given).q[-1][0] * weights).sum(), values, {"force": 1e-7, "surface_friction": 1e-5}
+    )
 
 
 def test_friction_sticks_and_slides_on_a_slope():

@@ -150,7 +150,7 @@ def test_pairs_are_those_of_ipctk(kind):
         expected = peer_barrier(ipctk, kind, x[c], width[c], reach)
         actual = (energy[c], force[c].ravel(), hessian[c])
         for own, peer in zip(actual, expected, strict=True):
-            assert own == pytest.approx(peer, rel=1e-9, abs=1e-11 * float(np.abs(peer).max()))
+            assert own == pytest.approx(peer, rel=1e-11, abs=1e-11 * float(np.abs(peer).max()))
 
 
 def test_listed_pairs_are_those_of_ipctk():

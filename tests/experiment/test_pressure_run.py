@@ -421,9 +421,9 @@ def test_the_replays_gradient_is_that_of_differences():
         loss = lambda x, name=name: 1e6 * replay.errors(replay(release, {name: x})).square().sum()  # noqa: E731
         (gradient,) = torch.autograd.grad(loss(x), x)
         with torch.no_grad():
-            step = 1e-4 * value
+            step = 1e-3 * value  # with smaller ones, differences are of the size of the solver's tolerance
             difference = (loss(x + step) - loss(x - step)) / (2 * step)
-        assert float(gradient) == pytest.approx(float(difference), rel=1e-4)
+        assert float(gradient) == pytest.approx(float(difference), rel=2e-5)
 
 
 def test_leaving_the_range_of_the_training_is_noticed():

@@ -54,9 +54,9 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     for row, name in enumerate(dataset.names):
         waves = InputWaves(limit=1e4, **dict(configured.laboratory.trials[name].waves)).series(100, 0.01)
         np.testing.assert_allclose(dataset.inputs["muscle_stress"][row], waves[1:], rtol=1e-9)
-    found = results["parameters"]["sysid"]
-    assert found["youngs_modulus"] == pytest.approx(7.5e4, rel=0.01)
-    assert found["contact_friction"] == pytest.approx(0.4, rel=0.05)
+    identified = results["parameters"]["sysid"]
+    assert identified["youngs_modulus"] == pytest.approx(7.5e4, rel=0.01)
+    assert identified["contact_friction"] == pytest.approx(0.4, rel=0.05)
     errors = results["errors_mm"]
     assert errors["sysid"]["mean"] < 1.2 * results["noise_mm"] < 0.2 * errors["simulation"]["mean"]
     check_robots("run", tolerance=1e-7)
@@ -73,7 +73,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     [
         (
             ["laboratory.trials.fast.waves.phases=[0,1]"],
-            r"laboratory\.trials\.fast\.waves\.phases has 2 values, but the body has 3 muscles: give a phase for each",
+            r"laboratory\.trials\.fast\.waves\.phases has 2 values, but the body has 3 muscles: give as many phases",
         ),
         (
             ["laboratory.trials.fast.waves.frequency=60"],

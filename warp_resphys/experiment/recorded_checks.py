@@ -172,7 +172,7 @@ def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None)
             raise InputError(f"{key} is set, but {why}: leave it out.")
         count, wanted = len(trial.waves.phases), number_of(len(drive.parts), drive.per)
         if count != len(drive.parts):
-            raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give a phase for each.")
+            raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give as many phases.")
         if 2.0 * trial.waves.frequency * run.time_step >= 1.0:
             raise InputError(
                 f"{key}.frequency is {trial.waves.frequency:g}: steps of {run.time_step:g} s resolve less than "

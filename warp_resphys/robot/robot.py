@@ -25,7 +25,7 @@ from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
 from ..mesh.mesh import Mesh
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .commands import Commands
+from .commands import Acting, Commands
 from .description import Description
 from .inputs import Given, InputReader, inputs_of
 from .motion import Motion
@@ -311,12 +311,19 @@ class Robot:
                 state.q.detach(),
                 None,
             )
+        return self._after(state, acting, predictor, body, now)
+
+    @staticmethod
+    def _after(
+        state: RobotState, acting: Acting, predictor: LearnedPredictor | None, body: State, lost: torch.Tensor
+    ) -> RobotState:
+        """Returns the state after a step, from the one before it and the body after it."""
         left = state.left
         if predictor is not None and predictor.left_at is not None:
             left = left | (predictor.left_at >= 0)
         hidden = None if predictor is None else predictor.hidden
         base = None if acting.base is None else acting.base[1:]
-        return RobotState(body, acting.memory, hidden, base, left, now)
+        return RobotState(body, acting.memory, hidden, base, left, lost)
 
     def drive(self, state: RobotState, **inputs: Given) -> tuple[Inputs, Callable[[State], RobotState]]:
         """Returns a step's inputs with the learned force, and a map from the body's state after it to the robot's.
@@ -331,21 +338,14 @@ class Robot:
             InputError: an invalid input, as for `step`.
         """
         acting = self._commands.act(state, self._read(inputs, state.batch))
-        own, left, hidden = acting.inputs, state.left, state.hidden
+        own, predictor = acting.inputs, None
         if self._learned is not None:
             predictor = self._predictor(acting.conditions, acting.base)
-            predictor.hidden = hidden
-            force, hidden = predictor(state.body, 0), predictor.hidden
+            predictor.hidden = state.hidden
+            force = predictor(state.body, 0)
             assert isinstance(force, torch.Tensor)
             own = own.plus(force)
-            if predictor.left_at is not None:
-                left = left | (predictor.left_at >= 0)
-        base = None if acting.base is None else acting.base[1:]
-
-        def after(body: State) -> RobotState:
-            return RobotState(body, acting.memory, hidden, base, left, state.lost)
-
-        return own, after
+        return own, lambda body: self._after(state, acting, predictor, body, state.lost)
 
     def rollout(
         self,

@@ -105,7 +105,7 @@ class Case:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """What happened to a case.
+    """Outcome of a case.
 
     Attributes:
         crossings: number of steps after which surfaces cross.
@@ -360,7 +360,7 @@ def card_house(angle: float, friction: float) -> Scene:
 
 
 def card_checks(quick: bool, device: torch.device) -> Iterator[Check]:
-    """By how much the upper ends of two cards sink in half a second after they were leant on one another."""
+    """Two cards that were leant on one another: the way by which their upper ends sink in half a second."""
     for degrees in (25.0,) if quick else (15.0, 25.0, 35.0):
         angle = math.radians(degrees)
         need = card_friction(angle)

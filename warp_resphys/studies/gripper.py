@@ -27,11 +27,12 @@ from ..fem.scene import Scene
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
-from ..io.settings import Natural, Positive, Settings, Some, Word, setting
+from ..io.settings import Natural, Positive, Settings, Word, setting
 from ..mesh.mesh import box_hexahedra, select_vertices
 from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .beam import Divisions
+from .benchmark import Batches
 from .tables import Sheet, show
 from .timing import now, yardstick_seconds
 
@@ -47,7 +48,7 @@ class GripperStudy(Settings):
 
     fingers: Divisions
     ball: Natural
-    batches: dict[str, Some[Natural]]
+    batches: Batches
     tensions: Annotated[tuple[Positive, Positive], Strict(False)] = setting(unit="N")
     time_step: Positive = setting(unit="s")
     relative_tolerance: Positive
@@ -136,7 +137,7 @@ def gripper_study(study: GripperStudy, folder: Path) -> None:
     """
     device = choose_device(study.device)
     rows, yardsticks = [], [yardstick_seconds()]
-    batches = study.batches[device.type]
+    batches = study.batches.on(device.type)
     with Progress("grasps", len(batches) * 2 * (1 + study.repeats), "grasps") as progress:
         for batch in batches:
             grasps = [SoftGrasp.of(study, batch, device, contact) for contact in (True, False)]

@@ -11,6 +11,7 @@ second derivatives
 import warp as wp
 
 from .contact import INFINITE, KEPT, ONE, TWO, UNDEFINED, ZERO, barrier, slide_tangent, smoothed
+from .points import line_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -490,6 +491,19 @@ def grip_tangents(
     for i in range(4):
         for j in range(4):
             add_block(out, g, i, j, w[i] * w[j] * block)
+
+
+@wp.kernel
+def place(
+    vertices: wp.array[int],  # (P) of the surface
+    nodes: wp.array2d[int],
+    weights: wp.array2d[wp.float64],
+    field: wp.array2d[wp.vec3d],  # (B, N) at control vertices
+    field_out: wp.array2d[wp.vec3d],  # (B, N)
+):
+    """Sets a field at the vertices of a surface from that at control vertices."""
+    b, p = wp.tid()
+    field_out[b, vertices[p]] = line_at(field, nodes, weights, b, p, p)
 
 
 @wp.kernel

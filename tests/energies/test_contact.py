@@ -12,6 +12,7 @@ from warp_resphys import (
     Corotated,
     Inputs,
     Mesh,
+    Rigid,
     Scene,
     Simulator,
     SolverSettings,
@@ -329,12 +330,14 @@ def test_a_plate_that_moves_by_more_than_a_gap_in_a_step_presses_a_block(fractio
 
 
 @pytest.mark.parametrize("moves", [(True, False), (False, True), (True, True)])
-def test_lifts_raise_two_bodies_of_a_scene(moves):
+@pytest.mark.parametrize("rigid", [{}, {"all": Rigid()}])
+def test_lifts_raise_two_bodies_of_a_scene(moves, rigid):
     """By 2 mm a step, more than their gaps; a body whose lift stays is not moved."""
     bodies = {}
     for k, name in enumerate("ab"):
         lift = HalfSpace(position=(0.0, 0.0, -0.9 * D), moves=moves[k])
-        bodies[name] = Body(raised(BLOCK, 0.1 * k, 0.0, 0.0), energies=[Contact({"lift": lift}, KAPPA, 0.0, D)])
+        mesh = replace(raised(BLOCK, 0.1 * k, 0.0, 0.0), regions={"all": np.arange(len(BLOCK.cells))})
+        bodies[name] = Body(mesh, rigid=rigid, energies=[Contact({"lift": lift}, KAPPA, 0.0, D)])
     s = Simulator(Scene(bodies), SOFT, 5e-3)
     way = 2e-3 * torch.arange(4, dtype=torch.float64)[:, None, None]
     inputs = Inputs(**{name: way for name in s.inputs if name.endswith("move_z")})

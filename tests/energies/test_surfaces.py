@@ -15,6 +15,7 @@ from warp_resphys import (
     HalfSpace,
     Inputs,
     Mesh,
+    Rigid,
     Scene,
     Simulator,
     SolverSettings,
@@ -237,12 +238,15 @@ def test_crossings_are_seen(device):
     assert count[0] == count[2] == 0 < count[1]
 
 
-def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, **options):
-    """A cube above a plate that is held below."""
-    cube = turned(CUBE, (0.4, 0.5), (0.021, 0.0197, 0.0255))
+def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", **options):
+    """A cube, of which a `rigid` layer or the whole is rigid, above a plate that is held below."""
+    low = CUBE.vertices[CUBE.cells].mean(1)[:, 2] < 0.01
+    parts = {"layer": np.flatnonzero(low), "whole": np.arange(len(CUBE.cells))}
+    cube = turned(replace(CUBE, regions=parts), (0.4, 0.5), (0.021, 0.0197, 0.0255))
+    stiff = {rigid: Rigid(density=1070.0, stiffness=1e6)} if rigid else {}
     plate = Body(PLATE, fixed=select_vertices(PLATE, z=0.0))
     contact = SurfaceContact(kappa, friction, slip_speed=1e-2)
-    scene = Scene({"plate": plate, "cube": Body(cube)}, contact)
+    scene = Scene({"plate": plate, "cube": Body(cube, rigid=stiff)}, contact)
     return Simulator(scene, SOFT, integrator=integrator, **{"time_step": 0.002, "solver": FINE, **options})
 
 
@@ -257,10 +261,12 @@ def thrown(simulator, velocity, spin, batch=1):
     return State(rest.q, v)
 
 
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_gradients_of_an_oblique_impact(integrator, device):
+@pytest.mark.parametrize(
+    ("integrator", "rigid"), [("implicit_euler", ""), ("bdf2", ""), ("implicit_euler", "layer"), ("bdf2", "whole")]
+)
+def test_gradients_of_an_oblique_impact(integrator, rigid, device):
     """Sixteen throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
-    simulator = landing(integrator=integrator, device=device)
+    simulator = landing(integrator=integrator, rigid=rigid, device=device)
     random = np.random.default_rng(0)
     velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (16, 3)))
     weights = simulator.tensor(random.normal(size=(2, 16, simulator.body.n_vertices, 3)))
@@ -281,7 +287,7 @@ def test_gradients_of_an_oblique_impact(integrator, device):
     given = {name: value.clone().requires_grad_() for name, value in values.items()}
     slopes = dict(zip(given, torch.autograd.grad(loss(given).sum(), list(given.values())), strict=True))
     for name, value in values.items():
-        size = (1e-4 if name == "surface_stiffness" else 1e-6) * float(value.abs().max())
+        size = {"surface_stiffness": 1e-4, "spin": 1e-5}.get(name, 1e-6) * float(value.abs().max())
         way = size * torch.ones_like(value)
         if name == "velocity":
             way = size * simulator.tensor([0.6, -0.5, 0.6]).expand(16, 3)
@@ -455,16 +461,17 @@ def test_a_body_touches_itself(device):
         assert float(forces.normal.norm()) > 0.01
 
 
-def test_batch_is_what_its_environments_are_alone(device):
+@pytest.mark.parametrize("rigid", ["", "layer", "whole"])
+def test_batch_is_what_its_environments_are_alone(rigid, device):
     """Sixteen environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)
     velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (16, 3)))
     spin = torch.linspace(-4.0, 4.0, 16, dtype=torch.float64)
     settings = SolverSettings(linear_solver="banded" if device == "cpu" else "tiled")
-    together = landing(solver=settings, device=device)
+    together = landing(rigid=rigid, solver=settings, device=device)
     path = together.rollout(thrown(together, velocity, spin, 16), 12)
     for b in range(16):
-        alone = landing(solver=settings, device=device)
+        alone = landing(rigid=rigid, solver=settings, device=device)
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
         if device == "cpu":
             assert torch.equal(own.q[:, 0], path.q[:, b])
@@ -500,9 +507,10 @@ def test_equilibrium_of_bodies_that_lean_on_one_another():
     assert float(slope) == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_the_matrix_of_a_step_has_its_pairs():
+@pytest.mark.parametrize("rigid", ["", "layer", "whole"])
+def test_the_matrix_of_a_step_has_its_pairs(rigid):
     """H of a step in contact, as a matrix, is the difference of the residual."""
-    simulator = landing()
+    simulator = landing(rigid=rigid)
     velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64)
     state = simulator.rollout(thrown(simulator, velocity, velocity[:, 0]), 5).final
     step, x = simulator.linearise(state), simulator.step(state)[0].q

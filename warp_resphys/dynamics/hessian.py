@@ -14,7 +14,7 @@ from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..io.errors import InputError
 from ..kernels.assembly import sum_blocks
-from ..linalg.coupling import Coupling, CouplingSolver
+from ..linalg.coupling import Coupling, CouplingSolver, VertexCouplings, coordinates
 from ..linalg.linear_solver import Factor, LinearSolver, numbered
 from .assembly import BlockPattern, HessianAssembly
 
@@ -80,10 +80,18 @@ class ExactHessian(HessianApproximation):
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
         self.vertex_at = pattern.free[linear.order]
         self._coupled: CouplingSolver | None = None
+        # Numbers of the free and, behind them, the dependent vertices; -1 for fixed ones.
+        free, depends = torch.as_tensor(pattern.free, device=potential.device), potential.coordinates
+        self._vertices = torch.cat([free, depends.dependent])
         self._place = torch.full((potential.n_vertices,), -1, device=potential.device)
-        self._place[torch.as_tensor(pattern.free, device=potential.device)] = torch.arange(
-            len(pattern.free), device=potential.device
-        )
+        self._place[self._vertices] = torch.arange(len(self._vertices), device=potential.device)
+        self._reduction: VertexCouplings | None = None
+        if depends.depends:
+            weights = depends.weights
+            place = self._place[depends.controls].masked_fill(weights == 0.0, -1)
+            own = torch.full((len(free), place.shape[1]), -1, device=potential.device)
+            own[:, 0] = self._place[free]
+            self._reduction = VertexCouplings(torch.cat([own, place]), torch.cat([(own >= 0).to(weights), weights]))
 
     @override
     def ready(self) -> bool:
@@ -150,13 +158,13 @@ class ExactHessian(HessianApproximation):
         environment = torch.cat([part.environment for part in parts])
         nodes = self._place[torch.cat([part.nodes for part in parts])]
         blocks = torch.cat([part.blocks for part in parts])
-        device, n_free = nodes.device, len(self.vertex_at)
-        keys, local = torch.where(nodes < 0, -1, environment[:, None] * n_free + nodes).unique(return_inverse=True)
+        device, total = nodes.device, len(self._vertices)
+        keys, local = torch.where(nodes < 0, -1, environment[:, None] * total + nodes).unique(return_inverse=True)
         fixed = int((keys < 0).sum())  # all fixed vertices have one key
         keys, local = keys[fixed:], local - fixed
         if not len(keys):
             return []
-        row = keys // n_free
+        row = keys // total
         count, at = numbered(row, self._potential.batch)
         # A size that depends on the environment alone, so that on a CPU it is bit for bit what it is in another batch.
         sizes = -(-count // _ROUNDED) * _ROUNDED
@@ -167,14 +175,17 @@ class ExactHessian(HessianApproximation):
         rows = torch.stack([first[row], 3 * sizes[row], at], 1)
         columns = torch.where(local < 0, -1, at[local.clamp_min(0)])
         values = self._summed(blocks, local, rows, columns, int(squares.sum()))
-        unknowns = torch.full((len(sizes), int(sizes.max()), 3), -1, device=device)
-        unknowns[row, at] = 3 * (keys % n_free)[:, None] + torch.arange(3, device=device)
-        out, done = [], 0
+        vertices = torch.full((len(sizes), int(sizes.max())), -1, device=device)
+        vertices[row, at] = keys % total
+        out, done = list[Coupling](), 0
         for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
             own, m = order[sizes[order] == size], 3 * size
             if size:
                 matrices = values[done : done + number * m * m].view(number, m, m)
-                out.append(Coupling(own, unknowns[own, :size].flatten(1), matrices))
+                if self._reduction is None:
+                    out.append(Coupling(own, coordinates(vertices[own, :size]), matrices))
+                else:
+                    out += self._reduction.reduced(own, vertices[own, :size], matrices)
                 done += number * m * m
         return out
 

@@ -264,7 +264,14 @@ class BoundContact(BoundEnergy):
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
         self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
         self._check_body(site.body)
+        self._rigid = [self._rigid_part(site, name) for name in site.body.controls]
         self._check_start(like)
+
+    def _rigid_part(self, site: EnergySite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the numbers of a rigid part's points, and its vertices within the body."""
+        cells = site.body.mesh.cells[site.body.mesh.region(name)]
+        own = torch.as_tensor(np.unique(cells) + site.first, device=self._vertices.device)
+        return torch.isin(self._vertices, own).nonzero().ravel(), own[~torch.isin(own, self._vertices)]
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""
@@ -461,7 +468,15 @@ class BoundContact(BoundEnergy):
             if not bool(lack.any()):
                 break
             normal = n.gather(2, worst[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
-            q = q.index_add(1, self._vertices, lack[..., None] * normal)
+            ways, inside = lack[..., None] * normal, list[tuple[torch.Tensor, torch.Tensor]]()
+            for surface, within in self._rigid:  # A rigid part moves as its vertex that lacks most.
+                most = lack[:, surface].argmax(1)
+                way = ways[torch.arange(len(q), device=q.device), surface[most], None]
+                ways[:, surface] = way
+                inside.append((within, way.expand(-1, len(within), -1)))
+            q = q.index_add(1, self._vertices, ways)
+            for within, way in inside:
+                q = q.index_add(1, within, way)
         self._check(q, pose, "after an obstacle has moved")
         return q
 
@@ -480,10 +495,6 @@ class BoundContact(BoundEnergy):
         if len(body.symmetry) or len(body.glued):
             what = "symmetry planes" if len(body.symmetry) else "glued vertices"
             raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
-        if self._contact.moves and body.rigid:
-            raise InputError(
-                "obstacles that move do not push rigid parts: move the body instead, or give the part a stiff material."
-            )
 
     def _check_start(self, rest: torch.Tensor) -> None:
         """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""

@@ -41,7 +41,7 @@ class PlacedEnergy:
             points: points of the energy, with the body's own vertex numbers.
             prefix: prefix of the energy's names.
         """
-        shifted = tuple(replace(own, nodes=own.nodes + first) if first else own for own in points)
+        shifted = tuple(own.shifted(first) for own in points)
         return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)
 
     @property

@@ -359,11 +359,14 @@ class IncrementalPotential(Launcher):
         if self.low_rank is not None:
             along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
             product += torch.einsum("bnr,br->bn", self.low_rank, along).view_as(product)
-        for part in self.last_pair_tangents:
-            row = part.environment[:, None].expand_as(part.nodes)
-            ways = self._direction[row, part.nodes]
-            forces = torch.einsum("aij,aj->ai", part.blocks, ways.flatten(1)).view_as(ways)
-            product.index_put_((row, part.nodes), forces, accumulate=True)
+        if self.last_pair_tangents:
+            whole, between = self.coordinates.expand(self._direction), torch.zeros_like(product)
+            for part in self.last_pair_tangents:
+                row = part.environment[:, None].expand_as(part.nodes)
+                ways = whole[row, part.nodes]
+                forces = torch.einsum("aij,aj->ai", part.blocks, ways.flatten(1)).view_as(ways)
+                between.index_put_((row, part.nodes), forces, accumulate=True)
+            product += self.coordinates.reduce(between)
         return product
 
     def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..fem.body import Body
-from ..fem.coordinates import barycentric
+from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, physical_gradients
 from ..fem.rigid import Rigid
 from ..kernels import point_inertia as kernels
@@ -108,7 +108,7 @@ class BoundRigidInertia(BoundInertia):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         inertia = step.constants.value("density") / step.stage.step**2
-        target = torch.einsum("pc,bci->bpi", self._factor, step.stage.target[:, self._controls])
+        target = weighted_sum(self._factor, step.stage.target[:, None, self._controls])
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
 
 

@@ -1,12 +1,12 @@
 """Kernels of contact between surfaces, and derivatives of its friction by the state at the start of a step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from ..fem.elements import Points
 from ..io.errors import InputError
@@ -28,10 +28,15 @@ class SurfacePoints(Points):
     """Vertices of a surface."""
 
     surface: Surface
+    first: int = 0  # number of the body's first vertex
+
+    @override
+    def shifted(self, first: int) -> Self:
+        return replace(super().shifted(first), first=self.first + first)
 
     def placed(self, count: int) -> Surface:
         """Returns the surface with the vertex numbers of a simulator of `count` vertices."""
-        return self.surface.within(int(self.nodes[0, 0] - self.surface.vertices[0]), count)
+        return self.surface.within(self.first, count)
 
 
 class Sliding(NamedTuple):
@@ -79,6 +84,7 @@ class SurfaceTerm(Term):
         assert isinstance(s.source, SurfacePoints)
         self._vertices, self._reach = s.n_vertices, reach
         self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
+        self._whole = launcher.zeros(s.n_vertices, 3) if s.nodes_per_cell > 1 else None  # positions, if some depend
         self._none = torch.zeros(0, device=launcher.device, dtype=torch.int64)
         self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
         self._grips: Grips | None = None
@@ -99,6 +105,17 @@ class SurfaceTerm(Term):
         n = self._vertices
         fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (n, 3))
         return {STIFFNESS.name: (1,), FRICTION.name: (1,), "surface_slip": (1,), **fields}
+
+    def _expand(self, field: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns a field (B, N, 3) with its values at vertices of the surface that depend on others."""
+        if self._whole is None:
+            return field
+        out = torch.zeros_like(field) if out is None else out
+        (s,), own = self.sets, self.launcher
+        vertices = warp_view(self._list.vertices.to(torch.int32), wp.int32)
+        inputs = [vertices, s.nodes, s.gradients, warp_view(field.contiguous(), wp.vec3d)]
+        own.launch(own.record(kernels.place, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
+        return out
 
     @override
     def set_step(self, values: Values) -> None:
@@ -136,6 +153,7 @@ class SurfaceTerm(Term):
         ours = self._list
         if torch.equal(origin, end):
             return
+        origin, end = self._expand(origin), self._expand(end)
         if not (ours.covers(origin) and ours.covers(end)):
             ours.find(origin, end - origin)
         if ours.count:
@@ -144,13 +162,12 @@ class SurfaceTerm(Term):
 
     def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
         """Returns launches of forces and energies at positions."""
-        if not self._bounded:  # by `bounds`, whose list holds all pairs up to the next step
-            x = wp.to_torch(positions)
-            if not self._list.covers(x):
-                self._list.find(x, torch.zeros_like(x))
+        x = self._expand(wp.to_torch(positions), self._whole)
+        if not (self._bounded or self._list.covers(x)):  # By `bounds`, a list holds all pairs up to the next step.
+            self._list.find(x, torch.zeros_like(x))
         now = (self._list.version, self._steps)
         if active.ptr not in self._recorded or self._recorded[active.ptr][0] != now:
-            self._recorded[active.ptr] = now, self._record(values, positions, active)
+            self._recorded[active.ptr] = now, self._record(values, warp_view(x, wp.vec3d), active)
         return self._recorded[active.ptr][1]
 
     def _record(self, values: Values, positions: Any, active: Any) -> list[Any]:
@@ -194,6 +211,7 @@ class SurfaceTerm(Term):
     @override
     def pair_tangents(self, values: Values, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
         own, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
+        positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
             stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
@@ -224,14 +242,15 @@ class SurfaceTerm(Term):
     def _bounding(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns the launch that bounds a way, after a search for pairs along it, and limits its length."""
         own, ours, self._bounded = self.launcher, self._list, True
-        start, end, part = wp.to_torch(origin), wp.to_torch(positions), wp.to_torch(share)
+        start, end, part = self._expand(wp.to_torch(origin)), self._expand(wp.to_torch(positions)), wp.to_torch(share)
         ways = ((end - start) * own.active[:, None, None]).nan_to_num(0.0)
         start = torch.where(own.active.bool()[:, None, None], start, end)
         part.copy_(torch.minimum(part, ours.longest_way / ours.lengths(ways).amax(1).clamp_min(_TINY)))
         way = part[:, None, None] * ways
         if not (ours.covers(start) and ours.covers(start + way)):
             ours.find(start, way)
-        return [self._bound(origin, positions, share)] if ours.count else []
+        self._ends = start, end  # keeps their memory
+        return [self._bound(*(warp_view(x, wp.vec3d) for x in self._ends), share)] if ours.count else []
 
     def _bound(self, origin: Any, positions: Any, share: Any) -> Any:
         inputs = [warp_view(self.launcher.active, wp.int32), self._list.pairs, origin, positions]
@@ -325,9 +344,10 @@ class SurfaceTerm(Term):
         names = ("surface_start", "surface_reference", STIFFNESS.name, FRICTION.name)
 
         def differentiate() -> dict[str, torch.Tensor]:
-            chosen = self._near_at(values, positions)
+            x, ways = self._expand(positions), self._expand(direction)
+            chosen = self._near_at(values, x)
             environment, nodes = self._list.environment[chosen], self._list.nodes[chosen]
-            work = (self._pair_force[chosen] * direction[environment[:, None], nodes]).sum((1, 2))
+            work = (self._pair_force[chosen] * ways[environment[:, None], nodes]).sum((1, 2))
             by_stiffness = own.zeros(1).index_add_(0, environment, -work[:, None]) / value_of(values, STIFFNESS.name)
             start, reference, stiffness, friction = given = [
                 value_of(values, name).detach().requires_grad_() for name in names
@@ -335,9 +355,9 @@ class SurfaceTerm(Term):
             slopes = tuple(torch.zeros_like(value) for value in given)
             with torch.enable_grad():
                 if (slides := self.sliding(values, start, stiffness)) is not None:
-                    force = slides.force(positions, reference, friction, value_of(values, "surface_slip"))
-                    ways = direction[slides.environment[:, None], slides.nodes]
-                    work = (slides.weights[..., None] * ways * force[:, None]).sum()
+                    force = slides.force(x, reference, friction, value_of(values, "surface_slip"))
+                    along = ways[slides.environment[:, None], slides.nodes]
+                    work = (slides.weights[..., None] * along * force[:, None]).sum()
                     slopes = torch.autograd.grad(work, given)
             out = dict(zip(names, slopes, strict=True))
             return out | {STIFFNESS.name: out[STIFFNESS.name] + by_stiffness}

@@ -27,6 +27,7 @@ import torch
 from typing_extensions import override
 
 from ..fem.elements import Points
+from ..fem.scene import Scene
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
@@ -116,10 +117,11 @@ class BoundSurfaceContact(BoundEnergy):
         super().__init__(contact, site)
         self._contact = contact
         body, rest = site.body, site.rest_positions
-        if len(body.coordinates.dependent) or len(body.coordinates.sliding):
+        members = body.bodies.values() if isinstance(body, Scene) else (body,)
+        if any(member.glued or member.symmetry for member in members):
             raise InputError(
-                "contact between surfaces moves every vertex on its own: leave out symmetry planes, glue and rigid "
-                "parts; a rigid thing can be an obstacle, or a body of a stiff material."
+                "contact between surfaces counts the whole surface of a mesh as free: leave out symmetry planes and "
+                "glue."
             )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)

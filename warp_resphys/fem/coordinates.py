@@ -170,6 +170,16 @@ class Coordinates:
         return Points(nodes, operators)
 
 
+def weighted_sum(weights: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
+    """Returns sums (B, S, ...) of fields (B, S or 1, w, ...) with weights (S, w).
+
+    Their order is fixed, so that every environment is bit for bit what it is in another batch.
+    """
+    columns = weights.view(*weights.shape, *[1] * (fields.ndim - 3)).unbind(1)
+    first, *others = (w * f for w, f in zip(columns, fields.unbind(2), strict=True))
+    return sum(others, first)
+
+
 class DeviceCoordinates:
     """`Coordinates` with the device and dtype of a tensor.
 
@@ -177,36 +187,32 @@ class DeviceCoordinates:
         dependent: (S,) vertices determined by control vertices.
         sliding: (R,) control vertices in symmetry planes.
         projections: (R, 3, 3) projections onto the directions along these planes.
+        controls: (S, w) control vertices of the dependent ones, in any order.
+        weights: (S, w) their weights, zero in places that a vertex does not need.
         depends: whether there are dependent vertices.
         slides: whether there are sliding vertices.
     """
 
     def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
         self.dependent = torch.as_tensor(coordinates.dependent, device=like.device)
-        matrix = coordinates.weights.tocoo()
-        indices = torch.as_tensor(np.stack([matrix.row, matrix.col]).astype(np.int64))
-        values = torch.as_tensor(matrix.data)
-        weights = torch.sparse_coo_tensor(indices, values, matrix.shape, check_invariants=False)
-        self._weights = weights.to(device=like.device, dtype=like.dtype).coalesce()  # (S, N)
-        self._transposed = self._weights.mT.coalesce()
+        points = coordinates.points if coordinates else Points(np.zeros((0, 1), np.int64), np.zeros((0, 1, 1, 1)))
+        self.controls = torch.as_tensor(points.nodes, device=like.device)
+        self.weights = torch.as_tensor(points.gradients[:, 0, :, 0]).to(like)
+        used = self.weights.ravel().nonzero().ravel()
+        self._by_control = used[self.controls.ravel()[used].argsort(stable=True)]  # entries of `weights`
+        control = self.controls.ravel()[self._by_control]
+        self._moved, self._counts = control.unique_consecutive(return_counts=True)
         self.depends, self.slides = len(coordinates.dependent) > 0, len(coordinates.sliding) > 0
         self.sliding = torch.as_tensor(coordinates.sliding, device=like.device)
         self.projections, self._offsets = (
             torch.as_tensor(values).to(like) for values in (coordinates.projections, coordinates.offsets)
         )
 
-    def _times(self, matrix: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
-        """Returns a sparse matrix (r, n) times (B, n, ...)."""
-        columns = fields.movedim(1, 0).reshape(fields.shape[1], -1)
-        rest = (fields.shape[0], *fields.shape[2:])
-        return torch.sparse.mm(matrix, columns).reshape(matrix.shape[0], *rest).movedim(0, 1)
-
     def expand(self, r: torch.Tensor) -> torch.Tensor:
         """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
         if not self.depends:
             return r
-        kept = r.index_fill(1, self.dependent, 0.0)
-        return r.index_copy(1, self.dependent, self._times(self._weights, kept))
+        return r.index_copy(1, self.dependent, weighted_sum(self.weights, r[:, self.controls]))
 
     def hold(self, r: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P r + o."""
@@ -225,8 +231,12 @@ class DeviceCoordinates:
         """Returns P W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
         if not self.depends:
             return self.restrict(forces)
-        on_controls = self._times(self._transposed, forces.index_select(1, self.dependent))
-        return self.restrict(forces.index_fill(1, self.dependent, 0.0) + on_controls)
+        vertex, weights = self.dependent[self._by_control // self.controls.shape[1]], self.weights.ravel()
+        rows = forces.index_select(1, vertex).movedim(1, 0).flatten(1) * weights[self._by_control, None]
+        sums = torch.segment_reduce(rows, "sum", lengths=self._counts, axis=0, unsafe=True)
+        sums = sums.view(-1, forces.shape[0], *forces.shape[2:]).movedim(0, 1)
+        kept = forces.index_fill(1, self.dependent, 0.0)
+        return self.restrict(kept.index_copy(1, self._moved, kept.index_select(1, self._moved) + sums))
 
 
 def control_vertices(

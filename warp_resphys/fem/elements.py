@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from ..io.errors import InputError
 from ..mesh.elements import Array
@@ -38,6 +39,10 @@ class Points:
     def n_points(self) -> int:
         """Number of points P = C Q."""
         return self.gradients.shape[0] * self.gradients.shape[1]
+
+    def shifted(self, first: int) -> Self:
+        """Returns the points with numbers of vertices that begin at `first`."""
+        return replace(self, nodes=self.nodes + first)
 
 
 @dataclass(frozen=True)

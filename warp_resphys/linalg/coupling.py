@@ -31,6 +31,50 @@ class Coupling:
         yield from zip(*(x.split(size) for x in (self.environments, self.unknowns, self.matrices)), strict=True)
 
 
+class VertexCouplings:
+    """Turns couplings of vertices, some of which are weighted sums of free ones, into those of the free ones.
+
+    Args:
+        columns: (V, w) free vertices that determine every vertex; -1 in places that it does not need.
+        weights: (V, w) their weights.
+    """
+
+    def __init__(self, columns: torch.Tensor, weights: torch.Tensor) -> None:
+        self._columns, self._weights = columns, weights
+        self._count = int(columns.max()) + 1
+
+    def reduced(self, environments: torch.Tensor, vertices: torch.Tensor, matrices: torch.Tensor) -> Iterator[Coupling]:
+        """Yields the couplings of free vertices.
+
+        Args:
+            environments: (G,) environments.
+            vertices: (G, s) their vertices; -1 in places that an environment does not need.
+            matrices: (G, 3 s, 3 s) symmetric matrices of the coordinates of these.
+        """
+        for own, chosen, k in Coupling(environments, vertices, matrices).parts():
+            columns = torch.where(chosen[..., None] < 0, -1, self._columns[chosen])  # (G, s, w)
+            row = torch.arange(len(own), device=own.device)[:, None, None].expand_as(columns)
+            used = columns >= 0
+            keys, local = (row * self._count + columns)[used].unique(return_inverse=True)
+            if not len(keys):
+                continue
+            counts, at = numbered(keys // self._count, len(own))
+            unknowns = torch.full((len(own), int(counts.max())), -1, device=own.device)
+            unknowns[keys // self._count, at] = keys % self._count
+            weights = k.new_zeros(*chosen.shape, unknowns.shape[1])
+            vertex = torch.arange(chosen.shape[1], device=own.device)[:, None].expand_as(columns)[used]
+            weights[row[used], vertex, at[local]] = self._weights[chosen][used].to(k)
+            whole = k.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))
+            reduced = torch.einsum("gsi,gsxty,gtj->gixjy", weights, whole, weights)
+            yield Coupling(own, coordinates(unknowns), reduced.flatten(3, 4).flatten(1, 2))
+
+
+def coordinates(vertices: torch.Tensor) -> torch.Tensor:
+    """Returns the unknowns (G, 3 s) of vertices (G, s); -1 for negative ones."""
+    unknowns = 3 * vertices[..., None] + torch.arange(3, device=vertices.device)
+    return torch.where(vertices[..., None] < 0, -1, unknowns).flatten(1)
+
+
 class CouplingSolver:
     """Solves (A + E K E^T) x = r with a factor of A (Woodbury), where E selects the unknowns of a coupling.
 

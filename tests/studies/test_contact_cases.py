@@ -12,7 +12,7 @@ from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.mesh.mesh import check_mesh
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.studies import contact_cases
-from warp_resphys.studies.contact_cases import card_drop, card_friction, card_house, cases, check_case, run_case
+from warp_resphys.studies.contact_cases import CardHouse, card_drop, cases, check_case, run_case
 
 CPU = torch.device("cpu")
 CASES = cases()
@@ -91,11 +91,22 @@ def test_meshes_are_whole():
 @pytest.mark.parametrize("degrees", [15.0, 35.0])
 def test_the_friction_of_cards_balances_moments(degrees):
     """About the edge on which a card stands, with its weight in its middle and the other card's force at its top."""
-    angle = math.radians(degrees)
-    scene = card_house(angle, 0.3)
-    x = scene.vertices[scene.vertex_slice("left")]
+    house = CardHouse(math.radians(degrees), 1)
+    scene = house.scene(0.3)
+    x = scene.vertices[scene.vertex_slice("card0")]
     foot, top, middle = x[x[:, 2].argmin()], x[x[:, 0].argmax()], x.mean(0)
     assert top[0] < 0.0  # The other card begins at the plane x = 0.
     need = (middle[0] - foot[0]) / (top[2] - foot[2])
-    assert card_friction(angle) == pytest.approx(need, rel=1e-9)
-    assert card_drop(angle, 1.05 * need, CPU) < 1e-3 < 1e-2 < card_drop(angle, 0.95 * need, CPU)
+    assert house.least_friction == pytest.approx(need, abs=1e-5)
+    stands, falls = (card_drop(house.scene(share * need), CPU) for share in (1.05, 0.95))
+    assert stands < 1e-3 < 1e-2 < falls
+
+
+def test_a_second_storey_needs_more_friction():
+    """The lower storey carries the upper one: it stands with 5 % more friction than statics asks, and falls with less."""
+    one, two = (CardHouse(math.radians(25.0), storeys) for storeys in (1, 2))
+    assert len(two.cards) == 7
+    need = two.least_friction
+    assert need > 1.2 * one.least_friction
+    stands, falls = (card_drop(two.scene(share * need), CPU) for share in (1.05, 0.95))
+    assert stands < 1e-3 < 1e-2 < falls

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 import warp as wp
-from typing_extensions import Self, override
+from typing_extensions import override
 
 from ..fem.elements import Points
 from ..io.errors import InputError

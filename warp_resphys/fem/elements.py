@@ -6,12 +6,11 @@ energy. Gauss points, element centres and averages over vertex patches all have 
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
-from typing_extensions import Self
 
 from ..io.errors import InputError
 from ..mesh.elements import Array

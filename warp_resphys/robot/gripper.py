@@ -17,6 +17,7 @@ from ..experiment.build import build_body
 from ..experiment.laboratory import make_setup
 from ..experiment.target import target_settings
 from ..fem.body import Body
+from ..fem.rigid import Rigid
 from ..io.settings import NotNegative, Positive, Settings, parse, setting
 from ..io.stages import finished_record
 from ..mesh.mesh import Mesh, box_hexahedra
@@ -30,6 +31,7 @@ from .robot_scene import RobotScene
 FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
 THING: Final = "thing"
 _LABORATORY: Final = "laboratory"
+_STIFFNESS: Final = 1e7  # of the thing [Pa]
 Thing = Literal["ball", "cylinder", "box"]
 
 
@@ -115,10 +117,11 @@ def thing_mesh(thing: Thing, radius: float, divisions: int, nodes: int = 8) -> M
 
 
 def _thing(settings: GripperSettings, thing: Thing, height: float, nodes: int) -> tuple[Body, Corotated]:
-    """A hard thing on a table at a height [m], and its material."""
+    """A rigid thing on a table at a height [m], and a material without cells."""
     mesh, radius = thing_mesh(thing, 0.5 * settings.size, 2, nodes), 0.5 * settings.size
-    mesh = replace(mesh, vertices=mesh.vertices + [0.0, 0.0, height + radius + 0.9 * settings.distance])
+    places = mesh.vertices + [0.0, 0.0, height + radius + 0.9 * settings.distance]
+    mesh = replace(mesh, vertices=places, regions={THING: np.arange(len(mesh.cells))})
     below = {"table": HalfSpace(position=(0.0, 0.0, height))}
     table = Contact(below, settings.stiffness, settings.friction, settings.distance, settings.slip_speed)
     density = settings.mass / float(Body(mesh).discretisation.element_volumes.sum())
-    return Body(mesh, energies=[table]), Corotated(density=density, youngs_modulus=5e6, poissons_ratio=0.3)
+    return Body(mesh, energies=[table], rigid={THING: Rigid(density, _STIFFNESS)}), Corotated()

@@ -6,7 +6,7 @@ mat                 both ends of a mat are turned against one another until it t
 rollers             two turning cylinders draw a soft block between them
 funnel              a soft ball is forced through a funnel narrower than itself
 clip                the ends of a U are pressed on one another
-cards               two cards that lean on one another stand with more friction than statics asks, and fall with less
+cards               houses of cards stand with more friction than statics asks, and fall with less
 ==================  ==================================================================================================
 
 A case passes if in no step an edge passes through a triangle, every solve converges, and surfaces come within reach.
@@ -43,7 +43,7 @@ from ..mesh.rod import rod
 from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .device_check import Check
-from .surface_check import SOFT, STONE, G
+from .surface_check import MARGIN, SOFT, STONE, G, Touch, built, least_friction, rigid
 
 FloatArray = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ _RUBBER: Final = StableNeoHookean(youngs_modulus=1e5, poissons_ratio=0.4, densit
 _QUICK: Final = ("spikes", "wedge in crack", "cliff edges", "funnel", "clip")
 _LENGTH, _THICKNESS, _WIDTH = 0.2, 0.01, 0.1  # of a card [m]
 _CARD_GAP: Final = 2e-4  # at which contact of cards begins [m]
-_MARGIN: Final = 0.05  # of the friction of cards, either way
+_CARD_REST: Final = 0.97 * _CARD_GAP  # between them at the start
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 
 
@@ -338,44 +338,92 @@ def clip() -> Case:
     return Case(body, contact, distance, 40, 0.004, SOFT, (0.0, 0.0, 0.0), force=force)
 
 
-def card_friction(angle: float) -> float:
-    """Coefficient of friction below which two cards slide apart that lean on one another at an angle to the vertical.
+@dataclass
+class CardHouse:
+    """Storeys of pairs of rigid cards that lean on one another, with a flat card on every storey but the last.
 
-    A card of length L and thickness t touches the floor and its neighbour with the lower and the upper edge of the same
-    face. About the lower one, its weight W has the lever arm (L sin a - t cos a) / 2, and the horizontal force of the
-    neighbour L cos a; so that force, which friction at the floor balances, is W (tan a - t / L) / 2.
+    A leaning card of length L and thickness t touches floor and neighbour with the edges of one of its faces.
+
+    Args:
+        angle: of the leaning cards to the vertical [rad].
+        storeys: number of storeys; each has one pair fewer than that below.
     """
-    return 0.5 * (math.tan(angle) - _THICKNESS / _LENGTH)
 
+    angle: float
+    storeys: int
+    cards: list[FloatArray] = field(default_factory=list)  # corners (4, 2) [m], lower left first, counter-clockwise
+    touches: list[Touch] = field(default_factory=list)  # places where they push one another
 
-def card_house(angle: float, friction: float) -> Scene:
-    """Returns two cards that lean on one another on a floor, at an angle to the vertical, and almost touch."""
-    kappa, gap = 1e6, 0.97 * _CARD_GAP
-    floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -gap))}, kappa, friction, _CARD_GAP)
-    card = placed(box_hexahedra((_THICKNESS, _WIDTH, _LENGTH), (1, 4, 8)), (-_THICKNESS, -0.5 * _WIDTH, 0.0))
-    left = placed(card, (-_LENGTH * math.sin(angle) - 0.5 * gap, 0.0, 0.0), (0.0, angle, 0.0))
-    meshes = {"left": left, "right": placed(left, turn=(0.0, 0.0, math.pi))}
-    bodies = {name: Body(mesh, energies=[floor]) for name, mesh in meshes.items()}
-    return Scene(bodies, SurfaceContact(kappa, friction, _CARD_GAP))
+    def __post_init__(self) -> None:
+        """Puts up the storeys."""
+        sine, cosine = math.sin(self.angle), math.cos(self.angle)
+        along, thick = _LENGTH * np.array([sine, cosine]), _THICKNESS * np.array([-cosine, sine])
+        foot = np.array([-0.5 * _CARD_REST - along[0], 0.0])
+        left = np.array([foot + thick, foot, foot + along, foot + along + thick])
+        right = left[[1, 0, 3, 2]] * [-1.0, 1.0]
+        pitch, up = 2.0 * (along[0] - thick[0]) + _THICKNESS, np.array([0.0, 1.0])
+        floor, below = 0.0, None  # height, and the flat card, of a storey
+        for storey in range(self.storeys):
+            tops = list[tuple[int, FloatArray]]()
+            for k in range(self.storeys - storey):
+                place = np.array([pitch * (k + 0.5 * storey), floor])
+                a, b = (self._put(corners + place) for corners in (left, right))
+                for card, at in ((a, left[1] + place), (b, right[0] + place)):
+                    self._touch(card, at, up, below)
+                self._touch(a, left[2] + place, np.array([-1.0, 0.0]), b)
+                tops += [(a, left[3] + place), (b, right[2] + place)]
+            floor += left[3, 1] + _CARD_REST
+            if storey + 1 < self.storeys:
+                ends = np.array([tops[0][1][0] - _THICKNESS, tops[-1][1][0] + _THICKNESS])
+                x, z = ends[[0, 1, 1, 0]], floor + _THICKNESS * np.array([0.0, 0.0, 1.0, 1.0])
+                below = self._put(np.stack([x, z], 1))
+                for other, at in tops:
+                    self._touch(below, at, up, other)
+                floor += _THICKNESS + _CARD_REST
+
+    def _put(self, corners: FloatArray) -> int:
+        """Adds a card, and returns its number."""
+        self.cards.append(corners)
+        return len(self.cards) - 1
+
+    def _touch(self, card: int, at: FloatArray, normal: FloatArray, other: int | None) -> None:
+        own, by = (at - self.cards[card].mean(0), None if other is None else (other, at - self.cards[other].mean(0)))
+        self.touches.append(Touch(own, normal, card, by))
+
+    @property
+    def least_friction(self) -> float:
+        """Coefficient of friction below which no forces carry the cards."""
+        sizes = [float(np.linalg.norm(card[1] - card[0]) * np.linalg.norm(card[3] - card[0])) for card in self.cards]
+        return least_friction(sizes, self.touches)
+
+    def scene(self, friction: float) -> Scene:
+        """Returns the cards on a floor, which almost touch."""
+        kappa, bodies = 1e6, dict[str, Body]()
+        floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -_CARD_REST))}, kappa, friction, _CARD_GAP)
+        for k, corners in enumerate(self.cards):
+            brick = box_hexahedra((1.0, _WIDTH, 1.0), (1, 1, 1))
+            u, y, v = brick.vertices.T
+            x, z = (corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])).T
+            bodies[f"card{k}"] = rigid(replace(brick, vertices=np.stack([x, y, z], 1)), floor)
+        return Scene(bodies, SurfaceContact(kappa, friction, _CARD_GAP))
 
 
 def card_checks(quick: bool, device: torch.device) -> Iterator[Check]:
-    """Two cards that were leant on one another: the way by which their upper ends sink in half a second."""
-    for degrees in (25.0,) if quick else (15.0, 25.0, 35.0):
-        angle = math.radians(degrees)
-        need = card_friction(angle)
-        for mu, stands in ((need * (1.0 + _MARGIN), True), (need * (1.0 - _MARGIN), False)):
-            way = card_drop(angle, mu, device)
-            title = f"at {degrees:g} degrees, mu {mu:.3f} for {need:.3f}: by how much they sink"
+    """Houses of cards that were put up: the way by which their upper edges sink in half a second."""
+    for degrees, storeys in ((25.0, 2),) if quick else ((15.0, 1), (25.0, 1), (35.0, 1), (25.0, 2)):
+        house = CardHouse(math.radians(degrees), storeys)
+        need = house.least_friction
+        for mu, stands in ((need * (1.0 + MARGIN), True), (need * (1.0 - MARGIN), False)):
+            way = card_drop(house.scene(mu), device)
+            title = (
+                f"{len(house.cards)} cards at {degrees:g} degrees, mu {mu:.3f} for {need:.3f}: by how much they sink"
+            )
             expected = "< 1 mm: they stand" if stands else "> 10 mm: they fall"
             yield Check(title, f"{1e3 * way:.1f} mm", expected, way < 1e-3 if stands else way > 1e-2)
 
 
-def card_drop(angle: float, friction: float, device: torch.device) -> float:
-    """Returns by how much the upper ends of two cards sink in half a second [m]."""
-    scene = card_house(angle, friction)
-    s = Simulator(scene, STONE, 0.01, (0.0, 0.0, -G), solver=SolverSettings(relative_tolerance=1e-6), device=device)
+def card_drop(scene: Scene, device: torch.device) -> float:
+    """Returns by how much the upper edges of a house of cards sink in half a second [m]."""
     top = scene.vertices[:, 2] > scene.vertices[:, 2].max() - 1e-6
-    with torch.no_grad():
-        z = s.rollout(s.rest_state(), 50).q[:, 0, top, 2].mean(1)
+    z = built(scene, device).q[:, 0, top, 2].mean(1)
     return float(z[0] - z[-1])

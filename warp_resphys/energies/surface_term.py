@@ -157,8 +157,7 @@ class SurfaceTerm(Term):
         if not (ours.covers(origin) and ours.covers(end)):
             ours.find(origin, end - origin)
         if ours.count:
-            ends = (warp_view(origin, wp.vec3d), warp_view(end, wp.vec3d))
-            self.launcher.launch(self._bound(*ends, warp_view(share, wp.float64)))
+            self.launcher.launch(self._bound(origin, end, warp_view(share, wp.float64)))
 
     def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
         """Returns launches of forces and energies at positions."""
@@ -250,10 +249,12 @@ class SurfaceTerm(Term):
         if not (ours.covers(start) and ours.covers(start + way)):
             ours.find(start, way)
         self._ends = start, end  # keeps their memory
-        return [self._bound(*(warp_view(x, wp.vec3d) for x in self._ends), share)] if ours.count else []
+        return [self._bound(start, end, share)] if ours.count else []
 
-    def _bound(self, origin: Any, positions: Any, share: Any) -> Any:
-        inputs = [warp_view(self.launcher.active, wp.int32), self._list.pairs, origin, positions]
+    def _bound(self, start: torch.Tensor, end: torch.Tensor, share: Any) -> Any:
+        """Returns the launch that bounds the way between positions (B, N, 3)."""
+        ends = (warp_view(x.contiguous(), wp.vec3d) for x in (start, end))
+        inputs = [warp_view(self.launcher.active, wp.int32), self._list.pairs, *ends]
         return self.launcher.record(kernels.bound, (self._list.count,), inputs, [share])
 
     @override

@@ -415,9 +415,7 @@ def card_checks(quick: bool, device: torch.device) -> Iterator[Check]:
         need = house.least_friction
         for mu, stands in ((need * (1.0 + MARGIN), True), (need * (1.0 - MARGIN), False)):
             way = card_drop(house.scene(mu), device)
-            title = (
-                f"{len(house.cards)} cards at {degrees:g} degrees, mu {mu:.3f} for {need:.3f}: by how much they sink"
-            )
+            title = f"{len(house.cards)} cards, {degrees:g} degrees, mu {mu:.3f} for {need:.3f}: by how much they sink"
             expected = "< 1 mm: they stand" if stands else "> 10 mm: they fall"
             yield Check(title, f"{1e3 * way:.1f} mm", expected, way < 1e-3 if stands else way > 1e-2)
 

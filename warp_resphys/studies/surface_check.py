@@ -45,7 +45,8 @@ FloatArray = NDArray[np.float64]
 G: Final = 9.81
 SIDE: Final = 0.02  # of a cube [m]
 SOFT: Final = Corotated(youngs_modulus=264e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
-STONE: Final = Corotated(youngs_modulus=2e7, poissons_ratio=0.2, density=2000.0, stiffness_damping=1e-3)
+DENSITY: Final = 2000.0  # of stones and cards [kg/m^3]
+STONE: Final = Corotated(youngs_modulus=2e7, poissons_ratio=0.2, density=DENSITY, stiffness_damping=1e-3)
 RADIUS, THICKNESS, WIDTH = 0.5, 0.12, 0.1  # of an arch [m]
 MARGIN: Final = 0.05  # of the friction of arches and cards, either way
 _THROWN: Final = tuple(itertools.product((1e-3, 1e-4), (torch.float64, torch.float32)))  # D [m] and dtype
@@ -175,7 +176,7 @@ def built(scene: Scene, device: torch.device) -> Trajectory:
 def rigid(mesh: Mesh, *energies: BodyEnergy) -> Body:
     """Returns a rigid body."""
     whole = replace(mesh, regions={"whole": np.arange(len(mesh.cells))})
-    return Body(whole, rigid={"whole": Rigid(float(STONE.density))}, energies=energies)
+    return Body(whole, rigid={"whole": Rigid(DENSITY)}, energies=energies)
 
 
 def arch(stones: int, friction: float) -> Scene:

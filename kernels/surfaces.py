@@ -440,6 +440,7 @@ class FrictionPairs:
     weights: wp.array[wp.vec4d]  # at the start of the step, as the other two
     normal: wp.array[wp.vec3d]
     load: wp.array[wp.float64]  # normal force [N]
+    regions: wp.array[int]  # number of their coefficient
 
 
 @wp.func
@@ -456,7 +457,7 @@ def grip_slide(
 def grip_forces(
     active: wp.array[int],
     grips: FrictionPairs,
-    coefficient: wp.array2d[wp.float64],  # (B, 1) mu
+    coefficient: wp.array2d[wp.float64],  # (B, F) mu, by regions
     slip: wp.array2d[wp.float64],  # (B, 1) slide at which friction is fully developed [m]
     reference: wp.array2d[wp.vec3d],  # (B, N) positions without slide [m]
     positions: wp.array2d[wp.vec3d],
@@ -469,7 +470,7 @@ def grip_forces(
     if active[b] == 0:
         return
     u = grip_slide(grips, g, positions, reference)
-    v, most = smoothed(wp.length(u), slip[b, 0]), coefficient[b, 0] * grips.load[g]
+    v, most = smoothed(wp.length(u), slip[b, 0]), coefficient[b, grips.regions[g]] * grips.load[g]
     force_out[g] = (most * v[1]) * wp.outer(grips.weights[g], u)
     energy_out[g] = most * v[0]
 
@@ -487,7 +488,7 @@ def grip_tangents(
     g = wp.tid()
     b, w = grips.environment[g], grips.weights[g]
     u = grip_slide(grips, g, positions, reference)
-    block = (coefficient[b, 0] * grips.load[g]) * slide_tangent(grips.normal[g], u, slip[b, 0])
+    block = (coefficient[b, grips.regions[g]] * grips.load[g]) * slide_tangent(grips.normal[g], u, slip[b, 0])
     for i in range(4):
         for j in range(4):
             add_block(out, g, i, j, w[i] * w[j] * block)

@@ -37,6 +37,7 @@ from .energies.obstacles import Sphere as Sphere
 from .energies.pointwise import PointwiseEnergy as PointwiseEnergy
 from .energies.pressure import Pressure as Pressure
 from .energies.strings import Strings as Strings
+from .energies.surfaces import FrictionPair as FrictionPair
 from .energies.surfaces import SurfaceContact as SurfaceContact
 from .energies.tendons import Tendons as Tendons
 from .fem.body import Body as Body

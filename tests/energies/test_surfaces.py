@@ -12,6 +12,7 @@ from warp_resphys import (
     Body,
     Contact,
     Corotated,
+    FrictionPair,
     HalfSpace,
     Inputs,
     Mesh,
@@ -30,6 +31,7 @@ from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
+from warp_resphys.mesh.mesh import select_cells
 from warp_resphys.robot.gripper import thing_mesh
 
 CPU = torch.device("cpu")
@@ -386,6 +388,39 @@ def test_friction_sticks_and_slides_on_a_slope():
     slides = G * (math.sin(math.radians(29.0)) - 0.5 * math.cos(math.radians(29.0)))
     assert abs(moved[24.0]) < 2e-4  # creep below the slip speed of 1 mm/s
     assert moved[29.0] == pytest.approx(0.5 * slides * (0.2**2 - 0.1**2), rel=0.1)
+
+
+def test_regions_have_their_own_friction():
+    """Of two cubes on a slope, one slides, and the other one stands on a rough part of the plate."""
+    plate = box_hexahedra((0.12, 0.06, 0.01), (12, 6, 1))
+    rough = select_cells(plate, y=(0.03, 0.06))
+    plate = replace(plate, regions={"rough": rough})
+    bodies = {"plate": Body(plate, fixed=select_vertices(plate, z=0.0))}
+    for name, y in (("a", 0.007), ("b", 0.0385)):
+        cube = box_hexahedra((0.015,) * 3, (2, 2, 2))
+        bodies[name] = Body(replace(cube, vertices=cube.vertices + [0.01, y, 0.0109]))
+    pairs = {"pad": FrictionPair("b", "plate_rough", 0.6)}
+    contact = SurfaceContact(2e4, 0.2, pairs=pairs)
+    slope = math.radians(25.0)
+    options = {"gravity": (G * math.sin(slope), 0.0, -G * math.cos(slope)), "solver": FINE}
+    simulator = Simulator(Scene(bodies, contact), replace(SOFT, stiffness_damping=2e-3), 0.005, **options)
+    a, b = (simulator.body.vertex_slice(name) for name in "ab")
+    with torch.no_grad():
+        half = simulator.rollout(simulator.rest_state(), 20)
+        path = simulator.rollout(half.final, 20)
+    gain = (path.v[-1, 0, a, 0] - path.v[0, 0, a, 0]).mean()
+    assert float(gain) == pytest.approx(20 * 0.005 * G * (math.sin(slope) - 0.2 * math.cos(slope)), rel=0.01)
+    assert float(path.v[-1, 0, b, 0].mean().abs()) < 1e-3
+    assert simulator.parts["surface_friction"] == ("other", "pad")
+    directional(
+        lambda given: simulator.rollout(half.final, 4, parameters=given).v[-1, 0, :, 0].sum(),
+        {"surface_friction": torch.tensor([[0.2, 0.6]], dtype=torch.float64)},
+        {"surface_friction": 1e-5},
+    )
+    with pytest.raises(InputError, match="the pair 'pad' of a contact"):
+        Simulator(Scene({"a": bodies["a"]}, contact))
+    with pytest.raises(InputError, match="surface_friction is -1"):
+        SurfaceContact(pairs={"pad": FrictionPair("a", "b", -1.0)})
 
 
 def test_momentum_is_conserved():

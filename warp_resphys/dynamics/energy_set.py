@@ -75,8 +75,10 @@ class EnergySet:
             self.parameters |= parameters
             self.inputs |= inputs
             self.constants |= item.named(energy.constants)
-            self.counts |= dict.fromkeys([*parameters, *inputs], energy.count)
-            self.parts |= dict.fromkeys(parameters, energy.names) if energy.names else {}
+            counts = {q.name: energy.count_of(q) for q in (*energy.parameters, *energy.inputs)}
+            self.counts |= item.named(counts)
+            shared = item.named({name: counts[name] != energy.count for name in counts})
+            self.parts |= {name: energy.names for name in parameters if energy.names and not shared[name]}
             self.memory |= item.named({m.name: replace(m, name=f"{item.prefix}{m.name}") for m in bound.memory})
         pairs = list(enumerate(self._pairs))
         self._loading, self._stepping, self._posing = (

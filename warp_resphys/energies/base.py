@@ -191,6 +191,11 @@ class Energy(ABC):
         """Number of parts (chambers, tendons), each with its own value of an input or a parameter."""
         return 1
 
+    def count_of(self, quantity: Quantity) -> int:
+        """Returns the number of values of a parameter or an input: `count`, or one that all parts share."""
+        del quantity
+        return self.count
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parts."""
@@ -235,19 +240,20 @@ class Energy(ABC):
         return {quantity.name: self.per_part(quantity, constants[quantity.name]) for quantity in self.parameters}
 
     def per_part(self, quantity: Quantity, values: torch.Tensor) -> torch.Tensor:
-        """Returns (1 or B, `count`) values of a parameter, or an array parameter (1 or B, *shape) unchanged.
+        """Returns (1 or B, `count_of`) values of a parameter, or an array parameter (1 or B, *shape) unchanged.
 
         Raises:
             InputError: another number of values.
         """
         if quantity.shape:
             return values
-        if values.shape[1] not in (1, self.count):
+        count = self.count_of(quantity)
+        if values.shape[1] not in (1, count):
             raise InputError(
-                f"{quantity.name} has {values.shape[1]} values for {self.count} {quantity.per}s: give one value, or "
-                f"one for each {quantity.per}."
+                f"{quantity.name} has {values.shape[1]} values for {count} {quantity.per or 'part'}s: give one value, "
+                f"or one for each {quantity.per or 'part'}."
             )
-        return values.expand(-1, self.count)
+        return values.expand(-1, count)
 
 
 class BoundEnergy:

@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..fem.elements import Points
@@ -18,7 +20,7 @@ from .launcher import HostLaunches, Launcher, warp_view
 from .pairs import PairList, Surface
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
-FRICTION = Quantity("surface_friction", "", 0.0, closed=True)
+FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="pair")
 _FEATURES = int(kernels.EDGE_FEATURES)
 _TINY = 1e-300  # keeps a division by a length defined
 
@@ -28,6 +30,7 @@ class SurfacePoints(Points):
     """Vertices of a surface."""
 
     surface: Surface
+    regions: NDArray[np.bool_]  # (F, 2, N) vertices of both regions of pairs of these
     first: int = 0  # number of the body's first vertex
 
     @override
@@ -38,6 +41,11 @@ class SurfacePoints(Points):
         """Returns the surface with the vertex numbers of a simulator of `count` vertices."""
         return self.surface.within(self.first, count)
 
+    def members(self, count: int) -> NDArray[np.bool_]:
+        """Returns the vertices (F, 2, `count`) of both regions of pairs, with the same numbers."""
+        after = count - self.first - self.regions.shape[2]
+        return np.pad(self.regions, [(0, 0), (0, 0), (self.first, after)])
+
 
 class Sliding(NamedTuple):
     """Friction of pairs at the start of a step, differentiable."""
@@ -47,6 +55,7 @@ class Sliding(NamedTuple):
     weights: torch.Tensor  # (G, 4) of the nearest points
     normal: torch.Tensor  # (G, 3)
     load: torch.Tensor  # (G,) normal force [N]
+    regions: torch.Tensor  # (G,) number of the coefficient
 
     def force(
         self, x: torch.Tensor, reference: torch.Tensor, friction: torch.Tensor, slip: torch.Tensor
@@ -56,14 +65,14 @@ class Sliding(NamedTuple):
         Args:
             x: (B, N, 3) positions [m].
             reference: (B, N, 3) positions without slide [m].
-            friction: (B, 1) coefficient.
+            friction: (B, F) coefficients.
             slip: (B, 1) slide at which friction is fully developed [m].
         """
         row = self.environment[:, None]
         way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
         u = way - (way * self.normal).sum(-1, keepdim=True) * self.normal
         _, factor = friction_over_slide(u, slip[self.environment, 0])
-        return -(friction[self.environment, 0] * self.load * factor)[:, None] * u
+        return -(friction[self.environment, self.regions] * self.load * factor)[:, None] * u
 
 
 class SurfaceTerm(Term):
@@ -85,6 +94,7 @@ class SurfaceTerm(Term):
         self._vertices, self._reach = s.n_vertices, reach
         self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
         self._whole = launcher.zeros(s.n_vertices, 3) if s.nodes_per_cell > 1 else None  # positions, if some depend
+        self._members = torch.as_tensor(s.source.members(s.n_vertices), device=launcher.device)
         self._none = torch.zeros(0, device=launcher.device, dtype=torch.int64)
         self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
         self._grips: Grips | None = None
@@ -104,7 +114,7 @@ class SurfaceTerm(Term):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         n = self._vertices
         fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (n, 3))
-        return {STIFFNESS.name: (1,), FRICTION.name: (1,), "surface_slip": (1,), **fields}
+        return {STIFFNESS.name: (1,), FRICTION.name: (1 + len(self._members),), "surface_slip": (1,), **fields}
 
     def _expand(self, field: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
         """Returns a field (B, N, 3) with its values at vertices of the surface that depend on others."""
@@ -305,8 +315,18 @@ class SurfaceTerm(Term):
         normal = n[:, 0]
         load = near.factor * stiffness[near.environment, 0] * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
         kept = load > 0.0
-        out = (near.environment, near.nodes, near.weights[:, 0], normal, load)
+        out = (near.environment, near.nodes, near.weights[:, 0], normal, load, self._regions(chosen))
         return Sliding(*(value[kept] for value in out)) if bool(kept.any()) else None
+
+    def _regions(self, chosen: torch.Tensor) -> torch.Tensor:
+        """Returns the number of the coefficient of friction of pairs: that of the first pair of regions they are in."""
+        nodes, out = self._list.nodes[chosen], torch.zeros_like(chosen)
+        first = torch.arange(4, device=nodes.device) <= self._list.kind[chosen, None]
+        for number, regions in reversed(list(enumerate(self._members, 1))):
+            a, b = (own[nodes] for own in regions)
+            matches = torch.where(first, a, b).all(1) | torch.where(first, b, a).all(1)
+            out = torch.where(matches, number, out)
+        return out
 
     def forces(self, values: Values, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Returns gaps (B, P) [m], normal forces and friction (B, P, 3) on the vertices [N], differentiable.
@@ -413,14 +433,16 @@ class Grips:
     ) -> "Grips":
         """Returns friction of pairs (G, ...) (`kernels.surfaces.FrictionPairs`)."""
         struct = kernels.FrictionPairs()
-        environment, nodes, weights, normal, load = sliding
-        kept = [environment.to(torch.int32), nodes.to(torch.int32), weights.contiguous(), normal.contiguous(), load]
+        environment, nodes, weights, normal, load, regions = sliding
+        kept = [*(x.to(torch.int32) for x in (environment, nodes)), *(x.contiguous() for x in (weights, normal, load))]
+        kept.append(regions.to(torch.int32))
         types = {
             "environment": wp.int32,
             "nodes": wp.vec4i,
             "weights": wp.vec4d,
             "normal": wp.vec3d,
             "load": wp.float64,
+            "regions": wp.int32,
         }
         for (name, kind), value in zip(types.items(), kept, strict=True):
             setattr(struct, name, warp_view(value, kind))

@@ -19,8 +19,8 @@ M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4)
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Final
+from dataclasses import dataclass, field
+from typing import ClassVar, Final, cast
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from typing_extensions import override
 
 from ..fem.elements import Points
 from ..fem.scene import Scene
-from ..io.errors import InputError
+from ..io.errors import InputError, MeshError
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet
@@ -40,10 +40,23 @@ _LEAST: Final = 1e-4  # share of D within which surfaces count as touching
 
 
 @dataclass(frozen=True)
+class FrictionPair:
+    """Friction between two regions of a mesh, or within one; in a scene, bodies are regions.
+
+    A vertex, an edge or a triangle is in a region if all of its vertices are.
+    """
+
+    first: str
+    second: str
+    friction: float  # mu
+
+
+@dataclass(frozen=True)
 class SurfaceContact(Energy):
     """Contact of a body with itself or, as `Scene.contact`, of all bodies with one another and with themselves.
 
-    Parameters are ``surface_stiffness`` [Pa] and ``surface_friction`` (equations in the module's docstring).
+    Parameters are ``surface_stiffness`` [Pa] and ``surface_friction`` (equations in the module's docstring), which has
+    one value, or where `pairs` are given that of all others and then theirs.
 
     Raises:
         InputError: a value out of range.
@@ -55,6 +68,7 @@ class SurfaceContact(Energy):
     friction: Parameter = 0.0  # mu
     distance: float = 1e-3  # D [m]
     slip_speed: float = 1e-3  # v_s [m/s]
+    pairs: Mapping[str, FrictionPair] = field(default_factory=dict)  # by name, the first one that fits
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -65,6 +79,24 @@ class SurfaceContact(Energy):
                 )
         STIFFNESS.check(self.stiffness)
         FRICTION.check(self.friction)
+        for pair in self.pairs.values():
+            FRICTION.check(pair.friction)
+        if self.pairs and not isinstance(self.friction, float | int):
+            raise InputError("contact of surfaces with pairs has one number as the friction of all others.")
+
+    @property
+    @override
+    def names(self) -> tuple[str, ...]:
+        return ("other", *self.pairs)
+
+    @property
+    @override
+    def count(self) -> int:
+        return 1 + len(self.pairs)
+
+    @override
+    def count_of(self, quantity: Quantity) -> int:
+        return self.count if quantity == FRICTION else 1
 
     @property
     @override
@@ -74,13 +106,22 @@ class SurfaceContact(Energy):
     @property
     @override
     def constants(self) -> Mapping[str, Parameter]:
-        return {STIFFNESS.name: self.stiffness, FRICTION.name: self.friction}
+        others = [float(pair.friction) for pair in self.pairs.values()]
+        friction = [cast(float, self.friction), *others] if others else self.friction
+        return {STIFFNESS.name: self.stiffness, FRICTION.name: friction}
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
         surface = Surface.of(mesh)
         vertices = surface.vertices
-        return (SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface),)
+        regions = np.zeros((len(self.pairs), 2, len(mesh.vertices)), dtype=np.bool_)
+        for row, (name, pair) in zip(regions, self.pairs.items(), strict=True):
+            for own, region in zip(row, (pair.first, pair.second), strict=True):
+                try:
+                    own[mesh.cells[mesh.region(region)]] = True
+                except MeshError as error:
+                    raise InputError(f"the pair {name!r} of a contact between surfaces: {error}") from None
+        return (SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface, regions),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "SurfaceTerm":

@@ -17,7 +17,7 @@ from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
-from ..energies.surfaces import SurfaceContact
+from ..energies.surfaces import FrictionPair, SurfaceContact
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -78,7 +78,8 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     if settings.obstacles:
         energies.append(build_contact(settings))
     if settings.self_contact is not None:
-        energies.append(SurfaceContact(**dict(settings.self_contact)))
+        pairs = {name: FrictionPair(**dict(pair)) for name, pair in settings.self_contact.pairs.items()}
+        energies.append(SurfaceContact(**dict(settings.self_contact) | {"pairs": pairs}))
     return energies
 
 

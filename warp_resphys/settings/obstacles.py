@@ -67,6 +67,14 @@ ObstacleSettings = Annotated[
 ]
 
 
+class FrictionPairSettings(Settings):
+    """Friction between two regions of the mesh, or within one, by `energies.surfaces.FrictionPair`."""
+
+    first: Word = setting(description="name of a region")
+    second: Word = setting(description="name of a region, which may be the same")
+    friction: NotNegative = setting(description="coefficient of friction")
+
+
 class SurfaceContactSettings(Settings):
     """Contact of the body with itself, and of its parts with one another, by `energies.surfaces`."""
 
@@ -74,6 +82,7 @@ class SurfaceContactSettings(Settings):
     friction: NotNegative = setting(0.0, "coefficient of friction")
     distance: Positive = setting(1.0e-3, "at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")
+    pairs: dict[str, FrictionPairSettings] = setting({}, "friction of pairs of regions, by name, the first that fits")
 
 
 class ContactSettings(Settings):

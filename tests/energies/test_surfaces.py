@@ -31,7 +31,7 @@ from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
-from warp_resphys.mesh.mesh import select_cells
+from warp_resphys.mesh.mesh import join, select_cells
 from warp_resphys.robot.gripper import thing_mesh
 
 CPU = torch.device("cpu")
@@ -656,6 +656,9 @@ def test_refusals():
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
     with pytest.raises(InputError, match="cross at rest"):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
+    with pytest.raises(InputError, match="is within another body: move"):
+        Simulator(Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
     with pytest.raises(InputError, match="mm from itself"):
         Simulator(Body(clip(), energies=[SurfaceContact(distance=0.02)]))
     with pytest.raises(InputError, match="distance of a contact between surfaces"):
@@ -667,6 +670,10 @@ def test_refusals():
     with pytest.raises(InputError, match="midpoint"):
         Simulator(Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
     simulator = landing()
+    smaller, cube = simulator.rest_positions.clone(), simulator.body.vertex_slice("cube")
+    smaller[cube] = 0.2 * (smaller[cube] - smaller[cube].mean(0)) + smaller.new_tensor([0.02, 0.02, 0.005])
+    with pytest.raises(InputError, match="is within another body at the start"):
+        simulator.step(simulator.state(smaller))
     crossing = simulator.rest_positions.clone()
     crossing[simulator.body.vertex_slice("cube"), 2] -= 0.008
     with pytest.raises(InputError, match="cross at the start of a step"):
@@ -689,3 +696,20 @@ def test_edges_in_line_take_few_iterations(name, shift):
     simulator = Simulator(scene, SOFT, time_step=0.01, solver=SolverSettings(name, relative_tolerance=1e-8))
     path = simulator.rollout(simulator.rest_state(), 5)
     assert max(int(report.iterations.max()) for report in path.reports) <= 4
+
+
+def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
+    """A shell with a ball in its hollow; the ball in the solid of a cube is seen, in its environment alone."""
+    shell = box_hexahedra((0.03, 0.03, 0.03), (3, 3, 3))
+    middle = np.abs(shell.vertices[shell.cells].mean(1) - 0.015).max(1) < 1e-3
+    hollow = Mesh(shell.vertices, shell.cells[~middle])
+    ball = replace(thing_mesh("ball", 0.002, 1), vertices=thing_mesh("ball", 0.002, 1).vertices + 0.015)
+    pairs = {}
+    for name, mesh in (("hollow", hollow), ("solid", shell)):
+        both = join({"outer": mesh, "ball": ball})
+        pairs[name] = PairList(Launcher(2, CPU), Surface.of(both), 1e-4), torch.tensor(both.vertices).repeat(2, 1, 1)
+        pairs[name][1][1, -8:] += 0.1
+    assert pairs["hollow"][0].enclosed(pairs["hollow"][1]).tolist() == [-1, -1]
+    inside = pairs["solid"][0].enclosed(pairs["solid"][1]).tolist()
+    assert inside[0] >= len(shell.vertices)
+    assert inside[1] == -1

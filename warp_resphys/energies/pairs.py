@@ -257,6 +257,25 @@ class PairList:
             own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
         return out
 
+    def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
+        """Returns a vertex (B,) of a piece that lies within another one, or -1; surfaces must not cross.
+
+        By the sum of the solid angles of triangles (van Oosterom and Strackee 1983).
+        """
+        out = torch.full((len(positions),), -1, device=positions.device)
+        pieces, place = self._pieces[self._triangles[:, 0]].unique(return_inverse=True)
+        if len(pieces) == 1:
+            return out
+        own = self._pieces[self.vertices]
+        for k, vertex in enumerate(int(self.vertices[own == piece][0]) for piece in pieces):
+            a, b, c = (positions[:, self._triangles] - positions[:, vertex, None, None]).unbind(2)
+            (la, lb, lc), away = (x.norm(dim=-1) for x in (a, b, c)), place != k
+            below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+            angle = 2.0 * torch.atan2((a * torch.linalg.cross(b, c)).sum(-1), below)
+            turns = angle.new_zeros(len(out), len(pieces)).index_add(1, place[away], angle[:, away]) / (4.0 * torch.pi)
+            out = torch.where((turns > 0.5).any(1), vertex, out)
+        return out
+
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
         own = self._launcher

@@ -147,6 +147,12 @@ class SurfaceTerm(Term):
                     f"the surfaces of the bodies cross at the start of a step, near vertex {vertex} in environment "
                     f"{b}: give a state in which they are apart."
                 )
+            if bool(((inside := ours.enclosed(given)) >= 0).any()):
+                b = int(inside.argmax())
+                raise InputError(
+                    f"vertex {int(inside[b])} is within another body at the start of a step, in environment {b}: give "
+                    "a state in which they are apart."
+                )
         share = self.launcher.zeros() + 1.0
         self.free_way(given, start, share)
         if bool((share < 1.0).any()):

@@ -180,6 +180,8 @@ class BoundSurfaceContact(BoundEnergy):
                 f"the surfaces of the bodies cross at rest, near vertex {vertex}: move the bodies apart, or mend the "
                 "mesh."
             )
+        if (inside := int(pairs.enclosed(rest))) >= 0:
+            raise InputError(f"at rest, vertex {inside} is within another body: move the bodies apart.")
         pairs.find(rest, torch.zeros_like(rest))
         piece, ends = torch.as_tensor(pairs.surface.pieces, device=rest.device), pairs.nodes
         gaps = pairs.distances(rest)

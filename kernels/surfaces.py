@@ -17,6 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 HALF, QUARTER = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(0.25))
 VERTEX_TRIANGLE, EDGE_EDGE = wp.constant(0), wp.constant(1)
+SLENDER = wp.constant(wp.float64(1e-2))  # square of the sine below which edges give no exact normal
 TRIANGLE_FEATURES, EDGE_FEATURES = wp.constant(7), wp.constant(9)  # of a pair of a kind (`nearest`)
 Corners = wp.types.matrix(shape=(4, 3), dtype=wp.float64)  # a vector for every vertex of a pair
 ADVANCES = wp.constant(1000)  # along the way of a pair
@@ -166,6 +167,17 @@ def nearest(kind: int, feature: int, x: Corners) -> Nearest:
     out.d = wp.length(r)
     if out.d > ZERO:
         out.n = r / out.d
+    if free == 2:
+        e, f, across = x1 - x0, x3 - x2, x0 - x2
+        if kind == VERTEX_TRIANGLE:
+            e, f, across = x2 - x1, x3 - x1, x0 - x1
+        normal = wp.cross(e, f)
+        square = wp.dot(normal, normal)
+        if square > SLENDER * wp.dot(e, e) * wp.dot(f, f):  # more digits than by the weights
+            normal /= wp.sqrt(square)
+            gap = wp.dot(normal, across)
+            out.d = wp.abs(gap)
+            out.n = wp.where(gap < ZERO, -normal, normal)
     out.w = w
     out.free = free
     out.t = t

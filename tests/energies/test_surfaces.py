@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from warp_resphys import (
 )
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.energies.surface_term import Sliding
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
 from warp_resphys.mesh.mesh import join, select_cells
@@ -153,7 +155,62 @@ def test_pairs_are_those_of_ipctk(kind):
         expected = peer_barrier(ipctk, kind, x[c], width[c], reach)
         actual = (energy[c], force[c].ravel(), hessian[c])
         for own, peer in zip(actual, expected, strict=True):
-            assert own == pytest.approx(peer, rel=1e-11, abs=1e-11 * float(np.abs(peer).max()))
+            assert own == pytest.approx(peer, rel=1e-12, abs=1e-12 * float(np.abs(peer).max()))
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_friction_is_that_of_ipctk(kind):
+    """Energy, gradient and Hessian of random slides, of which half stick, by its tangents and its smoothed friction."""
+    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
+    random, count, slip = np.random.default_rng(kind), 200, 0.5
+    of = "edge_edge" if kind else "point_triangle"
+    x = random.normal(size=(count, 4, 3))
+    moved = x + random.normal(size=x.shape) * np.where(np.arange(count) % 2, 1.0, 0.05)[:, None, None]
+    shares = np.stack([getattr(ipctk, f"{of}_closest_point")(*y) for y in x])
+    if kind:
+        weights = np.stack([1 - shares[:, 0], shares[:, 0], shares[:, 1] - 1, -shares[:, 1]], 1)
+    else:
+        weights = np.column_stack([np.ones(count), shares.sum(1) - 1, -shares])
+    bases = np.stack([getattr(ipctk, f"{of}_tangent_basis")(*y) for y in x])
+    load, launcher = random.uniform(0.5, 2.0, count), Launcher(1, CPU)
+    tensor = partial(torch.tensor, dtype=torch.float64)
+    sliding = Sliding(
+        torch.zeros(count, dtype=torch.int64),
+        torch.arange(4 * count).view(-1, 4),
+        tensor(weights),
+        torch.linalg.cross(*tensor(bases).unbind(2)),
+        tensor(load),
+        torch.zeros(count, dtype=torch.int64),
+    )
+    grips, mu = kernels.FrictionPairs(), 0.7
+    grips.environment = launcher.upload(np.zeros(count, np.int32), int)
+    grips.regions = launcher.upload(np.zeros(count, np.int32), int)
+    grips.nodes = launcher.upload(np.arange(4 * count, dtype=np.int32).reshape(-1, 4), wp.vec4i)
+    grips.weights, grips.load = launcher.upload(weights, wp.vec4d), launcher.upload(load, wp.float64)
+    grips.normal = launcher.upload(sliding.normal.numpy(), wp.vec3d)
+    given = [tensor([[mu]]), tensor([[slip]]), tensor(x).view(1, -1, 3), tensor(moved).view(1, -1, 3)]
+    views = [warp_view(v, kind_) for v, kind_ in zip(given, (wp.float64,) * 2 + (wp.vec3d,) * 2, strict=True)]
+    force, energy, hessian = (torch.zeros(count, *s, dtype=torch.float64) for s in ((4, 3), (), (12, 12)))
+    out = [warp_view(force, kernels.Corners), warp_view(energy, wp.float64)]
+    active = warp_view(launcher.active, wp.int32)
+    launcher.launch(launcher.record(kernels.grip_forces, (count,), [active, grips, *views], out))
+    launcher.launch(launcher.record(kernels.grip_tangents, (count,), [grips, *views], [warp_view(hessian, wp.float64)]))
+    push = sliding.force(given[3], given[2], given[0], given[1])
+    for c in range(count):
+        basis = np.kron(weights[c][:, None], bases[c])  # (12, 2)
+        u = basis.T @ (moved[c] - x[c]).ravel()
+        y, most = float(np.linalg.norm(u)), mu * load[c]
+        slope = ipctk.smooth_friction_f1_over_x(y, slip)
+        curved = ipctk.smooth_friction_f2_x_minus_f1_over_x3(y, slip)
+        expected = (
+            most * (ipctk.smooth_friction_f0(y, slip) - ipctk.smooth_friction_f0(0.0, slip)),
+            most * slope * basis @ u,
+            most * basis @ (slope * np.eye(2) + curved * np.outer(u, u)) @ basis.T,
+        )
+        for own, peer in zip((energy[c], force[c].ravel(), hessian[c]), expected, strict=True):
+            assert own.numpy() == pytest.approx(peer, rel=1e-12, abs=1e-12 * float(np.abs(peer).max()))
+        along = -most * slope * bases[c] @ u
+        assert push[c].numpy() == pytest.approx(along, abs=1e-12 * float(np.abs(along).max()))
 
 
 def test_listed_pairs_are_those_of_ipctk():
@@ -408,6 +465,13 @@ def test_regions_have_their_own_friction():
     with torch.no_grad():
         half = simulator.rollout(simulator.rest_state(), 20)
         path = simulator.rollout(half.final, 20)
+        before = simulator.rollout(half.final, 19).final
+        forces = simulator.contacts(before, simulator.step(before)[0])["surfaces"]
+    for own, expected in ((a, 0.005 * float(path.v[-1, 0, a, 0].mean())), (b, 0.0)):
+        on = torch.isin(forces.vertices, torch.arange(own.start, own.stop)) & (forces.gap[0] < D)
+        assert forces.slide[0, on].numpy() == pytest.approx(expected, rel=0.05, abs=5e-6)
+        assert forces.sticks[0, on].tolist() == [expected == 0.0] * int(on.sum())
+        assert int(on.sum()) >= 4
     gain = (path.v[-1, 0, a, 0] - path.v[0, 0, a, 0]).mean()
     assert float(gain) == pytest.approx(20 * 0.005 * G * (math.sin(slope) - 0.2 * math.cos(slope)), rel=0.01)
     assert float(path.v[-1, 0, b, 0].mean().abs()) < 1e-3

@@ -57,6 +57,12 @@ class Sliding(NamedTuple):
     load: torch.Tensor  # (G,) normal force [N]
     regions: torch.Tensor  # (G,) number of the coefficient
 
+    def slide(self, x: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
+        """Returns the relative ways (G, 3) of both parts of pairs in their tangential planes [m] (see `force`)."""
+        row = self.environment[:, None]
+        way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
+        return way - (way * self.normal).sum(-1, keepdim=True) * self.normal
+
     def force(
         self, x: torch.Tensor, reference: torch.Tensor, friction: torch.Tensor, slip: torch.Tensor
     ) -> torch.Tensor:
@@ -68,9 +74,7 @@ class Sliding(NamedTuple):
             friction: (B, F) coefficients.
             slip: (B, 1) slide at which friction is fully developed [m].
         """
-        row = self.environment[:, None]
-        way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
-        u = way - (way * self.normal).sum(-1, keepdim=True) * self.normal
+        u = self.slide(x, reference)
         _, factor = friction_over_slide(u, slip[self.environment, 0])
         return -(friction[self.environment, self.regions] * self.load * factor)[:, None] * u
 
@@ -334,8 +338,10 @@ class SurfaceTerm(Term):
             out = torch.where(matches, number, out)
         return out
 
-    def forces(self, values: Values, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Returns gaps (B, P) [m], normal forces and friction (B, P, 3) on the vertices [N], differentiable.
+    def forces(self, values: Values, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns gaps (B, P) [m], normal forces and friction (B, P, 3) on the vertices [N], slides (B, P) [m].
+
+        All are differentiable. Slides are the largest of the pairs of a vertex, negative without one that is pressed.
 
         Args:
             values: the values of the step, with their gradients.
@@ -343,10 +349,15 @@ class SurfaceTerm(Term):
         """
         normal, friction = torch.zeros_like(x), torch.zeros_like(x)
         gap = torch.full_like(x[..., 0], self._reach)
+        slide = torch.full_like(gap, -1.0)
         start, stiffness = value_of(values, "surface_start"), value_of(values, STIFFNESS.name)
         if (slides := self.sliding(values, start, stiffness)) is not None:
             names = ("surface_reference", FRICTION.name, "surface_slip")
             force = slides.force(x, *(value_of(values, name) for name in names))
+            ways = slides.slide(x, value_of(values, names[0])).square().sum(-1).clamp_min(_TINY).sqrt()
+            ways = torch.where(slides.weights == 0.0, -1.0, ways[:, None])
+            rows = slides.environment[:, None] * x.shape[1] + slides.nodes
+            slide = slide.ravel().scatter_reduce(0, rows.ravel(), ways.ravel(), "amax").view_as(slide)
             place = (slides.environment[:, None].expand_as(slides.nodes), slides.nodes)
             friction = friction.index_put(place, slides.weights[..., None] * force[:, None], accumulate=True)
         if len(chosen := self._near_at(values, x.detach())):
@@ -363,7 +374,7 @@ class SurfaceTerm(Term):
             distance = torch.where(near.weights[:, 0] == 0.0, self._reach, near.d[:, :1])
             gap = gap.ravel().scatter_reduce(0, entries.ravel(), distance.ravel(), "amin").view_as(gap)
         own = self._list.vertices
-        return gap[:, own], normal[:, own], friction[:, own]
+        return gap[:, own], normal[:, own], friction[:, own], slide[:, own]
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:

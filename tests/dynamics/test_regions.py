@@ -1,5 +1,7 @@
 """Bodies of several solids, rigid parts and glued meshes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -100,6 +102,18 @@ def test_a_cap_is_rigid_to_a_ten_thousandth_of_its_size_and_its_weight_bends_the
     stiff = {"beam": Corotated(2e5, 0.45), "cap": Corotated(1e10, 0.3, density=3000.0)}
     other = Simulator(clamped(), stiff, solver=SolverSettings(name="newton")).static_equilibrium().q[0].numpy()
     assert np.abs(q - other).max() < 1e-3 * np.abs(q - body.mesh.vertices).max()
+
+
+def test_a_rigid_body_of_a_scene_has_no_material():
+    beam, stone = clamped(), Body.rigid_body(box_hexahedra((0.01, 0.01, 0.01), (1, 1, 1)), Rigid(density=500.0))
+    scene = Scene({"beam": beam, "stone": stone})
+    own = {"beam": Corotated(2e5, 0.45), "cap": Corotated(1e6, 0.3)}
+    simulator = Simulator(scene, {"beam": own}, time_step=0.01, gravity=(0.0, 0.0, -9.81))
+    assert {name for name in simulator.parameters if name.startswith("stone")} == {"stone_body_density"}
+    v = simulator.rollout(simulator.rest_state(), 3).v[-1, 0, scene.vertex_slice("stone")]
+    assert v.detach().numpy() == pytest.approx(np.broadcast_to([0.0, 0.0, -3 * 0.01 * 9.81], v.shape), abs=1e-9)
+    with pytest.raises(InputError, match="The body 'stone' has no material"):
+        Simulator(Scene({"beam": beam, "stone": replace(stone, rigid={})}), {"beam": own})
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("implicit_euler", 1), ("bdf2", 2)])

@@ -62,6 +62,7 @@ def test_robots_in_contact_push_one_another():
     block = box_hexahedra((0.02, 0.02, 0.02), (1, 1, 1))
     moved = warp_resphys.Mesh(block.vertices + [0.07, -0.0215, 0.0], block.cells)
     objects = {"block": (Body(moved, fixed=[0, 1]), Corotated(2e5, 0.4))}
+    objects["stone"] = Body.rigid_body(warp_resphys.Mesh(block.vertices + [0.0, 0.5, 0.0], block.cells))
     pose = (SIZE[0], 0.0415, 0.0, 0.0, 0.0, np.pi)
     scene = RobotScene({"first": (robot, AWAY), "second": (robot, pose)}, objects, CONTACT)
     start = state = scene.begin()
@@ -71,6 +72,8 @@ def test_robots_in_contact_push_one_another():
     assert float(way[scene.scene.vertex_slice("second"), 1].max()) > 1e-3  # by the first one
     assert float(way[scene.scene.vertex_slice("block"), 1].abs().max()) < 1e-3
     assert float(state.robots["second"].q[0, :, 1].min()) < -1e-3  # in its own frame, which is turned
+    fall = way[scene.scene.vertex_slice("stone")] / (0.5 * np.linalg.norm(robot.simulator.gravity))
+    assert float(fall.norm(dim=-1).std()) < 1e-9 < float(fall.norm(dim=-1).mean())
     forces = scene.simulator.contacts(state.body, scene.step(state).body, acting, scene.constants)["surfaces"]
     assert 0.0 < float(forces.gap.min()) < CONTACT.distance
 

@@ -40,7 +40,7 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     placed: list[PlacedEnergy] = []
     for name, body, first in whole.members:
         prefix = f"{name}_" if name else ""
-        solids = solids_of(body, _material_of(material, name))
+        solids = solids_of(body, _material_of(material, body, name))
         energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
         sliding = [(Hysteresis(solid), f"{prefix}{region}") for solid, region in solids if solid.material.hysteresis]
         energies += sliding
@@ -57,10 +57,12 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     return placed
 
 
-def _material_of(material: Material | Materials, name: str) -> Material | Materials:
-    """Returns the material of a body, or raises InputError."""
+def _material_of(material: Material | Materials, body: Body, name: str) -> Material | Materials:
+    """Returns the material of a body, none for a rigid one, or raises InputError."""
     if not name or isinstance(material, Material):
         return material
+    if name not in material and body.soft_cells is not None and not len(body.soft_cells):
+        return {}
     if name not in material:
         raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
     own: Material | Materials = material[name]

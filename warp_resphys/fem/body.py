@@ -116,6 +116,18 @@ class Body:
         if self.rigid or self.glued or self.symmetry:
             self.coordinates  # noqa: B018  # Checks rigid parts, glue and planes.
 
+    @classmethod
+    def rigid_body(cls, mesh: Mesh, part: Rigid | None = None, **options: Any) -> "Body":
+        """Returns a body whose every cell belongs to one rigid part, ``body``.
+
+        Args:
+            mesh: its rest shape.
+            part: density and stiffness.
+            options: further arguments of `Body`.
+        """
+        whole = replace(mesh, regions={**mesh.regions, "body": np.arange(len(mesh.cells))})
+        return cls(whole, rigid={"body": Rigid() if part is None else part}, **options)
+
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Body":
         """Returns the body at R x + t, with its actuators; obstacles, and fibres of a material, stay as they are.
 

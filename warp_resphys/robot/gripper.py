@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..energies.contact import Contact
-from ..energies.materials import Corotated
 from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
 from ..experiment.build import build_body
@@ -72,7 +71,7 @@ def laboratory_robot(run: str | Path, on_failure: str = "raise") -> Robot:
 
 
 def gripper(robot: Robot, settings: GripperSettings, thing: Thing | None = "ball") -> RobotScene:
-    """Returns two copies of a finger, which bends towards x and hangs along -z, on both sides of a hard thing.
+    """Returns two copies of a finger, which bends towards x and hangs along -z, on both sides of a rigid thing.
 
     Args:
         robot: the finger.
@@ -116,12 +115,12 @@ def thing_mesh(thing: Thing, radius: float, divisions: int, nodes: int = 8) -> M
     return Mesh(radius * x * shrunk, cube.cells)
 
 
-def _thing(settings: GripperSettings, thing: Thing, height: float, nodes: int) -> tuple[Body, Corotated]:
-    """A rigid thing on a table at a height [m], and a material without cells."""
+def _thing(settings: GripperSettings, thing: Thing, height: float, nodes: int) -> Body:
+    """A rigid thing on a table at a height [m]."""
     mesh, radius = thing_mesh(thing, 0.5 * settings.size, 2, nodes), 0.5 * settings.size
     places = mesh.vertices + [0.0, 0.0, height + radius + 0.9 * settings.distance]
-    mesh = replace(mesh, vertices=places, regions={THING: np.arange(len(mesh.cells))})
+    mesh = replace(mesh, vertices=places)
     below = {"table": HalfSpace(position=(0.0, 0.0, height))}
     table = Contact(below, settings.stiffness, settings.friction, settings.distance, settings.slip_speed)
     density = settings.mass / float(Body(mesh).discretisation.element_volumes.sum())
-    return Body(mesh, energies=[table], rigid={THING: Rigid(density, _STIFFNESS)}), Corotated()
+    return Body.rigid_body(mesh, Rigid(density, _STIFFNESS), energies=[table])

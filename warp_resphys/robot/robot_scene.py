@@ -55,7 +55,7 @@ class RobotScene:
 
     Args:
         robots: robots by name, and their poses (6,): translation [m] and rotation vector [rad].
-        objects: other bodies by name, with their materials; they begin at rest.
+        objects: other bodies by name, with their materials, or rigid bodies alone; they begin at rest.
         contact: of all surfaces with one another; None for none.
         relative_tolerance: of the solver; that of the first robot if omitted.
 
@@ -73,7 +73,7 @@ class RobotScene:
     def __init__(
         self,
         robots: Mapping[str, tuple[Robot, ArrayLike]],
-        objects: Mapping[str, tuple[Body, Material]] | None = None,
+        objects: Mapping[str, Body | tuple[Body, Material]] | None = None,
         contact: SurfaceContact | None = None,
         relative_tolerance: float | None = None,
     ) -> None:
@@ -101,8 +101,11 @@ class RobotScene:
             body = robot.simulator.body.moved(*self._poses[name])
             own = [energy for energy in body.energies if contact is None or not isinstance(energy, SurfaceContact)]
             bodies[name], materials[name] = replace(body, energies=own), robot.simulator.material
-        for name, (body, material) in (objects or {}).items():
-            bodies[name], materials[name] = body, material
+        for name, thing in (objects or {}).items():
+            if isinstance(thing, Body):
+                bodies[name] = thing
+            else:
+                bodies[name], materials[name] = thing
         self.scene = Scene(bodies, contact)
         self.simulator: Simulator = replace(
             first,

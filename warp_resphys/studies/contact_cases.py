@@ -35,6 +35,7 @@ from ..energies.obstacles import HalfSpace
 from ..energies.pairs import PairList, Surface
 from ..energies.surfaces import SurfaceContact
 from ..fem.body import Body
+from ..fem.rigid import Rigid
 from ..fem.scene import Scene
 from ..io.errors import ResphysError
 from ..mesh.boxes import boxes_hexahedra
@@ -43,7 +44,7 @@ from ..mesh.rod import rod
 from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .device_check import Check
-from .surface_check import MARGIN, SOFT, STONE, G, Touch, built, least_friction, rigid
+from .surface_check import DENSITY, MARGIN, SOFT, STONE, G, Touch, built, least_friction
 
 FloatArray = NDArray[np.float64]
 
@@ -404,7 +405,8 @@ class CardHouse:
             brick = box_hexahedra((1.0, _WIDTH, 1.0), (1, 1, 1))
             u, y, v = brick.vertices.T
             x, z = (corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])).T
-            bodies[f"card{k}"] = rigid(replace(brick, vertices=np.stack([x, y, z], 1)), floor)
+            card = replace(brick, vertices=np.stack([x, y, z], 1))
+            bodies[f"card{k}"] = Body.rigid_body(card, Rigid(DENSITY), energies=[floor])
         return Scene(bodies, SurfaceContact(kappa, friction, _CARD_GAP))
 
 

@@ -32,7 +32,7 @@ from ..energies.materials import Corotated
 from ..energies.obstacles import HalfSpace
 from ..energies.pairs import PairList, Surface
 from ..energies.surfaces import SurfaceContact
-from ..fem.body import Body, BodyEnergy
+from ..fem.body import Body
 from ..fem.rigid import Rigid
 from ..fem.scene import Scene
 from ..io.progress import Progress
@@ -60,10 +60,11 @@ def slope_checks(quick: bool, device: torch.device) -> Iterator[Check]:
     plate = box_hexahedra((0.06, 0.06, 0.01), (6, 6, 1))
     cube = box_hexahedra((SIDE,) * 3, (2, 2, 2))
     raised = replace(cube, vertices=cube.vertices + [0.0203, 0.0197, 0.0109])
-    bodies = {"plate": Body(plate, fixed=select_vertices(plate, z=0.0)), "cube": Body(raised)}
+    held = Body(plate, fixed=select_vertices(plate, z=0.0))
+    cubes = {"soft": Body(raised), "rigid": Body.rigid_body(raised, Rigid())}
     speed = 1e-3  # v_s [m/s]
-    for mu in (0.5,) if quick else (0.2, 0.5):
-        scene = Scene(bodies, SurfaceContact(2e4, mu, slip_speed=speed))
+    for mu, kind in ((0.5, "rigid"),) if quick else ((0.2, "soft"), (0.5, "soft"), (0.5, "rigid")):
+        scene = Scene({"plate": held, "cube": cubes[kind]}, SurfaceContact(2e4, mu, slip_speed=speed))
         for beyond in (-1.0, 1.0):
             a = math.atan(mu) + math.radians(beyond)
             pull = (G * math.sin(a), 0.0, -G * math.cos(a))
@@ -73,11 +74,11 @@ def slope_checks(quick: bool, device: torch.device) -> Iterator[Check]:
                 v = s.rollout(s.rest_state(), 60).v[[30, 60], 0, own, 0].mean(1)
             gain = float(v[1] - v[0])
             if beyond < 0:
-                title = f"mu {mu:g}, a degree below arctan mu: speed gained"
+                title = f"{kind}, mu {mu:g}, a degree below arctan mu: speed gained"
                 yield Check(title, f"{1e3 * gain:.3f} mm/s", "< 0.1 mm/s", abs(gain) < 0.1 * speed)
             else:
                 actual = math.tan(a) - gain / (30 * s.time_step * G * math.cos(a))
-                title = f"mu {mu:g}, a degree above arctan mu: mu by the acceleration"
+                title = f"{kind}, mu {mu:g}, a degree above arctan mu: mu by the acceleration"
                 yield Check(title, f"{actual:.4f}", f"{mu:g} within 0.002", abs(actual - mu) < 2e-3)
 
 
@@ -89,14 +90,14 @@ def turned(mesh: Mesh, random: np.random.Generator, place: Any) -> Mesh:
 
 
 def throw_checks(throws: int, seed: int, device: torch.device) -> Iterator[Check]:
-    """Two or three blocks of random sizes thrown at one another."""
+    """Two or three blocks of random sizes thrown at one another, of which the second is rigid in every other throw."""
     share = max(throws // len(_THROWN), 1)
     with Progress("throws of bodies", len(_THROWN) * share, "throws") as progress:
         for distance, dtype in _THROWN:
             random = np.random.default_rng(seed)
             crossings = failed = most = hits = 0
             for k in range(share):
-                new = _throw(distance, dtype, 2 + k % 2, random, device)
+                new = _throw(distance, dtype, 2 + k % 2, k // 2 % 2 == 1, random, device)
                 crossings, failed, hits = crossings + new[0], failed + new[1], hits + new[3]
                 most = max(most, new[2])
                 progress.advance()
@@ -106,7 +107,7 @@ def throw_checks(throws: int, seed: int, device: torch.device) -> Iterator[Check
 
 
 def _throw(
-    distance: float, dtype: torch.dtype, count: int, random: np.random.Generator, device: torch.device
+    distance: float, dtype: torch.dtype, count: int, rigid: bool, random: np.random.Generator, device: torch.device
 ) -> tuple[int, int, int, int]:
     """Returns the numbers of crossings in all steps and of failed solves, the most iterations, and the hits."""
     speed, h = 10.0 ** random.uniform(-0.5, 1.0), 10.0 ** random.uniform(-3.3, -2.0)
@@ -117,7 +118,8 @@ def _throw(
         mesh = box_tetrahedra(random.uniform(0.01, 0.04, 3).tolist(), random.integers(1, 4, 3).tolist())
         # Half of the longest diagonal is 35 mm: none overlap at the start.
         place = way * (0.08 * k - 0.04) + 0.004 * random.normal(size=3)
-        bodies[f"body{k}"] = Body(turned(mesh, random, place))
+        block = turned(mesh, random, place)
+        bodies[f"body{k}"] = Body.rigid_body(block) if rigid and k == 1 else Body(block)
         velocities.append(np.tile((0.5 - k) * speed * way, (mesh.vertices.shape[0], 1)))
     scene = Scene(bodies, SurfaceContact(10.0 ** random.uniform(4, 6), random.uniform(0.0, 1.0), distance))
     solver = SolverSettings(relative_tolerance=1e-8 if dtype == torch.float64 else 1e-5, on_failure="count")
@@ -173,12 +175,6 @@ def built(scene: Scene, device: torch.device) -> Trajectory:
     return s.rollout(s.rest_state(), 50)
 
 
-def rigid(mesh: Mesh, *energies: BodyEnergy) -> Body:
-    """Returns a rigid body."""
-    whole = replace(mesh, regions={"whole": np.arange(len(mesh.cells))})
-    return Body(whole, rigid={"whole": Rigid(DENSITY)}, energies=energies)
-
-
 def arch(stones: int, friction: float) -> Scene:
     """A semicircular arch of rigid stones on a floor, which almost touch."""
     distance, kappa = 1e-3, 1e6
@@ -193,7 +189,8 @@ def arch(stones: int, friction: float) -> Scene:
         middle = math.pi - (k + 0.5) * angle
         along = np.array([-math.sin(middle), 0.0, math.cos(middle)])
         x -= np.outer(x @ along, along) * gap / (angle * RADIUS)
-        bodies[f"stone{k}"] = rigid(replace(brick, vertices=x), Contact(floor, kappa, friction, distance))
+        contact = Contact(floor, kappa, friction, distance)
+        bodies[f"stone{k}"] = Body.rigid_body(replace(brick, vertices=x), Rigid(DENSITY), energies=[contact])
     return Scene(bodies, SurfaceContact(kappa, friction, distance))
 
 

@@ -1,12 +1,35 @@
 """The barrier and the smoothed friction of contact on tensors (equations in `energies.contact`)."""
 
+from typing import Any
+
 import torch
+from torch.autograd.function import once_differentiable
+from typing_extensions import override
 
 
 def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
     """Returns the pressure of the barrier over its stiffness, -B'(d / D), at distances d > 0, with the reach D [m]."""
-    s = (d / reach).clamp_max(1.0)
-    return 2.0 * (s - 1.0) * s.log() + (s - 1.0).square() / s
+    pressure: torch.Tensor = _Pressure.apply(d, reach)
+    return pressure
+
+
+class _Pressure(torch.autograd.Function):
+    """The pressure of the barrier, whose derivative is computed with it."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, d: torch.Tensor, reach: float) -> torch.Tensor:
+        s = (d / reach).clamp_max(1.0)
+        log, below = s.log(), (s - 1.0) / s
+        ctx.save_for_backward((2.0 * log + below * (4.0 - below)) / reach)
+        return (s - 1.0) * (2.0 * log + below)
+
+    @override
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, None]:
+        (derivative,) = ctx.saved_tensors
+        return slope * derivative, None
 
 
 def friction_over_slide(u: torch.Tensor, slip: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

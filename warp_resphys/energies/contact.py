@@ -253,6 +253,8 @@ class BoundContact(BoundEnergy):
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
         self._area = site.tensor(points.areas)
         self._factor = site.tensor(points.factors)  # (P,) of friction
+        self._rubs_unevenly = bool((points.factors != 1.0).any())
+        self._interpolates = any(isinstance(obstacle, DistanceGrid) for obstacle in obstacles)
         self._shapes = ObstacleSet(obstacles, contact.distance, like.device)
         self._place = site.tensor(np.array([o.position for o in obstacles]))
         self._turn = site.tensor(np.stack([o.turn for o in obstacles]))
@@ -327,7 +329,9 @@ class BoundContact(BoundEnergy):
         d, n = self._shapes.distances(x, before)
         if x.device.type == "cpu":  # On a GPU the host would wait.
             self._check(state.q, before, "at the start of a step", d)
-        reference = stage.velocity_reference[:, self._vertices, None].expand(-1, -1, self._contact.count, -1)
+        same = stage.velocity_reference is state.q
+        reference = (x if same else stage.velocity_reference[:, self._vertices])[:, :, None]
+        reference = reference.expand(-1, -1, self._contact.count, -1)
         start, here = state.q, x[:, :, None].expand_as(reference)
         if self._contact.moves:
             # Where an obstacle was at a point, it moves with the obstacle; so do the normals.
@@ -342,11 +346,16 @@ class BoundContact(BoundEnergy):
             self._check_way(here.detach(), self._ends(x, step.inputs), now, d.detach())
         if self._contact.moves:
             start = self._pushed_out(state.q.detach(), now, d.detach())
-        length = n.norm(dim=-1, keepdim=True)  # One, but for interpolated distances.
+        load = self._load(d, step.constants)
+        if self._rubs_unevenly:
+            load = load * self._factor[:, None]
+        if self._interpolates:
+            length = n.norm(dim=-1, keepdim=True)
+            n, load = n / length, load * length[..., 0]
         duration = stage.step if math.isfinite(stage.step) else self.site.time_step
         values: dict[str, torch.Tensor | None] = {
-            "contact_load": self._load(d, step.constants) * length[..., 0] * self._factor[:, None],
-            "contact_normal": n / length,
+            "contact_load": load,
+            "contact_normal": n,
             "contact_reference": reference,
             "contact_slip": x.new_full((state.batch, 1), self._contact.slip_speed * duration),
             "contact_start": start.detach(),

@@ -388,5 +388,6 @@ class _Distances(torch.autograd.Function):
         for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
             buffer.copy_(value)
         own.launch(command)
-        slopes = (position.sum(2), -position.sum(1), turn.sum(1), -buffers[0].sum(1))
-        return None, *(slope.to(by_results[0].dtype) for slope in slopes)
+        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
+        needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
+        return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)

@@ -718,7 +718,7 @@ def test_refusals():
     with pytest.raises(InputError, match="touch at rest"):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
-    with pytest.raises(InputError, match="cross at rest"):
+    with pytest.raises(InputError, match=r"cross at rest: vertex .* of 'cube' is 5 mm deep in the .* of 'plate'"):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
     with pytest.raises(InputError, match="is within another body: move"):

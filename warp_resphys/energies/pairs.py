@@ -1,6 +1,6 @@
 """Pairs of vertices and triangles, and of edges, that may come near one another in a batch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,8 @@ class Surface:
         pieces: (N,) number of the piece that a vertex belongs to.
         rest: (N, 3) positions at rest [m].
         areas: (T,) areas of the triangles at rest [m^2].
+        names: names of the regions of the mesh.
+        owners: (N,) number of the first region that a vertex belongs to; -1 for none.
     """
 
     vertices: NDArray[np.int64]
@@ -43,6 +45,8 @@ class Surface:
     pieces: NDArray[np.int64]
     rest: NDArray[np.float64]
     areas: NDArray[np.float64]
+    names: tuple[str, ...]
+    owners: NDArray[np.int64]
 
     @classmethod
     def of(cls, mesh: Mesh) -> "Surface":
@@ -55,8 +59,11 @@ class Surface:
         cells = np.repeat(mesh.cells[:, :1], mesh.cells.shape[1], axis=1)
         graph = scipy.sparse.coo_array((np.ones(cells.size), (cells.ravel(), mesh.cells.ravel())), (len(x), len(x)))
         _, pieces = scipy.sparse.csgraph.connected_components(graph, directed=False)
-        degree = np.bincount(triangles.ravel(), minlength=len(x))
-        return cls(np.unique(triangles), triangles, edges, degree, pieces.astype(np.int64), x, areas)
+        degree, owners = np.bincount(triangles.ravel(), minlength=len(x)), np.full(len(x), -1)
+        for number, region in reversed(list(enumerate(mesh.regions.values()))):
+            owners[mesh.cells[region]] = number
+        own = (np.unique(triangles), triangles, edges, degree, pieces.astype(np.int64), x, areas)
+        return cls(*own, tuple(mesh.regions), owners)
 
     def within(self, first: int, count: int) -> "Surface":
         """Returns the surface with its body's vertices from `first` on among `count`."""
@@ -65,8 +72,14 @@ class Surface:
         def pad(values: NDArray[Any]) -> NDArray[Any]:
             return np.pad(values, [(first, after), *[(0, 0)] * (values.ndim - 1)])
 
-        own = (self.vertices + first, self.triangles + first, self.edges + first)
-        return Surface(*own, pad(self.degree), pad(self.pieces), pad(self.rest), self.areas)
+        moved = {name: getattr(self, name) + first for name in ("vertices", "triangles", "edges")}
+        padded = {name: pad(getattr(self, name)) for name in ("degree", "pieces", "rest", "owners")}
+        return replace(self, **moved, **padded)
+
+    def words(self, vertex: int) -> str:
+        """Returns a vertex in words, with the name of its body or region."""
+        owner = int(self.owners[vertex])
+        return f"vertex {vertex}" + (f" of {self.names[owner]!r}" if owner >= 0 else "")
 
     def vertex_areas(self) -> NDArray[np.float64]:
         """Returns the area (N,) of every vertex, a third of its triangles' [m^2]."""
@@ -256,6 +269,26 @@ class PairList:
             inputs = [self.pairs, warp_view(kept, wp.vec3d)]
             own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
         return out
+
+    def crossing(self, positions: torch.Tensor) -> str:
+        """Returns in words where an edge passes deepest through a triangle at positions (N, 3) [m], and how deep."""
+        a, b, c = positions[self._triangles].unbind(1)
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+        deepest, words = -1.0, ""
+        for edge in self._edges.tolist():
+            start, end = positions[edge]
+            below, above = (((x - a) * normal).sum(-1) for x in (start, end))
+            at = start + (below / (below - above))[:, None] * (end - start)
+            sides = [(torch.linalg.cross(q - p, at - p) * normal).sum(-1) for p, q in ((a, b), (b, c), (c, a))]
+            through = (torch.stack(sides) >= 0.0).all(0) & (below * above <= 0.0)
+            through &= ~torch.isin(self._triangles, self._triangles.new_tensor(edge)).any(1)
+            depth = torch.where(through, torch.minimum(below.abs(), above.abs()), -1.0)
+            if float(depth.max()) > deepest:
+                deepest, k = float(depth.max()), int(depth.argmax())
+                near = edge[int(below[k] > above[k])]
+                other = self.surface.words(int(self._triangles[k, 0]))
+                words = f"{self.surface.words(near)} is {1e3 * deepest:.3g} mm deep in the surface at {other}"
+        return words
 
     def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns a vertex (B,) of a piece that lies within another one, or -1; surfaces must not cross.

@@ -143,19 +143,18 @@ class SurfaceTerm(Term):
     def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
         given, ours = value_of(values, "surface_start"), self._list
         if not follows:
-            count, edge = ours.crossings(given)
+            count, _ = ours.crossings(given)
             if bool(count.any()):
                 b = int(count.argmax())
-                vertex = int(ours.surface.edges[int(edge[b]), 0])
                 raise InputError(
-                    f"the surfaces of the bodies cross at the start of a step, near vertex {vertex} in environment "
-                    f"{b}: give a state in which they are apart."
+                    f"surfaces cross at the start of a step, in environment {b}: {ours.crossing(given[b])}; give a "
+                    "state in which they are apart."
                 )
             if bool(((inside := ours.enclosed(given)) >= 0).any()):
                 b = int(inside.argmax())
                 raise InputError(
-                    f"vertex {int(inside[b])} is within another body at the start of a step, in environment {b}: give "
-                    "a state in which they are apart."
+                    f"{ours.surface.words(int(inside[b]))} is within another body at the start of a step, in "
+                    f"environment {b}: give a state in which they are apart."
                 )
         share = self.launcher.zeros() + 1.0
         self.free_way(given, start, share)

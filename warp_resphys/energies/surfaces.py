@@ -179,31 +179,29 @@ class BoundSurfaceContact(BoundEnergy):
 
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:
         """Raises InputError where surfaces cross or touch at rest, or parts of a piece are within reach of others."""
-        count, edge = pairs.crossings(rest)
-        if int(count):
-            vertex = int(pairs.surface.edges[int(edge), 0])
+        words = pairs.surface.words
+        if int(pairs.crossings(rest)[0]):
             raise InputError(
-                f"the surfaces of the bodies cross at rest, near vertex {vertex}: move the bodies apart, or mend the "
-                "mesh."
+                f"surfaces cross at rest: {pairs.crossing(rest[0])}; move the bodies apart, or mend the mesh."
             )
         if (inside := int(pairs.enclosed(rest))) >= 0:
-            raise InputError(f"at rest, vertex {inside} is within another body: move the bodies apart.")
+            raise InputError(f"at rest, {words(inside)} is within another body: move the bodies apart.")
         pairs.find(rest, torch.zeros_like(rest))
         piece, ends = torch.as_tensor(pairs.surface.pieces, device=rest.device), pairs.nodes
         gaps = pairs.distances(rest)
         if len(gaps) and float(gaps.min()) < _LEAST * self._contact.distance:
             nearest = int(gaps.argmin())
             raise InputError(
-                f"surfaces touch at rest, at vertices {int(ends[nearest, 0])} and {int(ends[nearest, 3])}: leave a gap "
-                "of about contact's distance between bodies."
+                f"surfaces touch at rest, at {words(int(ends[nearest, 0]))} and {words(int(ends[nearest, 3]))}: leave "
+                "a gap of about contact's distance between bodies."
             )
         close = (gaps < self._contact.distance) & (piece[ends[:, 0]] == piece[ends[:, 3]])
         if bool(close.any()):
             worst = int(torch.where(close, gaps, torch.inf).argmin())
             raise InputError(
                 f"contact between surfaces begins at {1e3 * self._contact.distance:g} mm, but at rest the surface of a "
-                f"body is {1e3 * float(gaps[worst]):.3g} mm from itself, between vertices {int(ends[worst, 0])} and "
-                f"{int(ends[worst, 3])}: take a smaller distance."
+                f"body is {1e3 * float(gaps[worst]):.3g} mm from itself, between {words(int(ends[worst, 0]))} and "
+                f"{words(int(ends[worst, 3]))}: take a smaller distance."
             )
 
     @override

@@ -72,9 +72,9 @@ class Surface:
         def pad(values: NDArray[Any]) -> NDArray[Any]:
             return np.pad(values, [(first, after), *[(0, 0)] * (values.ndim - 1)])
 
-        moved = {name: getattr(self, name) + first for name in ("vertices", "triangles", "edges")}
-        padded = {name: pad(getattr(self, name)) for name in ("degree", "pieces", "rest", "owners")}
-        return replace(self, **moved, **padded)
+        fields: dict[str, Any] = {name: getattr(self, name) + first for name in ("vertices", "triangles", "edges")}
+        fields |= {name: pad(getattr(self, name)) for name in ("degree", "pieces", "rest", "owners")}
+        return replace(self, **fields)
 
     def words(self, vertex: int) -> str:
         """Returns a vertex in words, with the name of its body or region."""

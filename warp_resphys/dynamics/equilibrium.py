@@ -279,7 +279,7 @@ def _solve(
     if len(fixed):
         start = start.clone()
         start[:, fixed] = fixed_positions
-    report = solver.solve(potential.coordinates.hold(start.double()).to(start), None if parts else follows)
+    report = solver.solve(potential.improved_start(start).to(start), None if parts else follows)
     work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
     return potential.positions.to(start.dtype, copy=True), replace(report, **work)
 

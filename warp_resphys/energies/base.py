@@ -386,6 +386,10 @@ class Term(ABC):
         """Prepares a step, after its values have been copied to the buffers."""
         del values
 
+    def improve_start(self, positions: Any) -> None:
+        """Changes positions (B, N) at which a solve may start, a Warp array, so that it takes fewer iterations."""
+        del positions
+
     def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
         """Raises InputError where a solve cannot start at positions.
 

@@ -253,6 +253,13 @@ class IncrementalPotential(Launcher):
         """Buffer (B, N, 3) of positions of finite energy [m], or None if all are (`Term.feasible`)."""
         return self._feasible[0][0] if self._feasible else None
 
+    def improved_start(self, start: torch.Tensor) -> torch.Tensor:
+        """Returns positions (B, N, 3) at which a solve starts instead of `start` (`Term.improve_start`), in planes."""
+        positions = start.double().contiguous().clone()
+        for term in self.energies:
+            term.improve_start(warp_view(positions, wp.vec3d))
+        return self.coordinates.hold(positions)
+
     def check_start(self, follows: bool) -> None:
         """Checks `feasible`, with fixed vertices where they were before (`Term.check_start`).
 

@@ -26,6 +26,7 @@ from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, physical_gradients
 from ..fem.rigid import Rigid
 from ..kernels import point_inertia as kernels
+from ..kernels.rigid_parts import straighten
 from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
@@ -160,15 +161,38 @@ class Rigidity(_OnOwnPoints):
 
     own_points: SolidPoints  # a single point with the volume of the part
     stiffness: float  # kappa [Pa]
+    centre: NDArray[np.float64]  # (4,) weights of the control vertices in the centre of mass
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> SolidTerm:
-        volume = float(self.own_points.shape_volume.sum())
-        return SolidTerm(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "RigidityTerm":
+        return RigidityTerm(launcher, sets, self)
 
     @override
     def bind(self, site: EnergySite) -> "BoundRigidity":
         return BoundRigidity(self, site)
+
+
+class RigidityTerm(SolidTerm):
+    """Kernels of the rigidity of a part.
+
+    A solve begins where the part is a rotation: by inertia it grows, as its vertices go straight on, and the stiff
+    energy turns it back in many iterations.
+    """
+
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: Rigidity) -> None:
+        volume = float(energy.own_points.shape_volume.sum())
+        super().__init__(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
+        # Positions (4, 3) about their mean, of which the deformation gradient is the identity.
+        corners = np.linalg.pinv(energy.own_points.gradients[0, 0]).T
+        arms = corners - energy.centre @ corners
+        self._centre = launcher.upload(energy.centre[None], wp.float64)
+        self._arms = launcher.upload(arms[None], wp.vec3d)
+
+    @override
+    def improve_start(self, positions: Any) -> None:
+        (s,), own = self.sets, self.launcher
+        inputs = [s.nodes, s.gradients, self._centre, self._arms]
+        own.launch(own.record(straighten, (own.batch, 1), inputs, [positions]))
 
 
 class BoundRigidity(BoundEnergy):
@@ -203,7 +227,7 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
     operators = np.asarray(np.linalg.cholesky(moments).T[None, :, :, None], dtype=np.float64)
     inertia = RigidInertia(Points(controls[None], operators), cells, part.density)
-    return [Rigidity(point, part.stiffness), inertia]
+    return [Rigidity(point, part.stiffness, moments.sum(0) / volume), inertia]
 
 
 def _moments(mesh: Mesh, cells: NDArray[np.int64], corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

@@ -63,6 +63,10 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),
         "benchmark sizes": Command("time and memory by linear solver and size of the body", "studies.sizes:size_study"),
         "benchmark peers": Command("a step beside another simulator's, at equal error", "studies.peers:peer_study"),
+        "benchmark peers-contact": Command(
+            "a soft block that slides and one that is held, beside other simulators",
+            "studies.peer_contact:peers_contact",
+        ),
         "benchmark gripper": Command(
             "a step of grippers in a grasp, beside one without contact", "studies.gripper:gripper_study"
         ),

@@ -7,6 +7,7 @@ Our steps are those of a roll-out without gradients in float64; the peer compute
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -60,7 +61,7 @@ def peer_study(study: PeerStudy, folder: Path) -> None:
     Raises:
         InputError: Newton is not installed.
     """
-    _newton()
+    peer_package("newton")
     results = []
     for ratio in study.poissons_ratios:
         for step in study.time_steps:
@@ -69,12 +70,64 @@ def peer_study(study: PeerStudy, folder: Path) -> None:
     show(*map(_table, results), f"Written: {folder / 'peer_study.json'}")
 
 
-def _newton() -> Any:
+def peer_package(name: str) -> Any:
+    """Returns the package of a peer.
+
+    Raises:
+        InputError: it is not installed.
+    """
     try:
-        import newton
+        return import_module(name)
     except ModuleNotFoundError:
-        raise InputError("Newton is not installed: run pip install 'warp-resphys[peer]'.") from None
-    return newton
+        message = f"The package {name} is not installed: run pip install 'warp-resphys[peer]'."
+        raise InputError(message) from None
+
+
+def newton_model(mesh: Mesh, density: float, modulus: float, ratio: float, gravity: float) -> Any:
+    """Returns a builder of Newton with tetrahedra, whose contact begins at the surface. Gravity acts along -z."""
+    newton = peer_package("newton")
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -gravity))
+    builder.add_soft_mesh(
+        pos=wp.vec3(0.0, 0.0, 0.0),
+        rot=wp.quat_identity(),
+        scale=1.0,
+        vel=wp.vec3(0.0, 0.0, 0.0),
+        vertices=[wp.vec3(*vertex) for vertex in mesh.vertices],
+        indices=mesh.cells.ravel().tolist(),
+        density=density,
+        k_mu=modulus / (2.0 * (1.0 + ratio)),
+        k_lambda=modulus * ratio / ((1.0 + ratio) * (1.0 - 2.0 * ratio)),
+        k_damp=0.0,
+        add_surface_mesh_edges=False,
+        particle_radius=0.0,
+    )
+    return builder
+
+
+def graph_of(steps: Callable[[], None], device: torch.device) -> Callable[[], object]:
+    """Takes steps once, which compiles their kernels, and returns what launches them as a graph."""
+    steps()
+    with wp.ScopedCapture(device=str(device)) as capture:
+        steps()
+    return partial(wp.capture_launch, capture.graph)
+
+
+def newton_positions(states: Sequence[Any]) -> list[Positions]:
+    """Positions (N, 3) after a first step, whose state is the last one, and a second."""
+    return [state.particle_q.numpy().astype(np.float64) for state in reversed(states)]
+
+
+def advance(
+    launch: Callable[[], object], read: Callable[[], list[Positions]], steps: int, device: torch.device
+) -> tuple[float, Positions]:
+    """Launches steps until there are enough, and returns seconds a step and the positions (T, N, 3) after every one."""
+    seconds, positions = 0.0, list[Positions]()
+    while len(positions) < steps:
+        began = now(device)
+        launch()
+        seconds += now(device) - began
+        positions += read()
+    return seconds / len(positions), np.array(positions[:steps])
 
 
 def _compare(study: PeerStudy, ratio: float, step: TimeStep) -> list[dict[str, Any]]:
@@ -126,21 +179,8 @@ def _ours(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callabl
 
 def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Callable[[float], Run]:
     """Prepares roll-outs of the peer for a number of iterations a step; a graph holds two steps, if it can."""
-    newton, device, modulus = _newton(), torch.device(study.device), study.youngs_modulus
-    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -9.80709))
-    builder.add_soft_mesh(
-        pos=wp.vec3(0.0, 0.0, 0.0),
-        rot=wp.quat_identity(),
-        scale=1.0,
-        vel=wp.vec3(0.0, 0.0, 0.0),
-        vertices=[wp.vec3(*vertex) for vertex in mesh.vertices],
-        indices=mesh.cells.ravel().tolist(),
-        density=study.density,
-        k_mu=modulus / (2.0 * (1.0 + ratio)),
-        k_lambda=modulus * ratio / ((1.0 + ratio) * (1.0 - 2.0 * ratio)),
-        k_damp=0.0,
-        add_surface_mesh_edges=False,
-    )
+    newton, device = peer_package("newton"), torch.device(study.device)
+    builder = newton_model(mesh, study.density, study.youngs_modulus, ratio, 9.80709)
     for vertex in select_vertices(mesh, x=0.0):
         builder.particle_mass[vertex] = 0.0
         builder.particle_flags[vertex] &= ~int(newton.ParticleFlags.ACTIVE)
@@ -158,23 +198,15 @@ def _theirs(study: PeerStudy, mesh: Mesh, ratio: float, step: TimeStep) -> Calla
                 solver.step(before, after, control, None, step.size)
 
         launch: Callable[[], object] = two_steps
-        two_steps()  # compiles the kernels, which is not possible while a graph is captured
         if iterations <= _IN_A_GRAPH:
-            with wp.ScopedCapture(device=str(device)) as capture:
-                two_steps()
-            launch = partial(wp.capture_launch, capture.graph)
+            launch = graph_of(two_steps, device)
+        else:
+            two_steps()  # compiles the kernels
 
         def run() -> tuple[float, Positions]:
             for state in states:
                 state.assign(rest)
-            seconds, positions = 0.0, []
-            for _ in range(-(-step.count // 2)):
-                began = now(device)
-                launch()
-                wp.synchronize_device(str(device))
-                seconds += now(device) - began
-                positions += [state.particle_q.numpy().astype(np.float64) for state in reversed(states)]
-            return seconds / len(positions), np.array(positions[: step.count])
+            return advance(launch, partial(newton_positions, states), step.count, device)
 
         return run
 
@@ -191,9 +223,9 @@ def _table(result: Mapping[str, Any]) -> Sheet:
     return Sheet.of(title, columns, [{**row, "ours": at_equal_error(row, ours)} for row in result["rows"]])
 
 
-def at_equal_error(row: Mapping[str, Any], ours: Sequence[Mapping[str, Any]]) -> str:
-    """Our least time at no more than the error of a row of the peer's, as text; a dash if none reaches it."""
-    if row["solver"] != "VBD":
+def at_equal_error(row: Mapping[str, Any], ours: Sequence[Mapping[str, Any]], time: str = "ms") -> str:
+    """Our least time at no more than the error of a row of a peer's, as text; a dash if none reaches it."""
+    if row["solver"] in {own["solver"] for own in ours}:
         return ""
-    times = [own["ms"] for own in ours if own["error_mm"] <= row["error_mm"]]
+    times = [own[time] for own in ours if own["error_mm"] <= row["error_mm"]]
     return f"{min(times):.3g}" if times else "-"

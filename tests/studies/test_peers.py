@@ -8,7 +8,8 @@ from support.command_line import outcome, refusal
 from warp_resphys.io.files import read_json
 from warp_resphys.studies.peers import at_equal_error
 
-OURS = [{"ms": 1.0, "error_mm": 1e-2}, {"ms": 3.0, "error_mm": 1e-4}, {"ms": 2.0, "error_mm": 5e-5}]
+TIMES = ((1.0, 1e-2), (3.0, 1e-4), (2.0, 5e-5))
+OURS = [{"solver": "quasi_newton", "ms": ms, "error_mm": error} for ms, error in TIMES]
 
 
 @pytest.mark.parametrize(("error", "said"), [(1e-1, "1"), (1e-3, "2"), (6e-5, "2"), (1e-6, "-")])

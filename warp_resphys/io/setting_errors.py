@@ -137,11 +137,14 @@ def _array(node: Schema, schema: Schema) -> str:
     items = node.get("prefixItems", [node.get("items", {})])
     members = in_words(items[0], schema).removeprefix("a ")
     members = re.sub(r"\b(number|word|list|group)\b", r"\1s", members, count=1)
+    members = members.removeprefix("one ") if members.startswith("one of ") else members
     members = f"lists of {members}" if members.partition(" ")[0] in _NUMBERS else members
     least, most = node.get("minItems", 0), node.get("maxItems")
     if least == most and least < len(_NUMBERS):
         return f"{_NUMBERS[least]} {members}"
-    return f"a list of {f'{_NUMBERS[least]} or more ' if 0 < least < len(_NUMBERS) else ''}{members}"
+    if 0 < least < len(_NUMBERS):
+        return f"a list of {_NUMBERS[least]} or more {members}"
+    return f"a list of {members.removeprefix('of ')}"
 
 
 def _range(node: Schema) -> str:

@@ -14,7 +14,7 @@ REFERENCE = "reference={time_step: 0.001, distance: 1e-5, tolerance: 1e-8}"
 BARRIER = (
     "barrier=[{time_step: 4e-3, distance: 1e-3, tolerance: 1e-4}, {time_step: 1e-3, distance: 1e-4, tolerance: 1e-4}]"
 )
-VBD = "vbd=[{time_step: 1e-3, stiffness: 1e4, iterations: 20}]"
+VBD = "vbd=[{time_step: 1e-3, stiffness: 1e4, damping: 0.0, iterations: 20}]"
 FLEX = "flex=[{time_step: 1e-3, solver: CG, tolerance: 1e-6, time_constant: 1e-3, impedance: 0.99}]"
 
 

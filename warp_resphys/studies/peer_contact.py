@@ -35,7 +35,7 @@ from ..fem.body import Body
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.progress import Progress
-from ..io.settings import Many, Natural, Positive, Settings, Share, Some, Vector, Word, setting
+from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
 from ..mesh.mesh import Mesh, box_tetrahedra
 from ..mesh.quality import cell_volumes
 from ..stepping.state import State
@@ -71,6 +71,7 @@ class VbdSetting(ProgramSetting):
     """A setting of Newton's VBD."""
 
     stiffness: Positive = setting(unit="N/m")
+    damping: NotNegative = setting(unit="N s/m")
     iterations: Natural
 
 
@@ -247,7 +248,7 @@ def _vbd(scene: PeerScene, values: VbdSetting, device: torch.device) -> Run:
         builder.add_shape_plane((*normal.tolist(), -float(point @ normal)), width=0.0, length=0.0)
     builder.color()
     model = builder.finalize(device=str(device))
-    for name, value in {"ke": values.stiffness, "kd": 0.0, "mu": study.friction}.items():
+    for name, value in {"ke": values.stiffness, "kd": values.damping, "mu": study.friction}.items():
         setattr(model, f"soft_contact_{name}", value)
         getattr(model, f"shape_material_{name}").fill_(value)
     collisions = newton.CollisionPipeline(model)

@@ -18,7 +18,7 @@ from .launcher import Launcher, warp_view
 
 _FIRST_CAPACITY = 4096
 _REBUILT = 100  # Uses of a hierarchy of boxes after which it is made anew.
-_SPARE = 1.5  # radius within which pairs are sought, over the way of a vertex
+_SPARE = 0.75  # radius around the middle of a way within which pairs are sought, over its length
 _PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
 
 
@@ -192,10 +192,10 @@ class PairList:
         return (ways - mean[:, -1:]).norm(dim=-1), (ways - mean[:, self._pieces]).norm(dim=-1)
 
     def find(self, origin: torch.Tensor, ways: torch.Tensor) -> None:
-        """Makes the list for positions (B, N, 3) and around ways (B, N, 3) from there [m]."""
+        """Makes the list for positions (B, N, 3) and ways (B, N, 3) from there, around the middle of these [m]."""
         own, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
-        self._origin, self._outer, self._inner = origin.clone(), outer, inner
+        self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
         motion = broad_phase.Sweep()
         motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
         motion.outer, motion.inner = warp_view(outer, wp.float64), warp_view(inner, wp.float64)

@@ -15,7 +15,7 @@ from ..data.input_response import InputResponse, response_of
 from ..data.observation import Observation
 from ..data.trials import Trials
 from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import InputError
+from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .feedback_equilibrium import equilibrium_under_feedback
@@ -257,7 +257,14 @@ class Replay:
             here = self._beside[0].linearise(state, now, own)
             here.factorise(x)
             residual = here.residual(x)
-            there = self._beside[1].linearise(varied, their_inputs.at(k), their)
+            try:
+                there = self._beside[1].linearise(varied, their_inputs.at(k), their)
+            except InputError as error:
+                raise ConvergenceError(
+                    f"the motion depends so much on the parameters that it has no derivatives after step {k}: {error}",
+                    None,
+                    None,
+                ) from error
             at = x.repeat(sets - 1, 1, 1)
             forces = (there.residual(at) - residual.repeat(sets - 1, 1, 1)).unflatten(0, (sets - 1, count))
             moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, PointMass, Simulator, Tendons
+from warp_resphys import Body, Contact, Corotated, HalfSpace, PointMass, Simulator, Tendons
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.modes import vibration_modes
@@ -211,6 +211,15 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
     torch.testing.assert_close(
         (along[1:] - along[0]) / 1e-5, differences, rtol=1e-3, atol=1e-4 * float(differences.abs().max())
     )
+
+
+def test_states_within_an_obstacle_are_no_derivatives():
+    """The second floor is where the first body, whose floor lies far below, falls through it."""
+    floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))})
+    sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=[floor]), Corotated(5e4, 0.45), time_step=0.01)
+    replay = Replay(sim, MARKERS, blank(20, masses=(0.0,)))
+    with pytest.raises(ConvergenceError, match="no derivatives from step 2 on"):
+        replay.varied(at_rest(sim, 1), {"obstacle_z": double([-0.05, 0.0])})
 
 
 def test_markers_that_were_not_seen_have_no_influence():

@@ -18,7 +18,7 @@ CPU = torch.device("cpu")
 CASES = cases()
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in ("mat", "rollers")])
+@pytest.mark.parametrize("name", [name for name in CASES if name not in ("mat", "rollers", "tentacle")])
 def test_surfaces_cross_without_contact_alone(name):
     """A case passes; without contact its surfaces cross."""
     case = replace(CASES[name], steps=min(CASES[name].steps, 40))
@@ -51,6 +51,24 @@ def test_a_mat_is_turned_until_it_touches_itself():
     short = replace(case, steps=24, time_step=0.1)
     assert check_case("mat", short, CPU).passed
     assert not check_case("free", replace(short, contact=None), CPU).passed
+
+
+def test_a_tentacle_curls_around_its_post_and_onto_itself():
+    """Its axis makes a whole turn around the post, and parts that are far from one another at rest are within reach."""
+    case = CASES["tentacle"]
+    body = case.bodies["tentacle"]
+    post, rest = body.energies[1].obstacles["post"], body.mesh.vertices
+    out = run_case(case, CPU)
+    assert (out.crossings, out.failed) == (0, 0)
+    levels = rest[:, 2].round(6)
+    axis = np.stack([out.end[levels == z].mean(0) for z in np.unique(levels)])[:, [0, 2]] - [0.04, -0.09]
+    assert np.linalg.norm(axis, axis=1).min() > post.radius
+    assert np.ptp(np.unwrap(np.arctan2(axis[:, 1], axis[:, 0]))) > 2.0 * math.pi
+    pairs, end = PairList(Launcher(1, CPU), Surface.of(body.mesh), case.distance), torch.from_numpy(out.end)[None]
+    pairs.find(end, torch.zeros_like(end))
+    first, second = rest[pairs.nodes[:, 0], 2], rest[pairs.nodes[:, 3], 2]
+    assert pairs.distances(end).numpy()[np.abs(first - second) > 0.1].min() < case.distance
+    assert run_case(replace(case, contact=None), CPU).crossings > 0
 
 
 def test_an_error_is_a_failed_check():

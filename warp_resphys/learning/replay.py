@@ -260,11 +260,8 @@ class Replay:
             try:
                 there = self._beside[1].linearise(varied, their_inputs.at(k), their)
             except InputError as error:
-                raise ConvergenceError(
-                    f"the motion depends so much on the parameters that it has no derivatives after step {k}: {error}",
-                    None,
-                    None,
-                ) from error
+                message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
+                raise ConvergenceError(message, None, None) from error
             at = x.repeat(sets - 1, 1, 1)
             forces = (there.residual(at) - residual.repeat(sets - 1, 1, 1)).unflatten(0, (sets - 1, count))
             moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))

@@ -6,6 +6,7 @@ mat                 both ends of a mat are turned against one another until it t
 rollers             two turning cylinders draw a soft block between them
 funnel              a soft ball is forced through a funnel narrower than itself
 clip                the ends of a U are pressed on one another
+tentacle            a tendon curls a tentacle around a post and onto itself
 cards               houses of cards stand with more friction than statics asks, and fall with less
 ==================  ==================================================================================================
 
@@ -31,9 +32,10 @@ from ..dynamics.simulator import Simulator
 from ..energies.contact import Contact
 from ..energies.launcher import Launcher
 from ..energies.materials import Material, StableNeoHookean
-from ..energies.obstacles import HalfSpace
+from ..energies.obstacles import Cylinder, HalfSpace
 from ..energies.pairs import PairList, Surface
 from ..energies.surfaces import SurfaceContact
+from ..energies.tendons import Tendons
 from ..fem.body import Body
 from ..fem.rigid import Rigid
 from ..fem.scene import Scene
@@ -73,6 +75,7 @@ class Case:
         velocities: velocities (3,) at the start, by body [m/s].
         force: (N, 3) external force on the vertices of all bodies, or None [N].
         drive: returns the positions (D, 3) of the fixed vertices [m] from those at rest and the share of the time.
+        pull: largest tensions of the tendons of a body, by its name, which are reached at two thirds of the time [N].
         passes: a body, and the coordinate x that its middle passes until the end [m]; or None.
     """
 
@@ -86,6 +89,7 @@ class Case:
     velocities: Mapping[str, Sequence[float]] = field(default_factory=dict)
     force: FloatArray | None = None
     drive: Callable[[FloatArray, float], FloatArray] | None = None
+    pull: Mapping[str, Sequence[float]] = field(default_factory=dict)
     passes: tuple[str, float] | None = None
 
     def simulator(self, device: torch.device) -> Simulator:
@@ -97,11 +101,14 @@ class Case:
     def inputs(self, simulator: Simulator) -> Inputs:
         """Returns the inputs of all steps."""
         force = None if self.force is None else simulator.tensor(self.force)
+        rise = simulator.tensor([min(1.5 * (k + 1) / self.steps, 1.0) for k in range(self.steps)])[:, None, None]
+        pulled = {name: Inputs(tendon_tension=rise * simulator.tensor(most)) for name, most in self.pull.items()}
+        own = Scene(self.bodies).inputs(pulled)
         if self.drive is None:
-            return Inputs(external_force=force)
+            return own.replace(external_force=force)
         rest = simulator.rest_positions[simulator.fixed].cpu().numpy()
         places = np.stack([self.drive(rest, (k + 1) / self.steps) for k in range(self.steps)])
-        return Inputs(external_force=force, fixed_positions=simulator.tensor(places[:, None]))
+        return own.replace(external_force=force, fixed_positions=simulator.tensor(places[:, None]))
 
 
 @dataclass(frozen=True)
@@ -186,7 +193,8 @@ def check_case(name: str, case: Case, device: torch.device) -> Check:
 
 def cases() -> dict[str, Case]:
     """Returns all cases by name."""
-    return {**erleben_cases(), "mat": mat(), "rollers": rollers(), "funnel": funnel(), "clip": clip()}
+    driven = {"mat": mat(), "rollers": rollers(), "funnel": funnel(), "clip": clip(), "tentacle": tentacle()}
+    return {**erleben_cases(), **driven}
 
 
 def cone(apex: ArrayLike, triangles: ArrayLike) -> Mesh:
@@ -337,6 +345,21 @@ def clip() -> Case:
     body = {"clip": Body(mesh, fixed=select_vertices(mesh, x=0.0))}
     contact = SurfaceContact(1e5, 0.3, distance)
     return Case(body, contact, distance, 40, 0.004, SOFT, (0.0, 0.0, 0.0), force=force)
+
+
+def tentacle() -> Case:
+    """Returns the case of a tentacle that a tendon curls around a post, until its end lies on its upper part."""
+    length, distance, slip_speed = 0.28, 5e-4, 2e-2
+    mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], [[0.0, 0.0065], [length, 0.0055]], 12, nodes=20)
+    curl, side = (
+        np.linspace([x, y, 0.0], [end_x, end_y, -length], 21)
+        for x, y, end_x, end_y in ((0.006, 0.0, 0.0031, 0.0), (0.0, 8e-4, 0.0, 6e-4))
+    )
+    post = Cylinder(position=(0.04, 0.0, -0.09), axis=(0.0, 1.0, 0.0), radius=0.016, length=0.12)
+    touches = Contact({"post": post}, 2e4, 0.3, 2.0 * distance, slip_speed)
+    body = Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=[Tendons([curl, side]), touches])
+    contact, soft = SurfaceContact(2e4, 0.3, distance, slip_speed), replace(_RUBBER, youngs_modulus=2.3e5)
+    return Case({"tentacle": body}, contact, distance, 120, material=soft, pull={"tentacle": (2.7, 1.5)})
 
 
 @dataclass

@@ -8,8 +8,8 @@ sphere, cylinder    are pressed into a bonded layer with the forces of theory (`
 throws, plates      no vertex of a surface penetrates, and every solve converges
 energy              implicit Euler gains none
 bodies              on one another (`surface_check`)
-cases               of Erleben, a mat, rollers, a funnel, a clip and a tentacle, whose surfaces never cross; a house of cards stands
-                    and falls by its friction (`contact_cases`)
+cases               of Erleben, a mat, rollers, a funnel, a clip and a tentacle, whose surfaces never cross; a house of
+                    cards stands and falls by its friction (`contact_cases`)
 ==================  ==================================================================================================
 """
 

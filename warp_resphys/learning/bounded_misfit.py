@@ -59,7 +59,10 @@ class BoundedMisfit(ABC):
     Attributes:
         bounds: see above.
         prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
+        failure: message of the last simulation that failed.
     """
+
+    failure = ""
 
     def __init__(self, bounds: Mapping[str, Bounds]) -> None:
         self.bounds, self.prior_weight = dict(bounds), 0.0

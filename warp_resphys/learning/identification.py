@@ -147,7 +147,8 @@ class ParameterSearch:
                 keep(attempts)
         good = [attempt for attempt in attempts if attempt["loss"] is not None]
         if not good:
-            raise ConvergenceError("the simulation failed at every start of the identification.", None, None)
+            reason = self._misfit.failure or "motions that are not finite"
+            raise ConvergenceError(f"the simulation failed at every start of the identification: {reason}", None, None)
         best, misfit = min(good, key=lambda attempt: attempt["loss"]), self._misfit
         unit = misfit.to_unit(best["parameters"])
         misfit.prior_weight = best.get("prior_weight", 0.0)

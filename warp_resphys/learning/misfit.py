@@ -169,7 +169,8 @@ class Misfit(BoundedMisfit):
                 if derivatives and not any(self._equilibria):
                     self._find_equilibria(points[:1])
                 series = self._simulated(points, varied=derivatives)
-        except ConvergenceError:
+        except ConvergenceError as error:
+            self.failure = str(error)
             return None
         self._keep_equilibria(points)
         fitted, nuisances = self._fit(series, self.prior_weight)

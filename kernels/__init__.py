@@ -24,3 +24,10 @@ Block (k, n) of a tangent is the derivative of column k of the stress by column 
 (n, k) is its transpose. For every energy, the stiffness between two nodes with operators g and g' is the sum of
 g_k g'_n (k, n).
 """
+
+import warp as wp
+
+from .messages import Messages
+
+if type(wp.get_logger()).__module__.startswith("warp."):  # else the user's own
+    wp.set_logger(Messages())

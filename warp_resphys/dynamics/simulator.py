@@ -147,6 +147,14 @@ class Simulator:
                 "solver is projective_dynamics, whose constant matrix knows no contact: choose quasi_newton."
             )
 
+    def __repr__(self) -> str:
+        """Body, names of the materials' laws, time step, integrator, dtype and device."""
+        laws = ", ".join(
+            f"{name}: {type(m).__name__}" if name else type(m).__name__ for name, m in self.materials.items()
+        )
+        numbers = f"{1e3 * self.time_step:g} ms, {self.integrator}, {self.dtype}, {self.device}"
+        return f"Simulator({self.body!r}, {laws or 'no material'}, {numbers})"
+
     @property
     def materials(self) -> dict[str, Material]:
         """Materials by name of region or body; a single material for all has an empty name."""
@@ -412,7 +420,7 @@ class Simulator:
             ConvergenceError: no equilibrium was found, or the body grows without bound, like an inflated one whose
                 material cannot resist the pressure.
         """
-        inputs = _NO_INPUTS if inputs is None else inputs
+        inputs = self._fitted(inputs)
         constants = self.prepare(parameters)
         if batch is None:
             given = [*inputs.fields.values(), *([] if start is None else [start])]
@@ -420,7 +428,7 @@ class Simulator:
         state = self.rest_state(batch) if after is None else after
         if state.batch == 1 < batch:
             state = state.map(lambda value: torch.cat([value] * batch))
-        self._checked(state, inputs, constants)
+        inputs, constants = self._checked(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
         if not self.is_held(state, inputs, constants):
@@ -489,7 +497,7 @@ class Simulator:
             ConvergenceError: as in `step`.
         """
         _check_count("steps", steps)
-        inputs = _NO_INPUTS if inputs is None else inputs
+        inputs = self._fitted(inputs, state.batch)
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
         states, reports, unchecked = [state], [], []
@@ -516,16 +524,22 @@ class Simulator:
         self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None
     ) -> tuple[Inputs, Constants]:
         """Returns inputs and constants, or raises InputError if these or the state do not fit."""
-        inputs, constants = _NO_INPUTS if inputs is None else inputs, self.prepare(parameters)
+        inputs, constants = self._fitted(inputs, state.batch), self.prepare(parameters)
         state.check(self.body.n_vertices, self.rest_positions)
         self._check_inputs(inputs, state.batch)
         constants.check_batch(state.batch)
         self._energies.check_memory(state.memory, state.batch, self.rest_positions)
         return inputs, constants
 
-    def _check_inputs(self, inputs: Inputs, batch: int) -> None:
-        """Raises InputError for inputs that do not fit."""
+    def _fitted(self, inputs: Inputs | None, batch: int | None = None) -> Inputs:
+        """Returns inputs with the simulator's device and dtype where they are numbers (`Inputs.fitted`)."""
+        if inputs is None:
+            return _NO_INPUTS
         if not isinstance(inputs, Inputs):
             raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
+        return inputs.fitted(self.counts, self.rest_positions, batch)
+
+    def _check_inputs(self, inputs: Inputs, batch: int) -> None:
+        """Raises InputError for inputs that do not fit."""
         accepted = {name: (quantity, self.counts[name]) for name, quantity in self.inputs.items()}
         inputs.check(accepted, batch, self.body.n_vertices, len(self.fixed), self.rest_positions)

@@ -13,6 +13,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create
 from ..mesh.motion_files import write_vtk
+from ..stepping.inputs import shapes
 from ..stepping.state import State
 from .nonlinear_solver import SolveReport
 
@@ -28,6 +29,11 @@ class Trajectory:
     body: Body
     time_step: float  # [s]
     obstacles: tuple[ObstacleMotion, ...] = ()
+
+    def __repr__(self) -> str:
+        """Number and length of the steps, and shapes of the tensors."""
+        given = ", ".join(shapes({"q": self.q, "v": self.v}))
+        return f"Trajectory({len(self.reports)} steps of {1e3 * self.time_step:g} ms, {given})"
 
     @property
     def times(self) -> NDArray[np.float64]:

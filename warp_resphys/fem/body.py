@@ -160,6 +160,12 @@ class Body:
         """(N, 3) rest positions [m]."""
         return self.mesh.vertices
 
+    def __repr__(self) -> str:
+        """Mesh, number of fixed vertices, and names of parts."""
+        parts = [repr(self.mesh), f"{len(self.fixed_vertices)} fixed vertices"]
+        parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
+        return f"Body({', '.join(parts)})"
+
     @property
     def n_vertices(self) -> int:
         """Number of vertices N."""

@@ -42,6 +42,11 @@ class Scene(Body):
     bodies: Mapping[str, Body]
     contact: BodyEnergy | None
 
+    @override
+    def __repr__(self) -> str:
+        parts = [f"{name}: {body!r}" for name, body in self.bodies.items()]
+        return f"Scene({', '.join(parts)}{'' if self.contact is None else f', {self.contact!r}'})"
+
     @cached_property
     def mesh(self) -> Mesh:
         """The joined mesh; its regions are the bodies, and their regions under the names ``body_region``.

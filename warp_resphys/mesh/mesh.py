@@ -78,6 +78,11 @@ class Mesh:
         """Name of the cells' kind, such as "hexahedron"."""
         return self.element.name
 
+    def __repr__(self) -> str:
+        """Sizes and regions."""
+        regions = f", regions {', '.join(self.regions)}" if self.regions else ""
+        return f"Mesh({len(self.vertices)} vertices, {len(self.cells)} cells: {self.kind}{regions})"
+
 
 # Steps along x, y and z from the lowest corner.
 _BRICK_CORNERS = (ELEMENTS["hexahedron"].shape.nodes.astype(np.int64) + 1) // 2

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from ..io.errors import InputError
 from .quantity import Quantity
@@ -13,7 +15,8 @@ class Inputs:
     """Inputs of a batch for one step or for T steps; every field is optional and differentiable.
 
     Every field but ``attached_mass`` may have a leading time axis T; `at` selects one step. A field without time and
-    batch axes, such as (N, 3) or (n,), is a batch of one.
+    batch axes, such as (N, 3) or (n,), is a batch of one. Numbers and lists are for every environment, and a number is
+    for every chamber or tendon.
 
     Args:
         external_force: (B, N, 3) or (T, B, N, 3), constant during a step, without gravity [N].
@@ -28,11 +31,14 @@ class Inputs:
 
     def __init__(
         self,
-        external_force: torch.Tensor | None = None,
-        fixed_positions: torch.Tensor | None = None,
-        attached_mass: torch.Tensor | None = None,
-        **actuation: torch.Tensor | None,
+        external_force: torch.Tensor | ArrayLike | None = None,
+        fixed_positions: torch.Tensor | ArrayLike | None = None,
+        attached_mass: torch.Tensor | ArrayLike | None = None,
+        **actuation: torch.Tensor | ArrayLike | None,
     ) -> None:
+        given = {"external_force": external_force, "fixed_positions": fixed_positions, "attached_mass": attached_mass}
+        plain = {n for n, x in (given | actuation).items() if not (x is None or isinstance(x, torch.Tensor))}
+        self._plain = frozenset(plain)  # names of fields given as numbers or lists
         self.external_force = _batched(external_force, 2)
         self.fixed_positions = _batched(fixed_positions, 2)
         self.attached_mass = _batched(attached_mass, 1)
@@ -40,6 +46,33 @@ class Inputs:
         for name, value in actuation.items():
             if (values := _batched(value, 1)) is not None:
                 self.actuation[name] = values
+
+    def __repr__(self) -> str:
+        """Shapes of the fields."""
+        return f"Inputs({', '.join(shapes(self.fields))})"
+
+    def fitted(self, counts: Mapping[str, int], like: torch.Tensor, batch: int | None = None) -> "Inputs":
+        """Returns the inputs with fields given as numbers or lists on a device, and for every environment.
+
+        Args:
+            counts: number of values of the inputs of energies by name.
+            like: a tensor with device and dtype.
+            batch: number of environments; None for one, which may become more.
+        """
+        if not self._plain:
+            return self
+        fields = self.fields
+        for name in self._plain:
+            value = fields[name].to(like)
+            if not value.ndim:
+                value = value.expand(1, counts.get(name, 1))
+            axis = -2 if name in self.actuation or name == "attached_mass" else -3
+            if batch is not None and value.shape[axis] == 1:
+                value = value.expand(*value.shape[:axis], batch, *value.shape[axis + 1 :])
+            fields[name] = value
+        fitted = Inputs(**fields)
+        fitted._plain = frozenset() if batch is not None else self._plain
+        return fitted
 
     @property
     def fields(self) -> dict[str, torch.Tensor]:
@@ -150,9 +183,24 @@ class Inputs:
                 accepted[name][0].check(values)
 
 
-def _batched(values: torch.Tensor | None, axes: int) -> torch.Tensor | None:
-    """Adds the batch axis to a field that has only `axes` axes."""
-    return values[None] if isinstance(values, torch.Tensor) and values.ndim == axes else values
+def _batched(values: torch.Tensor | ArrayLike | None, axes: int) -> torch.Tensor | None:
+    """Adds the batch axis to a field that has only `axes` axes.
+
+    Raises:
+        InputError: neither a tensor nor numbers.
+    """
+    if values is None:
+        return None
+    try:
+        tensor = values if isinstance(values, torch.Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"an input is {values!r}: give a tensor, a number or a list of numbers.") from None
+    return tensor[None] if tensor.ndim == axes else tensor
+
+
+def shapes(tensors: Mapping[str, torch.Tensor]) -> list[str]:
+    """Returns names and shapes of tensors in words."""
+    return [f"{name} {tuple(tensor.shape)}" for name, tensor in tensors.items()]
 
 
 def check_tensor(name: str, values: Any, shape: tuple[int, ...], unit: str, place: str, like: torch.Tensor) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from ..io.errors import InputError
-from .inputs import check_tensor
+from .inputs import check_tensor, shapes
 
 _MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
@@ -21,6 +21,10 @@ class State:
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, for BDF2
     # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Shapes of the tensors."""
+        return f"State({', '.join(shapes(self.tensors()))})"
 
     @property
     def batch(self) -> int:

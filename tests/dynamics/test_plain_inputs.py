@@ -1,0 +1,73 @@
+"""Inputs given as numbers and lists, and what Python prints of a simulation."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    Scene,
+    Simulator,
+    SurfaceContact,
+    Tendons,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.io.errors import InputError
+
+MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))
+ROUTES = [[[x, 0.01, z] for x in (0.0, 0.05, 0.1)] for z in (0.002, 0.018)]
+
+
+def pulled(dtype=torch.float64):
+    body = Body(MESH, fixed=select_vertices(MESH, x=0.0), energies=[Tendons(ROUTES)])
+    return Simulator(body, Corotated(2e5, 0.45), dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_numbers_and_lists_are_for_every_environment(dtype, batch):
+    simulator = pulled(dtype)
+    start = simulator.rest_state(batch)
+    series = np.linspace(0.1, 0.2, 3)[:, None, None] * np.ones((1, batch, 2))
+    cases = [
+        (0.2, [[0.2, 0.2]] * batch),
+        ([0.1, 0.3], [[0.1, 0.3]] * batch),
+        (np.array([[0.1, 0.3]]), [[0.1, 0.3]] * batch),
+        (series, series),
+        (series[:, :1], series),
+    ]
+    for given, expected in cases:
+        path = simulator.rollout(start, 3, Inputs(tendon_tension=given))
+        other = simulator.rollout(start, 3, Inputs(tendon_tension=simulator.tensor(expected)))
+        assert torch.equal(path.q, other.q)
+    rest = simulator.static_equilibrium(Inputs(tendon_tension=0.2), batch=batch).q
+    assert rest.shape[0] == batch
+    assert torch.equal(rest, simulator.static_equilibrium(Inputs(tendon_tension=simulator.tensor(cases[0][1]))).q)
+    force = np.zeros((len(MESH.vertices), 3))
+    force[-1, 2] = 0.01
+    moved = simulator.step(start, Inputs(external_force=force))[0].q
+    assert float((moved - simulator.step(start)[0].q)[:, -1, 2].min()) > 0.0
+
+
+def test_what_is_no_number_is_refused():
+    with pytest.raises(InputError, match="an input is 'much'"):
+        Inputs(tendon_tension="much")
+    simulator = pulled()
+    with pytest.raises(InputError, match=r"tendon_tension has shape \(1, 3\)"):
+        simulator.step(simulator.rest_state(), Inputs(tendon_tension=[0.1, 0.2, 0.3]))
+
+
+def test_simulations_are_printed_in_a_line():
+    simulator = pulled()
+    inputs = Inputs(tendon_tension=[0.1, 0.2])
+    path = simulator.rollout(simulator.rest_state(), 2, inputs)
+    scene = Scene({"a": simulator.body, "b": Body.rigid_body(MESH)}, SurfaceContact(distance=1e-4))
+    body = "Body(Mesh(20 vertices, 4 cells: hexahedron), 4 fixed vertices, Tendons)"
+    assert repr(simulator) == f"Simulator({body}, Corotated, 10 ms, implicit_euler, torch.float64, cpu)"
+    assert repr(path.final).startswith("State(q (1, 20, 3), v (1, 20, 3)")
+    assert repr(path) == "Trajectory(2 steps of 10 ms, q (3, 1, 20, 3), v (3, 1, 20, 3))"
+    assert repr(inputs) == "Inputs(tendon_tension (1, 2))"
+    assert repr(scene).startswith(f"Scene(a: {body}, b: Body(Mesh(20 vertices, 4 cells: hexahedron, regions body)")

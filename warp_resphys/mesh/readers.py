@@ -178,7 +178,9 @@ def _volume_cells(arrays: Arrays) -> IntArray:
     solids = {name.removeprefix("solid/"): cells for name, cells in arrays.items() if name.startswith("solid/")}
     if not solids:
         others = ", ".join(sorted({*arrays["types"].tolist()})) or "no cells"
-        raise MeshError(f"the file has no tetrahedra or hexahedra (only: {others}); mesh the volume first")
+        raise MeshError(
+            f"the file has no tetrahedra or hexahedra (only: {others}): mesh its inside by mesh=surface mesh.path=FILE"
+        )
     if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
         supported = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
         raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {supported}, and of one kind")

@@ -101,7 +101,7 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
     vertices = METRES[units] * vertices
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
-        raise MeshError(f"{path}: the surface is {across:.3g} m across in {units}: check the unit of its coordinates.")
+        raise MeshError(f"{path}: the surface is {across:.3g} m across in {units}: check mesh.units.")
     volumes = [_volume(vertices, shell) for shell in shells]
     outer = vertices[shells[int(np.argmax(volumes))]].reshape(-1, 3)
     for shell in shells:

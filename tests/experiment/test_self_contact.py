@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from support.configured import check, composed, settings
-from warp_resphys.energies.surfaces import SurfaceContact
+from warp_resphys.energies.surfaces import FrictionPair, SurfaceContact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
@@ -32,6 +32,21 @@ def test_its_parameters_can_be_identified_and_have_words():
     given = {"surface_friction": torch.tensor([0.1, 0.7], dtype=torch.float64)}
     assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.1], [0.7]]
     assert parameter_wording("surface_friction")[:2] == ("Friction between surfaces", "")
+
+
+def test_friction_of_pairs_of_regions_is_configured_and_identified():
+    pairs = "self_contact.pairs={pad: {first: lower, second: body, friction: 0.8}}"
+    run = settings(*ABOVE, pairs)
+    (contact,) = build_body(run).energies
+    assert contact.pairs == {"pad": FrictionPair("lower", "body", 0.8)}
+    simulator = build_simulator(run, run.simulation)
+    given = {"surface_friction_pad": torch.tensor([0.5, 0.6], dtype=torch.float64)}
+    assert given.keys() <= {*identifiable_parameters(simulator)}
+    assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.3, 0.5], [0.3, 0.6]]
+    assert parameter_wording("surface_friction_pad")[0] == "Friction between surfaces, 'pad'"
+    run = settings(*ABOVE, pairs.replace("body", "shell"))
+    with pytest.raises(InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"):
+        build_body(run)
 
 
 def test_a_beam_lies_on_another_one():

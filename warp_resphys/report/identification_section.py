@@ -204,6 +204,8 @@ def parameter_wording(parameter: str) -> Wording:
     if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
         kind, unit, factor = _PARAMETERS[offset[1]]
         return f"{kind.removesuffix(' of the tendons')} of the tendon '{offset[2]}'", unit, factor
+    if pair := re.fullmatch(r"surface_friction_(.+)", parameter):
+        return f"Friction between surfaces, {pair[1]!r}", "", 1.0
     if obstacle := re.fullmatch(
         r"(contact_(?:stiffness|friction)|obstacle_(?:growth|(?:turn_)?[xyz]))_(.+)", parameter
     ):

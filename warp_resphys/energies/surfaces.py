@@ -167,8 +167,8 @@ class BoundSurfaceContact(BoundEnergy):
         members = body.bodies.values() if isinstance(body, Scene) else (body,)
         if any(member.glued or member.symmetry for member in members):
             raise InputError(
-                "contact between surfaces counts the whole surface of a mesh as free: leave out symmetry planes and "
-                "glue."
+                "contact between surfaces acts on the whole boundary of a mesh, also where it is cut or glued: leave "
+                "out symmetry planes and glue."
             )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)

@@ -27,7 +27,7 @@ g_k g'_n (k, n).
 
 import warp as wp
 
-from .messages import Messages
+from .messages import QuietLogger
 
 if type(wp.get_logger()).__module__.startswith("warp."):  # else the user's own
-    wp.set_logger(Messages())
+    wp.set_logger(QuietLogger())

@@ -6,8 +6,8 @@ import warnings
 import warp as wp
 
 
-class Messages:
-    """A logger of Warp that leaves out its greeting and the loading of compiled modules of this package.
+class QuietLogger:
+    """A logger of Warp, for the whole process, that leaves out its greeting and the loading of modules of this package.
 
     Kernels that are compiled are named, as that takes seconds. ``wp.config.log_level = wp.LOG_DEBUG`` shows everything,
     and `wp.set_logger(None)` brings back Warp's own logger.
@@ -25,7 +25,7 @@ class Messages:
 
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
         """Issues a warning."""
-        warnings.warn(message, category or UserWarning, stacklevel=stacklevel + 1)
+        warnings.warn(message, category or UserWarning, stacklevel=stacklevel)
 
     def error(self, message: str) -> None:
         """Prints an error."""

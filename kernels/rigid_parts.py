@@ -16,7 +16,7 @@ def straighten(
     arms: wp.array2d[wp.vec3d],  # (P, 4) from there to the control vertices at rest [m]
     positions: wp.array2d[wp.vec3d],
 ):
-    """Turns every part as its deformation gradient does, without its strain, about its centre of mass."""
+    """Replaces the deformation gradient of every part by its rotation, with the centre of mass in its place."""
     b, p = wp.tid()
     r = polar_rotation(deformation_gradient(positions, nodes, gradients, b, p, p))
     middle = wp.vec3d()

@@ -507,14 +507,14 @@ def grip_tangents(
 
 
 @wp.kernel
-def place(
+def interpolate(
     vertices: wp.array[int],  # (P) of the surface
     nodes: wp.array2d[int],
     weights: wp.array2d[wp.float64],
     field: wp.array2d[wp.vec3d],  # (B, N) at control vertices
     field_out: wp.array2d[wp.vec3d],  # (B, N)
 ):
-    """Sets a field at the vertices of a surface from that at control vertices."""
+    """Sets a field at the vertices of a surface from that at control vertices, and leaves it elsewhere."""
     b, p = wp.tid()
     field_out[b, vertices[p]] = line_at(field, nodes, weights, b, p, p)
 

@@ -52,12 +52,58 @@ def test_numbers_and_lists_are_for_every_environment(dtype, batch):
     assert float((moved - simulator.step(start)[0].q)[:, -1, 2].min()) > 0.0
 
 
-def test_what_is_no_number_is_refused():
-    with pytest.raises(InputError, match="an input is 'much'"):
-        Inputs(tendon_tension="much")
+@pytest.mark.parametrize("given", [0.2, [0.1, 0.3], np.array([0.1, 0.3]), torch.tensor(0.2)])
+def test_numbers_stay_numbers_in_other_inputs(given):
+    """In float32, for two environments, by every method that makes other inputs of some."""
+    simulator = pulled(torch.float32)
+    start, force = simulator.rest_state(2), simulator.tensor(np.full((2, len(MESH.vertices), 3), 1e-3))
+    inputs = Inputs(tendon_tension=given)
+    expected = simulator.step(start, Inputs(tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
+    pushed = simulator.step(start, Inputs(force, tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
+    axis = torch.tensor([0])
+    for other in (inputs.at(0), inputs.replace(attached_mass=None), inputs.to(force), inputs.repeat(1)):
+        assert torch.equal(simulator.step(start, other)[0].q, expected)
+    for other in (inputs.plus(force), inputs.replace(external_force=force)):
+        assert torch.equal(simulator.step(start, other)[0].q, pushed)
+    alone = simulator.step(simulator.rest_state(), inputs.select(axis))[0].q
+    assert alone.numpy() == pytest.approx(expected[:1].numpy(), abs=1e-6)
+    scene = Scene({"a": simulator.body, "b": simulator.body})
+    both = Simulator(scene, simulator.material, dtype=torch.float32)
+    own = {"a": Inputs(tendon_tension=given, external_force=np.full((len(MESH.vertices), 3), 1e-3)), "b": Inputs()}
+    moved = both.step(both.rest_state(2), scene.inputs(own))[0].q[:, scene.vertex_slice("a")]
+    assert moved.numpy() == pytest.approx(pushed.numpy(), abs=1e-6)
+
+
+def test_a_number_has_a_gradient():
+    simulator = pulled()
+    tension = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    rest = simulator.static_equilibrium(Inputs(tendon_tension=tension), batch=2).q.sum()
+    (slope,) = torch.autograd.grad(rest, tension)
+    ends = (simulator.static_equilibrium(Inputs(tendon_tension=0.2 + h), batch=2).q.sum() for h in (1e-3, -1e-3))
+    assert float(slope) == pytest.approx(float(next(ends) - next(ends)) / 2e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tendon_tension": "much"}, "tendon_tension is 'much'"),
+        ({"external_force": [0.0, 0.0, -1.0]}, r"external_force has shape \(3,\): it must be \(N, 3\)"),
+        ({"fixed_positions": 1.0}, r"fixed_positions has shape \(\)"),
+        ({"attached_mass": 0.1}, r"attached_mass has shape \(\): .* a mass for every vertex"),
+        ({"tendon_tension": [torch.ones(2), torch.ones(2)]}, "list with tensors"),
+    ],
+)
+def test_what_is_no_input_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        Inputs(**given)
+
+
+def test_wrong_numbers_of_values_are_refused():
     simulator = pulled()
     with pytest.raises(InputError, match=r"tendon_tension has shape \(1, 3\)"):
         simulator.step(simulator.rest_state(), Inputs(tendon_tension=[0.1, 0.2, 0.3]))
+    with pytest.raises(InputError, match="one number in a batch"):
+        Inputs(tendon_tension=0.1).repeat(1).joined(Inputs(tendon_tension=0.2))
 
 
 def test_simulations_are_printed_in_a_line():

@@ -330,13 +330,17 @@ def test_a_plate_that_moves_by_more_than_a_gap_in_a_step_presses_a_block(fractio
 
 
 @pytest.mark.parametrize("moves", [(True, False), (False, True), (True, True)])
-@pytest.mark.parametrize("rigid", [{}, {"all": Rigid()}])
+@pytest.mark.parametrize("rigid", [{}, {"all": Rigid()}, {"low": Rigid()}, {"core": Rigid()}])
 def test_lifts_raise_two_bodies_of_a_scene(moves, rigid):
     """By 2 mm a step, more than their gaps; a body whose lift stays is not moved."""
     bodies = {}
     for k, name in enumerate("ab"):
         lift = HalfSpace(position=(0.0, 0.0, -0.9 * D), moves=moves[k])
-        mesh = replace(raised(BLOCK, 0.1 * k, 0.0, 0.0), regions={"all": np.arange(len(BLOCK.cells))})
+        block = box_hexahedra((SIDE,) * 3, (4, 4, 4))
+        middle = block.vertices[block.cells].mean(1) / SIDE
+        parts = {"all": middle[:, 2] > 0.0, "low": middle[:, 2] < 0.4, "core": np.abs(middle - 0.5).max(1) < 0.2}
+        regions = {name: np.flatnonzero(chosen) for name, chosen in parts.items()}
+        mesh = replace(raised(block, 0.1 * k, 0.0, 0.0), regions=regions)
         bodies[name] = Body(mesh, rigid=rigid, energies=[Contact({"lift": lift}, KAPPA, 0.0, D)])
     s = Simulator(Scene(bodies), SOFT, 5e-3)
     way = 2e-3 * torch.arange(4, dtype=torch.float64)[:, None, None]

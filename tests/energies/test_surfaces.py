@@ -481,10 +481,22 @@ def test_regions_have_their_own_friction():
         {"surface_friction": torch.tensor([[0.2, 0.6]], dtype=torch.float64)},
         {"surface_friction": 1e-5},
     )
+    pairs = {"first": FrictionPair("plate", "b", 0.6), "second": FrictionPair("b", "plate_rough", 0.05)}
+    both = replace(simulator, body=Scene(bodies, SurfaceContact(2e4, 0.2, pairs=pairs)))
+    swapped = dict(reversed(pairs.items()))
+    other = replace(simulator, body=Scene(bodies, SurfaceContact(2e4, 0.2, pairs=swapped)))
+    with torch.no_grad():
+        held, slides = (s.rollout(s.rest_state(), 20).v[-1, 0, b, 0].mean() for s in (both, other))
+    assert float(held) < 1e-3 < 0.1 < float(slides)  # the first pair that fits counts
     with pytest.raises(InputError, match="the pair 'pad' of a contact"):
         Simulator(Scene({"a": bodies["a"]}, contact))
     with pytest.raises(InputError, match="surface_friction is -1"):
         SurfaceContact(pairs={"pad": FrictionPair("a", "b", -1.0)})
+    for wrong in ([FrictionPair("a", "b", 1.0)], {"other": FrictionPair("a", "b", 1.0)}):
+        with pytest.raises(InputError, match="by name, other than 'other'"):
+            SurfaceContact(pairs=wrong)
+    with pytest.raises(InputError, match=r"3 values for 2 coefficients \(other, pad\)"):
+        simulator.prepare({"surface_friction": torch.full((1, 3), 0.1, dtype=torch.float64)})
 
 
 def test_momentum_is_conserved():
@@ -718,10 +730,14 @@ def test_refusals():
     with pytest.raises(InputError, match="touch at rest"):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
-    with pytest.raises(InputError, match=r"cross at rest: vertex .* of 'cube' is 5 mm deep in the .* of 'plate'"):
+    with pytest.raises(
+        InputError, match=r"cross at rest: an edge .* 'plate'.*; deepest is vertex \d+ in '(cube|plate)', by 5 mm"
+    ):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
-    with pytest.raises(InputError, match="is within another body: move"):
+    with pytest.raises(
+        InputError, match=r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate': move"
+    ):
         Simulator(Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
     with pytest.raises(InputError, match="mm from itself"):
         Simulator(Body(clip(), energies=[SurfaceContact(distance=0.02)]))
@@ -736,7 +752,9 @@ def test_refusals():
     simulator = landing()
     smaller, cube = simulator.rest_positions.clone(), simulator.body.vertex_slice("cube")
     smaller[cube] = 0.2 * (smaller[cube] - smaller[cube].mean(0)) + smaller.new_tensor([0.02, 0.02, 0.005])
-    with pytest.raises(InputError, match="is within another body at the start"):
+    with pytest.raises(
+        InputError, match=r"vertex \d+ in 'cube' is within that with .* in 'plate' at the start .* environment 0"
+    ):
         simulator.step(simulator.state(smaller))
     crossing = simulator.rest_positions.clone()
     crossing[simulator.body.vertex_slice("cube"), 2] -= 0.008
@@ -773,7 +791,16 @@ def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
         both = join({"outer": mesh, "ball": ball})
         pairs[name] = PairList(Launcher(2, CPU), Surface.of(both), 1e-4), torch.tensor(both.vertices).repeat(2, 1, 1)
         pairs[name][1][1, -8:] += 0.1
-    assert pairs["hollow"][0].enclosed(pairs["hollow"][1]).tolist() == [-1, -1]
-    inside = pairs["solid"][0].enclosed(pairs["solid"][1]).tolist()
-    assert inside[0] >= len(shell.vertices)
-    assert inside[1] == -1
+    assert pairs["hollow"][0].enclosed(pairs["hollow"][1]).tolist() == [[-1, -1]] * 2
+    (inside, outer), other = pairs["solid"][0].enclosed(pairs["solid"][1]).tolist()
+    assert inside >= len(shell.vertices) > outer >= 0
+    assert other == [-1, -1]
+
+
+def test_a_pin_in_a_cube_is_as_deep_as_it_is():
+    """Of 5 mm width, 10 mm deep in the middle of a cube of 40 mm: what is nearest to its end is the face above."""
+    cube = box_hexahedra((0.04, 0.04, 0.04), (4, 4, 4))
+    pin = box_hexahedra((0.005, 0.005, 0.012), (1, 1, 1))
+    pin = replace(pin, vertices=pin.vertices + [0.0173, 0.0169, 0.03])
+    with pytest.raises(InputError, match=r"deepest is vertex \d+ in 'pin', by 10 mm"):
+        Simulator(Scene({"cube": Body(cube), "pin": Body(pin)}, SurfaceContact(distance=1e-4)))

@@ -6,7 +6,7 @@ import sys
 import pytest
 import warp as wp
 
-from warp_resphys.kernels.messages import Messages
+from warp_resphys.kernels.messages import QuietLogger
 
 SCRIPT = """
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
@@ -33,8 +33,8 @@ def test_a_script_whose_kernels_are_compiled_prints_nothing():
     ],
 )
 def test_compilation_and_other_modules_are_shown(message, shown, capsys, monkeypatch):
-    Messages().info(message)
+    QuietLogger().info(message)
     assert (message in capsys.readouterr().out) == shown
     monkeypatch.setattr(wp.config, "log_level", wp.LOG_DEBUG)
-    Messages().info(message)
+    QuietLogger().info(message)
     assert message in capsys.readouterr().out

@@ -144,7 +144,7 @@ def test_what_does_not_fit_is_refused(finished):
     scene = RobotScene({"one": (robot, AWAY)})
     with pytest.raises(InputError, match="no robot 'hand' in the scene: it has one"):
         scene.begin(inputs={"hand": {}})
-    with pytest.raises(InputError, match="surfaces of the bodies cross"):
+    with pytest.raises(InputError, match=r"surfaces cross at rest: an edge at vertex \d+ in 'one' .* in 'two'"):
         RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
 
 

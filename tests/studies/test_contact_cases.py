@@ -115,7 +115,7 @@ def test_the_friction_of_cards_balances_moments(degrees):
     foot, top, middle = x[x[:, 2].argmin()], x[x[:, 0].argmax()], x.mean(0)
     assert top[0] < 0.0  # The other card begins at the plane x = 0.
     need = (middle[0] - foot[0]) / (top[2] - foot[2])
-    assert house.least_friction == pytest.approx(need, abs=1e-4)
+    assert house.least_friction == pytest.approx(need, rel=1e-6)
     stands, falls = (card_drop(house.scene(share * need), CPU) for share in (1.05, 0.95))
     assert stands < 1e-3 < 1e-2 < falls
 

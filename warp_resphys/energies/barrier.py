@@ -14,7 +14,7 @@ def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
 
 
 class _Pressure(torch.autograd.Function):
-    """The pressure of the barrier, whose derivative is computed with it."""
+    """The pressure of the barrier, whose derivative is computed with it; it has no second derivatives."""
 
     @override
     @staticmethod

@@ -249,9 +249,10 @@ class Energy(ABC):
             return values
         count = self.count_of(quantity)
         if values.shape[1] not in (1, count):
+            per = quantity.per or "part"
             raise InputError(
-                f"{quantity.name} has {values.shape[1]} values for {count} {quantity.per or 'part'}s: give one value, "
-                f"or one for each {quantity.per or 'part'}."
+                f"{quantity.name} has {values.shape[1]} values for {count} {per}s ({', '.join(self.names)}): give one "
+                f"value, or one for each {per}."
             )
         return values.expand(-1, count)
 

@@ -266,7 +266,8 @@ class BoundContact(BoundEnergy):
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
         self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
         self._check_body(site.body)
-        self._rigid = [self._rigid_part(site, name) for name in site.body.controls]
+        rigid = [self._rigid_part(site, name) for name in site.body.controls]
+        self._rigid = [(surface, within) for surface, within in rigid if len(surface)]  # others are out of reach
         self._check_start(like)
 
     def _rigid_part(self, site: EnergySite, name: str) -> tuple[torch.Tensor, torch.Tensor]:

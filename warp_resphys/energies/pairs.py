@@ -19,7 +19,34 @@ from .launcher import Launcher, warp_view
 _FIRST_CAPACITY = 4096
 _REBUILT = 100  # Uses of a hierarchy of boxes after which it is made anew.
 _SPARE = 0.75  # radius around the middle of a way within which pairs are sought, over its length
+_AT_ONCE = 64  # vertices or environments whose triangles are compared at once
 _PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
+
+
+def winding(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """Returns how often a closed surface of triangles (B, T, 3, 3) encloses points (B, P, 3), as (B, P).
+
+    By the sum of solid angles (van Oosterom and Strackee 1983).
+    """
+    a, b, c = (corners[:, None] - points[:, :, None, None]).unbind(3)
+    la, lb, lc = (x.norm(dim=-1) for x in (a, b, c))
+    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return torch.atan2((a * torch.linalg.cross(b, c)).sum(-1), below).sum(2) / (2.0 * torch.pi)
+
+
+def triangle_distances(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
+    """Returns the distances (P,) of points (P, 3) from the nearest of triangles (T, 3, 3) [m]."""
+    a, b, c = corners.unbind(1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    x = points[:, None]
+    distances, inside = [((x - a) * normal).sum(-1).abs()], []
+    for p, q in ((a, b), (b, c), (c, a)):
+        across = torch.linalg.cross((q - p).expand(len(points), -1, -1), x - p)
+        inside.append((across * normal).sum(-1) >= 0.0)
+        share = (((x - p) * (q - p)).sum(-1) / (q - p).square().sum(-1)).clamp(0.0, 1.0)
+        distances.append((x - p - share[..., None] * (q - p)).norm(dim=-1))
+    distances[0] = torch.where(torch.stack(inside).all(0), distances[0], torch.inf)
+    return torch.stack(distances).amin((0, 2))
 
 
 @dataclass(frozen=True)
@@ -34,8 +61,8 @@ class Surface:
         pieces: (N,) number of the piece that a vertex belongs to.
         rest: (N, 3) positions at rest [m].
         areas: (T,) areas of the triangles at rest [m^2].
-        names: names of the regions of the mesh.
-        owners: (N,) number of the first region that a vertex belongs to; -1 for none.
+        names: names of the regions of the mesh, in a scene of its bodies first.
+        owners: (N,) number of the first of them that a vertex belongs to; -1 for none.
     """
 
     vertices: NDArray[np.int64]
@@ -77,9 +104,9 @@ class Surface:
         return replace(self, **fields)
 
     def words(self, vertex: int) -> str:
-        """Returns a vertex in words, with the name of its body or region."""
+        """Returns a vertex in words: its number among all vertices, and the name of its body or region."""
         owner = int(self.owners[vertex])
-        return f"vertex {vertex}" + (f" of {self.names[owner]!r}" if owner >= 0 else "")
+        return f"vertex {vertex}" + (f" in {self.names[owner]!r}" if owner >= 0 else "")
 
     def vertex_areas(self) -> NDArray[np.float64]:
         """Returns the area (N,) of every vertex, a third of its triangles' [m^2]."""
@@ -270,43 +297,53 @@ class PairList:
             own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
         return out
 
-    def crossing(self, positions: torch.Tensor) -> str:
-        """Returns in words where an edge passes deepest through a triangle at positions (N, 3) [m], and how deep."""
+    def crossing(self, positions: torch.Tensor, edge: int) -> str:
+        """Returns in words what an edge that passes through a triangle shows at positions (N, 3) [m]."""
+        start, end = positions[self._edges[edge]]
         a, b, c = positions[self._triangles].unbind(1)
-        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-        deepest, words = -1.0, ""
-        for edge in self._edges.tolist():
-            start, end = positions[edge]
-            below, above = (((x - a) * normal).sum(-1) for x in (start, end))
-            at = start + (below / (below - above))[:, None] * (end - start)
-            sides = [(torch.linalg.cross(q - p, at - p) * normal).sum(-1) for p, q in ((a, b), (b, c), (c, a))]
-            through = (torch.stack(sides) >= 0.0).all(0) & (below * above <= 0.0)
-            through &= ~torch.isin(self._triangles, self._triangles.new_tensor(edge)).any(1)
-            depth = torch.where(through, torch.minimum(below.abs(), above.abs()), -1.0)
-            if float(depth.max()) > deepest:
-                deepest, k = float(depth.max()), int(depth.argmax())
-                near = edge[int(below[k] > above[k])]
-                other = self.surface.words(int(self._triangles[k, 0]))
-                words = f"{self.surface.words(near)} is {1e3 * deepest:.3g} mm deep in the surface at {other}"
+        normal = torch.linalg.cross(b - a, c - a)
+        below, above = (((x - a) * normal).sum(-1) for x in (start, end))
+        at = start + (below / (below - above))[:, None] * (end - start)
+        sides = [(torch.linalg.cross(q - p, at - p) * normal).sum(-1) for p, q in ((a, b), (b, c), (c, a))]
+        through = (torch.stack(sides) >= 0.0).all(0) & (below * above <= 0.0)
+        through &= ~torch.isin(self._triangles, self._edges[edge]).any(1)
+        vertex, other = int(self._edges[edge, 0]), int(self._triangles[int(through.int().argmax()), 0])
+        words = f"an edge at {self.surface.words(vertex)} passes through a triangle at {self.surface.words(other)}"
+        depth, deepest = 0.0, -1
+        pieces = self._pieces[[vertex, other]].tolist()
+        for one, two in (pieces, pieces[::-1]) if pieces[0] != pieces[1] else ():
+            own, corners = self.vertices[self._pieces[self.vertices] == one], positions[self._triangles_of(two)]
+            for some in own.split(_AT_ONCE):
+                points = positions[some]
+                inside = winding(points[None], corners[None])[0] > 0.5
+                far = torch.where(inside, triangle_distances(points, corners), -1.0)
+                if float(far.max()) > depth:
+                    depth, deepest = float(far.max()), int(some[far.argmax()])
+        if deepest >= 0:
+            words += f"; deepest is {self.surface.words(deepest)}, by {1e3 * depth:.3g} mm"
         return words
 
-    def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns a vertex (B,) of a piece that lies within another one, or -1; surfaces must not cross.
+    def _triangles_of(self, piece: int) -> torch.Tensor:
+        """Returns the triangles (T, 3) of a piece."""
+        return self._triangles[self._pieces[self._triangles[:, 0]] == piece]
 
-        By the sum of the solid angles of triangles (van Oosterom and Strackee 1983).
+    def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
+        """Returns (B, 2) a vertex of a piece within another one, and a vertex of that; -1 where there is none.
+
+        Surfaces must not cross.
         """
-        out = torch.full((len(positions),), -1, device=positions.device)
-        pieces, place = self._pieces[self._triangles[:, 0]].unique(return_inverse=True)
-        if len(pieces) == 1:
-            return out
-        own = self._pieces[self.vertices]
-        for k, vertex in enumerate(int(self.vertices[own == piece][0]) for piece in pieces):
-            a, b, c = (positions[:, self._triangles] - positions[:, vertex, None, None]).unbind(2)
-            (la, lb, lc), away = (x.norm(dim=-1) for x in (a, b, c)), place != k
-            below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-            angle = 2.0 * torch.atan2((a * torch.linalg.cross(b, c)).sum(-1), below)
-            turns = angle.new_zeros(len(out), len(pieces)).index_add(1, place[away], angle[:, away]) / (4.0 * torch.pi)
-            out = torch.where((turns > 0.5).any(1), vertex, out)
+        out = torch.full((len(positions), 2), -1, device=positions.device)
+        pieces = self._pieces[self.vertices].unique()
+        of = [positions[:, self.vertices[self._pieces[self.vertices] == piece]] for piece in pieces]
+        low, high = torch.stack([x.amin(1) for x in of], 1), torch.stack([x.amax(1) for x in of], 1)  # (B, pieces, 3)
+        contained = (low[:, :, None] > low[:, None]).all(-1) & (high[:, :, None] < high[:, None]).all(-1)
+        for one, two in contained.any(0).nonzero().tolist():
+            rows = contained[:, one, two].nonzero().ravel()
+            vertex = self.vertices[self._pieces[self.vertices] == pieces[one]][0]
+            triangles = self._triangles_of(int(pieces[two]))
+            for some in rows.split(_AT_ONCE):
+                inside = winding(positions[some][:, vertex, None], positions[some][:, triangles])[:, 0] > 0.5
+                out[some[inside]] = torch.stack([vertex, triangles[0, 0]])
         return out
 
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -255,7 +255,7 @@ class IncrementalPotential(Launcher):
 
     def improved_start(self, start: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, N, 3) at which a solve starts instead of `start` (`Term.improve_start`), in planes."""
-        positions = start.double().contiguous().clone()
+        positions = start.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
         for term in self.energies:
             term.improve_start(warp_view(positions, wp.vec3d))
         return self.coordinates.hold(positions)

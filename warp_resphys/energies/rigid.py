@@ -109,7 +109,7 @@ class BoundRigidInertia(BoundInertia):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         inertia = step.constants.value("density") / step.stage.step**2
-        target = weighted_sum(self._factor, step.stage.target[:, None, self._controls])
+        target = weighted_sum(self._factor, step.stage.target[:, self._controls, None].unbind(1))
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
 
 
@@ -175,14 +175,14 @@ class Rigidity(_OnOwnPoints):
 class RigidityTerm(SolidTerm):
     """Kernels of the rigidity of a part.
 
-    A solve begins where the part is a rotation: by inertia it grows, as its vertices go straight on, and the stiff
-    energy turns it back in many iterations.
+    A solve begins where the deformation gradient of the part is a rotation: by inertia alone its vertices go straight
+    on, and the part grows, which the stiff energy takes many iterations to undo.
     """
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: Rigidity) -> None:
         volume = float(energy.own_points.shape_volume.sum())
         super().__init__(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
-        # Positions (4, 3) about their mean, of which the deformation gradient is the identity.
+        # Places (4, 3) of which the deformation gradient is the identity, about the centre of mass.
         corners = np.linalg.pinv(energy.own_points.gradients[0, 0]).T
         arms = corners - energy.centre @ corners
         self._centre = launcher.upload(energy.centre[None], wp.float64)

@@ -20,7 +20,7 @@ from .launcher import HostLaunches, Launcher, warp_view
 from .pairs import PairList, Surface
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
-FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="pair")
+FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="coefficient")
 _FEATURES = int(kernels.EDGE_FEATURES)
 _TINY = 1e-300  # keeps a division by a length defined
 
@@ -121,14 +121,17 @@ class SurfaceTerm(Term):
         return {STIFFNESS.name: (1,), FRICTION.name: (1 + len(self._members),), "surface_slip": (1,), **fields}
 
     def _expand(self, field: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns a field (B, N, 3) with its values at vertices of the surface that depend on others."""
+        """Returns a field (B, N, 3) with the values at all vertices of the surface from those at control vertices.
+
+        At other vertices it is zero, or what `out` has there.
+        """
         if self._whole is None:
             return field
         out = torch.zeros_like(field) if out is None else out
         (s,), own = self.sets, self.launcher
         vertices = warp_view(self._list.vertices.to(torch.int32), wp.int32)
         inputs = [vertices, s.nodes, s.gradients, warp_view(field.contiguous(), wp.vec3d)]
-        own.launch(own.record(kernels.place, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
+        own.launch(own.record(kernels.interpolate, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
         return out
 
     @override
@@ -143,18 +146,19 @@ class SurfaceTerm(Term):
     def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
         given, ours = value_of(values, "surface_start"), self._list
         if not follows:
-            count, _ = ours.crossings(given)
+            count, edge = ours.crossings(given)
             if bool(count.any()):
                 b = int(count.argmax())
                 raise InputError(
-                    f"surfaces cross at the start of a step, in environment {b}: {ours.crossing(given[b])}; give a "
-                    "state in which they are apart."
+                    f"surfaces cross at the start of a step, in environment {b}: "
+                    f"{ours.crossing(given[b], int(edge[b]))}. Give a state in which the bodies are apart."
                 )
-            if bool(((inside := ours.enclosed(given)) >= 0).any()):
-                b = int(inside.argmax())
+            if bool(((enclosed := ours.enclosed(given)) >= 0).any()):
+                b = int(enclosed[:, 0].argmax())
+                inside, outer = (ours.surface.words(vertex) for vertex in enclosed[b].tolist())
                 raise InputError(
-                    f"{ours.surface.words(int(inside[b]))} is within another body at the start of a step, in "
-                    f"environment {b}: give a state in which they are apart."
+                    f"a body with {inside} is within that with {outer} at the start of a step, in environment {b}: "
+                    "give a state in which the bodies are apart."
                 )
         share = self.launcher.zeros() + 1.0
         self.free_way(given, start, share)

@@ -79,6 +79,11 @@ class SurfaceContact(Energy):
                 )
         STIFFNESS.check(self.stiffness)
         FRICTION.check(self.friction)
+        if not isinstance(self.pairs, Mapping) or "other" in self.pairs:
+            raise InputError(
+                f"pairs of a contact between surfaces are {self.pairs!r}: give FrictionPair(...) by name, other than "
+                "'other', which stands for all surfaces that are in no pair."
+            )
         for pair in self.pairs.values():
             FRICTION.check(pair.friction)
         if self.pairs and not isinstance(self.friction, float | int):
@@ -167,8 +172,8 @@ class BoundSurfaceContact(BoundEnergy):
         members = body.bodies.values() if isinstance(body, Scene) else (body,)
         if any(member.glued or member.symmetry for member in members):
             raise InputError(
-                "contact between surfaces acts on the whole boundary of a mesh, also where it is cut or glued: leave "
-                "out symmetry planes and glue."
+                "contact between surfaces does not support symmetry planes or glue, where the boundary of a mesh is no "
+                "surface: leave them out."
             )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)
@@ -180,12 +185,16 @@ class BoundSurfaceContact(BoundEnergy):
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:
         """Raises InputError where surfaces cross or touch at rest, or parts of a piece are within reach of others."""
         words = pairs.surface.words
-        if int(pairs.crossings(rest)[0]):
+        count, edge = pairs.crossings(rest)
+        if int(count):
             raise InputError(
-                f"surfaces cross at rest: {pairs.crossing(rest[0])}; move the bodies apart, or mend the mesh."
+                f"surfaces cross at rest: {pairs.crossing(rest[0], int(edge))}. Move bodies apart, or mend the mesh."
             )
-        if (inside := int(pairs.enclosed(rest))) >= 0:
-            raise InputError(f"at rest, {words(inside)} is within another body: move the bodies apart.")
+        inside, outer = pairs.enclosed(rest)[0].tolist()
+        if inside >= 0:
+            raise InputError(
+                f"at rest, a body with {words(inside)} is within that with {words(outer)}: move the bodies apart."
+            )
         pairs.find(rest, torch.zeros_like(rest))
         piece, ends = torch.as_tensor(pairs.surface.pieces, device=rest.device), pairs.nodes
         gaps = pairs.distances(rest)

@@ -122,9 +122,16 @@ class Body:
 
         Args:
             mesh: its rest shape.
-            part: density and stiffness.
-            options: further arguments of `Body`.
+            part: density and stiffness; `Rigid()`, of 1200 kg/m^3, if omitted.
+            options: further arguments of `Body` except `rigid`.
+
+        Raises:
+            InputError: the mesh has a region of that name.
         """
+        if "body" in mesh.regions:
+            raise InputError(
+                "the mesh of a rigid body has a region 'body', which would stand for all of it: rename it."
+            )
         whole = replace(mesh, regions={**mesh.regions, "body": np.arange(len(mesh.cells))})
         return cls(whole, rigid={"body": Rigid() if part is None else part}, **options)
 
@@ -161,9 +168,10 @@ class Body:
         return self.mesh.vertices
 
     def __repr__(self) -> str:
-        """Mesh, number of fixed vertices, and names of parts."""
+        """Mesh, number of fixed vertices, rigid parts, energies, and numbers of glued regions and symmetry planes."""
         parts = [repr(self.mesh), f"{len(self.fixed_vertices)} fixed vertices"]
         parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
+        parts += [f"{len(given)} {name}" for name in ("glued", "symmetry") if (given := getattr(self, name))]
         return f"Body({', '.join(parts)})"
 
     @property

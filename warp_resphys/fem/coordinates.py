@@ -170,13 +170,13 @@ class Coordinates:
         return Points(nodes, operators)
 
 
-def weighted_sum(weights: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
-    """Returns sums (B, S, ...) of fields (B, S or 1, w, ...) with weights (S, w).
+def weighted_sum(weights: torch.Tensor, fields: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Returns sums (B, S, ...) of w fields (B, S or 1, ...) with weights (S, w).
 
     Their order is fixed, so that every environment is bit for bit what it is in another batch.
     """
-    columns = weights.view(*weights.shape, *[1] * (fields.ndim - 3)).unbind(1)
-    first, *others = (w * f for w, f in zip(columns, fields.unbind(2), strict=True))
+    columns = weights.view(*weights.shape, *[1] * (fields[0].ndim - 2)).unbind(1)
+    first, *others = (w * f for w, f in zip(columns, fields, strict=True))
     return sum(others, first)
 
 
@@ -199,9 +199,10 @@ class DeviceCoordinates:
         self.controls = torch.as_tensor(points.nodes, device=like.device)
         self.weights = torch.as_tensor(points.gradients[:, 0, :, 0]).to(like)
         used = self.weights.ravel().nonzero().ravel()
-        self._by_control = used[self.controls.ravel()[used].argsort(stable=True)]  # entries of `weights`
-        control = self.controls.ravel()[self._by_control]
-        self._moved, self._counts = control.unique_consecutive(return_counts=True)
+        entry = used[self.controls.ravel()[used].argsort(stable=True)]  # of `weights`, by control vertex
+        self._carried = self.dependent[entry // self.controls.shape[1]]
+        self._shares = self.weights.ravel()[entry, None]
+        self._moved, self._counts = self.controls.ravel()[entry].unique_consecutive(return_counts=True)
         self.depends, self.slides = len(coordinates.dependent) > 0, len(coordinates.sliding) > 0
         self.sliding = torch.as_tensor(coordinates.sliding, device=like.device)
         self.projections, self._offsets = (
@@ -212,7 +213,8 @@ class DeviceCoordinates:
         """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
         if not self.depends:
             return r
-        return r.index_copy(1, self.dependent, weighted_sum(self.weights, r[:, self.controls]))
+        at = [r.index_select(1, column) for column in self.controls.unbind(1)]
+        return r.index_copy(1, self.dependent, weighted_sum(self.weights, at))
 
     def hold(self, r: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P r + o."""
@@ -231,8 +233,7 @@ class DeviceCoordinates:
         """Returns P W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
         if not self.depends:
             return self.restrict(forces)
-        vertex, weights = self.dependent[self._by_control // self.controls.shape[1]], self.weights.ravel()
-        rows = forces.index_select(1, vertex).movedim(1, 0).flatten(1) * weights[self._by_control, None]
+        rows = forces.index_select(1, self._carried).movedim(1, 0).flatten(1) * self._shares
         sums = torch.segment_reduce(rows, "sum", lengths=self._counts, axis=0, unsafe=True)
         sums = sums.view(-1, forces.shape[0], *forces.shape[2:]).movedim(0, 1)
         kept = forces.index_fill(1, self.dependent, 0.0)

@@ -45,7 +45,7 @@ class Scene(Body):
     @override
     def __repr__(self) -> str:
         parts = [f"{name}: {body!r}" for name, body in self.bodies.items()]
-        return f"Scene({', '.join(parts)}{'' if self.contact is None else f', {self.contact!r}'})"
+        return f"Scene({', '.join(parts)}{'' if self.contact is None else f', {type(self.contact).__name__}'})"
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -112,16 +112,17 @@ class Scene(Body):
         Raises:
             InputError: no body of that name, or fixed positions of some bodies with fixed vertices but not of all.
         """
-        fields: dict[str, torch.Tensor] = {}
-        for name, own in by_body.items():
+        for name in by_body:
             self.vertex_slice(name)
-            fields |= {f"{name}_{key}": value for key, value in own.actuation.items()}
+        fields: dict[str, torch.Tensor | ArrayLike] = {}
         for key in _FIELDS:
             given = {name: value for name, own in by_body.items() if (value := own.fields.get(key)) is not None}
             if not given:
                 continue
             axis = -1 if key == "attached_mass" else -2
-            sample = next(iter(given.values()))
+            tensors = [value for name, value in given.items() if key not in by_body[name].plain]
+            sample = (tensors or [*given.values()])[0]
+            given = {name: value.to(sample) for name, value in given.items()}
             for name, body in self.bodies.items():
                 if name in given:
                     continue
@@ -131,5 +132,6 @@ class Scene(Body):
                 shape = [*sample.shape]
                 shape[axis] = size
                 given[name] = sample.new_zeros(shape)
-            fields[key] = torch.cat([given[name] for name in self.bodies], axis)
-        return Inputs(**fields)
+            whole = torch.cat([given[name] for name in self.bodies], axis)
+            fields[key] = whole if tensors else whole.numpy()
+        return Inputs.of_bodies(by_body).replace(**fields)

@@ -34,6 +34,8 @@ class Coupling:
 class VertexCouplings:
     """Turns couplings of vertices, some of which are weighted sums of free ones, into those of the free ones.
 
+    The matrix of all vertices in contact is made first, and then W^T K W.
+
     Args:
         columns: (V, w) free vertices that determine every vertex; -1 in places that it does not need.
         weights: (V, w) their weights.

@@ -10,13 +10,19 @@ from numpy.typing import ArrayLike
 from ..io.errors import InputError
 from .quantity import Quantity
 
+_BY_VERTEX = {
+    "external_force": "(N, 3) or (B, N, 3), a force for every vertex",
+    "fixed_positions": "(D, 3) or (B, D, 3), a position for every fixed vertex",
+    "attached_mass": "(N,) or (B, N), a mass for every vertex",
+}
+
 
 class Inputs:
     """Inputs of a batch for one step or for T steps; every field is optional and differentiable.
 
     Every field but ``attached_mass`` may have a leading time axis T; `at` selects one step. A field without time and
-    batch axes, such as (N, 3) or (n,), is a batch of one. Numbers and lists are for every environment, and a number is
-    for every chamber or tendon.
+    batch axes, such as (N, 3) or (n,), is a batch of one. Lists and arrays of numbers get the simulator's dtype, and
+    one environment of them is for all; a number, or a tensor without axes, is for every chamber or tendon.
 
     Args:
         external_force: (B, N, 3) or (T, B, N, 3), constant during a step, without gravity [N].
@@ -25,8 +31,11 @@ class Inputs:
         attached_mass: (1 or B, N) weights hung on the vertices, beside the body's own [kg].
         actuation: (B, n) or (T, B, n) inputs of the body's energies by name, such as ``pressure`` in each chamber [Pa].
 
+    Attributes:
+        plain: names of fields given as numbers, for any number of environments.
+
     Raises:
-        InputError: fields with different numbers of steps.
+        InputError: a field that is no tensor, number or list of numbers, or has too few axes.
     """
 
     def __init__(
@@ -38,14 +47,16 @@ class Inputs:
     ) -> None:
         given = {"external_force": external_force, "fixed_positions": fixed_positions, "attached_mass": attached_mass}
         plain = {n for n, x in (given | actuation).items() if not (x is None or isinstance(x, torch.Tensor))}
-        self._plain = frozenset(plain)  # names of fields given as numbers or lists
-        self.external_force = _batched(external_force, 2)
-        self.fixed_positions = _batched(fixed_positions, 2)
-        self.attached_mass = _batched(attached_mass, 1)
+        self.plain = frozenset(plain)
+        self.external_force, self.fixed_positions, self.attached_mass = (
+            _batched(name, value, axes) for (name, value), axes in zip(given.items(), (2, 2, 1), strict=True)
+        )
         self.actuation: dict[str, torch.Tensor] = {}
         for name, value in actuation.items():
-            if (values := _batched(value, 1)) is not None:
+            if (values := _batched(name, value, 1)) is not None:
                 self.actuation[name] = values
+                if not values.ndim:
+                    self.plain |= {name}
 
     def __repr__(self) -> str:
         """Shapes of the fields."""
@@ -59,20 +70,31 @@ class Inputs:
             like: a tensor with device and dtype.
             batch: number of environments; None for one, which may become more.
         """
-        if not self._plain:
+        if not self.plain:
             return self
         fields = self.fields
-        for name in self._plain:
+        for name in self.plain:
             value = fields[name].to(like)
             if not value.ndim:
                 value = value.expand(1, counts.get(name, 1))
-            axis = -2 if name in self.actuation or name == "attached_mass" else -3
+            axis = value.ndim - (2 if name in self.actuation or name == "attached_mass" else 3)
             if batch is not None and value.shape[axis] == 1:
                 value = value.expand(*value.shape[:axis], batch, *value.shape[axis + 1 :])
             fields[name] = value
-        fitted = Inputs(**fields)
-        fitted._plain = frozenset() if batch is not None else self._plain
-        return fitted
+        return Inputs(**fields) if batch is not None else self._derived(fields)
+
+    def _derived(self, fields: Mapping[str, torch.Tensor]) -> "Inputs":
+        """Returns inputs with other values of the fields, which count as numbers where those here do."""
+        out = Inputs(**fields)
+        out.plain |= self.plain & fields.keys()
+        return out
+
+    @staticmethod
+    def of_bodies(parts: Mapping[str, "Inputs"]) -> "Inputs":
+        """Returns the inputs of all bodies' energies, with names that begin with those of the bodies."""
+        out = Inputs(**{f"{name}_{key}": value for name, own in parts.items() for key, value in own.actuation.items()})
+        out.plain |= {f"{name}_{key}" for name, own in parts.items() for key in own.plain & own.actuation.keys()}
+        return out
 
     @property
     def fields(self) -> dict[str, torch.Tensor]:
@@ -81,13 +103,16 @@ class Inputs:
         fields = {name: getattr(self, name) for name in names} | self.actuation
         return {name: value for name, value in fields.items() if value is not None}
 
-    def replace(self, **fields: torch.Tensor | None) -> "Inputs":
+    def replace(self, **fields: torch.Tensor | ArrayLike | None) -> "Inputs":
         """Returns inputs with some fields replaced; None removes a field."""
-        return Inputs(**{**self.fields, **fields})
+        new = Inputs(**fields)
+        out = Inputs(**{**self.fields, **dict.fromkeys(fields), **new.fields})
+        out.plain |= new.plain | (self.plain - fields.keys())
+        return out
 
     def map(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "Inputs":
         """Returns inputs with a function applied to every field and the index of its batch axis."""
-        return Inputs(**{name: change(*pair) for name, pair in self.axes().items()})
+        return self._derived({n: change(x, axis) if x.ndim else x for n, (x, axis) in self.axes().items()})
 
     def select(self, environments: torch.Tensor) -> "Inputs":
         """Returns the inputs of some environments, given their indices."""
@@ -100,11 +125,13 @@ class Inputs:
     def joined(self, other: "Inputs") -> "Inputs":
         """Returns the inputs of both batches, concatenated along the batch axis."""
         theirs = other.fields
-        return Inputs(**{n: torch.cat([value, theirs[n]], axis) for n, (value, axis) in self.axes().items()})
+        if numbers := [name for name, value in (self.fields | theirs).items() if not value.ndim]:
+            raise InputError(f"{numbers[0]} is one number in a batch: give (B, n) values to join batches.")
+        return self._derived({n: torch.cat([value, theirs[n]], axis) for n, (value, axis) in self.axes().items()})
 
     def to(self, like: torch.Tensor) -> "Inputs":
         """Returns the inputs with the device and dtype of a tensor."""
-        return self.map(lambda value, _: value.to(like))
+        return self._derived({name: value.to(like) for name, value in self.fields.items()})
 
     def plus(self, force: torch.Tensor | None) -> "Inputs":
         """Returns the inputs with an external force (B, N, 3) added [N]."""
@@ -132,7 +159,7 @@ class Inputs:
         has_time = self._has_time_axis()
         if not any(has_time.values()):
             return self
-        return Inputs(**{n: v[min(step, len(v) - 1)] if has_time[n] else v for n, v in self.fields.items()})
+        return self._derived({n: v[min(step, len(v) - 1)] if has_time[n] else v for n, v in self.fields.items()})
 
     def window(self, first: torch.Tensor, steps: int) -> "Inputs":
         """Returns the inputs of consecutive steps that start at another step in each environment.
@@ -148,7 +175,7 @@ class Inputs:
             return value[at, torch.arange(value.shape[1], device=value.device)]
 
         has_time = self._has_time_axis()
-        return Inputs(**{name: pick(v) if has_time[name] else v for name, v in self.fields.items()})
+        return self._derived({name: pick(v) if has_time[name] else v for name, v in self.fields.items()})
 
     def check(
         self,
@@ -183,18 +210,22 @@ class Inputs:
                 accepted[name][0].check(values)
 
 
-def _batched(values: torch.Tensor | ArrayLike | None, axes: int) -> torch.Tensor | None:
+def _batched(name: str, values: torch.Tensor | ArrayLike | None, axes: int) -> torch.Tensor | None:
     """Adds the batch axis to a field that has only `axes` axes.
 
     Raises:
-        InputError: neither a tensor nor numbers.
+        InputError: neither a tensor nor numbers, or forces, positions or masses that are not given by vertex.
     """
     if values is None:
         return None
+    if isinstance(values, list | tuple) and any(isinstance(value, torch.Tensor) for value in values):
+        raise InputError(f"{name} is a list with tensors: make it one tensor, as by torch.stack.")
     try:
         tensor = values if isinstance(values, torch.Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
     except (TypeError, ValueError):
-        raise InputError(f"an input is {values!r}: give a tensor, a number or a list of numbers.") from None
+        raise InputError(f"{name} is {values!r}: give a tensor, a number or a list of numbers.") from None
+    if tensor.ndim < axes and name in _BY_VERTEX:
+        raise InputError(f"{name} has shape {tuple(tensor.shape)}: it must be {_BY_VERTEX[name]}.")
     return tensor[None] if tensor.ndim == axes else tensor
 
 

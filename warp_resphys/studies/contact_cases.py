@@ -46,7 +46,7 @@ from ..mesh.rod import rod
 from ..robot.gripper import thing_mesh
 from ..stepping.inputs import Inputs
 from .device_check import Check
-from .surface_check import DENSITY, MARGIN, SOFT, STONE, G, Touch, built, least_friction
+from .surface_check import DENSITY, MARGIN, SOFT, STONE, G, PointContact, built, least_friction
 
 FloatArray = NDArray[np.float64]
 
@@ -376,7 +376,7 @@ class CardHouse:
     angle: float
     storeys: int
     cards: list[FloatArray] = field(default_factory=list)  # corners (4, 2) [m], lower left first, counter-clockwise
-    touches: list[Touch] = field(default_factory=list)  # places where they push one another
+    touches: list[PointContact] = field(default_factory=list)  # places where they push one another
 
     def __post_init__(self) -> None:
         """Puts up the storeys."""
@@ -412,7 +412,7 @@ class CardHouse:
 
     def _touch(self, card: int, at: FloatArray, normal: FloatArray, other: int | None) -> None:
         own, by = (at - self.cards[card].mean(0), None if other is None else (other, at - self.cards[other].mean(0)))
-        self.touches.append(Touch(own, normal, card, by))
+        self.touches.append(PointContact(own, normal, card, by))
 
     @property
     def least_friction(self) -> float:

@@ -169,9 +169,9 @@ def arch_checks(stones: int, device: torch.device) -> Iterator[Check]:
 
 @torch.no_grad()
 def built(scene: Scene, device: torch.device) -> Trajectory:
-    """Returns the motion of bodies that were put up at rest, for half a second."""
+    """Returns the motion of rigid bodies that were put up at rest, for half a second."""
     solver = SolverSettings(relative_tolerance=1e-6)
-    s = Simulator(scene, STONE, 0.01, (0.0, 0.0, -G), solver=solver, device=device)
+    s = Simulator(scene, {}, 0.01, (0.0, 0.0, -G), solver=solver, device=device)
     return s.rollout(s.rest_state(), 50)
 
 
@@ -195,7 +195,7 @@ def arch(stones: int, friction: float) -> Scene:
 
 
 @dataclass(frozen=True)
-class Touch:
+class PointContact:
     """A place at which a body pushes another one.
 
     Attributes:
@@ -211,24 +211,24 @@ class Touch:
     other: tuple[int, FloatArray] | None = None
 
 
-def arch_joints(stones: int) -> list[Touch]:
+def arch_joints(stones: int) -> list[PointContact]:
     """Returns the inner and outer ends of the joints of an arch."""
     turn = math.pi * (1.0 - np.arange(stones + 1) / stones)
     half, inner, outer = 0.5 * math.pi / stones, RADIUS - 0.5 * THICKNESS, RADIUS + 0.5 * THICKNESS
     ring = 2.0 / 3.0 * (outer**3 - inner**3) / (outer**2 - inner**2) * math.sin(half) / half
     middle = 0.5 * (turn[1:] + turn[:-1])
     centres, radial = (np.stack([np.cos(a), np.sin(a)], 1) for a in (middle, turn))
-    normal, out = np.stack([radial[:, 1], -radial[:, 0]], 1), list[Touch]()
+    normal, out = np.stack([radial[:, 1], -radial[:, 0]], 1), list[PointContact]()
     for joint, r in itertools.product(range(stones + 1), (inner, outer)):
         places = [r * radial[joint] - ring * centres[k] for k in (min(joint, stones - 1), joint - 1)]
         if joint == stones:
-            out.append(Touch(places[0], -normal[joint], stones - 1))
+            out.append(PointContact(places[0], -normal[joint], stones - 1))
         else:
-            out.append(Touch(places[0], normal[joint], joint, (joint - 1, places[1]) if joint else None))
+            out.append(PointContact(places[0], normal[joint], joint, (joint - 1, places[1]) if joint else None))
     return out
 
 
-def least_friction(weights: Sequence[float], touches: Sequence[Touch], most: float = 3.0) -> float:
+def least_friction(weights: Sequence[float], touches: Sequence[PointContact], most: float = 3.0) -> float:
     """Coefficient of friction below which no forces at the touches carry the weights of bodies.
 
     At every touch, the normal force N is positive, and friction at most mu N.
@@ -239,13 +239,14 @@ def least_friction(weights: Sequence[float], touches: Sequence[Touch], most: flo
         most: the coefficient is sought up to this one.
     """
     balance = np.zeros((3 * len(weights), 2 * len(touches)))
+    size = max(float(np.linalg.norm(touch.place)) for touch in touches)
     for k, touch in enumerate(touches):
         sides = [(touch.body, touch.place, 1.0), *((*o, -1.0) for o in [touch.other] if o is not None)]
         across = np.array([-touch.normal[1], touch.normal[0]])
         for (body, place, sign), (number, force) in itertools.product(sides, enumerate((touch.normal, across))):
-            moment = place[0] * force[1] - place[1] * force[0]
+            moment = (place[0] * force[1] - place[1] * force[0]) / size
             balance[3 * body : 3 * body + 3, 2 * k + number] += sign * np.array([*force, moment])
-    carried = np.kron(weights, [0.0, 1.0, 0.0])
+    carried = np.kron(np.divide(weights, max(weights)), [0.0, 1.0, 0.0])
     shear = np.kron(np.eye(len(touches)), [[0.0, 1.0], [0.0, -1.0]])
     normal = np.kron(np.eye(len(touches)), [[1.0, 0.0], [1.0, 0.0]])
 
@@ -256,7 +257,7 @@ def least_friction(weights: Sequence[float], touches: Sequence[Touch], most: flo
         return bool(solution.status == 0)
 
     low, high = 0.0, most
-    for _ in range(20):
+    for _ in range(30):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if carries(middle) else (middle, high)
     return high

@@ -92,6 +92,8 @@ for stiffness in (1e4, 1e5, 1e6):
         with torch.no_grad():
             end = simulator.rollout(simulator.rest_state(), 60).q[-1, 0, :, 2]
         gaps.append(float(end.min()) + 0.9 * D)
+    assert np.all(np.diff(gaps) < 0.0)
+    assert 0.0 < gaps[-1] < gaps[0] < D
     ax.semilogx(loads, 1e3 * np.array(gaps), "o-", label=f"stiffness {stiffness:.0e} Pa")
 ax.set(xlabel="load over the block's weight", ylabel="gap [mm]", ylim=(0.0, 1e3 * D))
 ax.legend()
@@ -119,6 +121,8 @@ for slip_speed in (1e-4, 1e-3, 1e-2, 1e-1):
         start.v[..., 0], start.v[..., 2] = 1.0, -1.0
         thrown = simulator.rollout(start, 30)
     most = max(int(report.iterations.max()) for report in thrown.reports)
+    expected = slip_speed * (1.0 - np.sqrt(1.0 - np.tan(a) / 0.4))
+    assert abs(creep - expected) < 0.02 * expected
     print(f"{1e3 * slip_speed:6g} mm/s {1e3 * creep:6.3g} mm/s {most:10d}")
 
 # %% [markdown]

@@ -249,9 +249,9 @@ class Energy(ABC):
             return values
         count = self.count_of(quantity)
         if values.shape[1] not in (1, count):
-            per = quantity.per or "part"
+            per, named = quantity.per or "part", ", ".join(name for name in self.names if not name.isdigit())
             raise InputError(
-                f"{quantity.name} has {values.shape[1]} values for {count} {per}s ({', '.join(self.names)}): give one "
+                f"{quantity.name} has {values.shape[1]} values for {count} {per}s{named and f' ({named})'}: give one "
                 f"value, or one for each {per}."
             )
         return values.expand(-1, count)

@@ -60,12 +60,12 @@ def test_numbers_stay_numbers_in_other_inputs(given):
     inputs = Inputs(tendon_tension=given)
     expected = simulator.step(start, Inputs(tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
     pushed = simulator.step(start, Inputs(force, tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
-    axis = torch.tensor([0])
-    for other in (inputs.at(0), inputs.replace(attached_mass=None), inputs.to(force), inputs.repeat(1)):
+    last = torch.tensor([1])
+    for other in (inputs.at(0), inputs.replace(attached_mass=None), inputs.to(force), inputs.repeat(2)):
         assert torch.equal(simulator.step(start, other)[0].q, expected)
     for other in (inputs.plus(force), inputs.replace(external_force=force)):
         assert torch.equal(simulator.step(start, other)[0].q, pushed)
-    alone = simulator.step(simulator.rest_state(), inputs.select(axis))[0].q
+    alone = simulator.step(simulator.rest_state(), inputs.select(last))[0].q
     assert alone.numpy() == pytest.approx(expected[:1].numpy(), abs=1e-6)
     scene = Scene({"a": simulator.body, "b": simulator.body})
     both = Simulator(scene, simulator.material, dtype=torch.float32)

@@ -111,8 +111,9 @@ class Inputs:
         return out
 
     def map(self, change: Callable[[torch.Tensor, int], torch.Tensor]) -> "Inputs":
-        """Returns inputs with a function applied to every field and the index of its batch axis."""
-        return self._derived({n: change(x, axis) if x.ndim else x for n, (x, axis) in self.axes().items()})
+        """Returns inputs with a function applied to every field and the index of its batch axis, but not to numbers."""
+        shared = {n for n, (x, axis) in self.axes().items() if not x.ndim or (n in self.plain and x.shape[axis] == 1)}
+        return self._derived({n: x if n in shared else change(x, axis) for n, (x, axis) in self.axes().items()})
 
     def select(self, environments: torch.Tensor) -> "Inputs":
         """Returns the inputs of some environments, given their indices."""

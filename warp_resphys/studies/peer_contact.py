@@ -49,6 +49,7 @@ Run = Callable[[Array, Array, int], tuple[float, Array]]  # q, v (N, 3), T to se
 G: Final = 9.81  # [m/s^2]
 _AWAY: Final = 1.0  # of obstacles from the body at rest, before they grow to the planes [m]
 _MOST_CONTACTS: Final = 2048  # of MuJoCo Warp
+_OURS: Final = "warp_resphys"
 
 
 class ProgramSetting(Settings):
@@ -192,14 +193,14 @@ def _compare(
     scene, dry = make(study), make(study.changed(slip_speed=0.1 * study.slip_speed))
     expected = dry.measure(_barrier(dry, study.reference, device), study.reference)[2][-1]
     programs: dict[str, tuple[Callable[..., Run], tuple[ProgramSetting, ...]]] = {
-        "barrier": (_barrier, study.barrier),
+        _OURS: (_barrier, study.barrier),
         "newton": (_vbd, study.vbd),
         "mujoco": (_mujoco, study.flex),
         "mujoco_warp": (_mujoco_warp, study.flex),
     }
     cases = [
         (program, values, programs[program][0](scene, values, device), list[float]())
-        for program in ("barrier", *study.peers)
+        for program in (_OURS, *study.peers)
         for values in programs[program][1]
     ]
     rows = {}
@@ -329,7 +330,7 @@ def _mujoco_warp(scene: PeerScene, values: FlexSetting, device: torch.device) ->
 
 
 def _table(name: str, rows: list[dict[str, Any]]) -> Sheet:
-    ours = [row for row in rows if row["solver"] == "barrier"]
+    ours = [row for row in rows if row["solver"] == _OURS]
     columns = (
         "program {solver} | step [ms] {step_ms:g} | setting {setting} | time of it [ms] {ms:.3g} | "
         "time / simulated {load:.2f} | error [mm] {error_mm:.2g} | penetration [um] {penetration_um:.3g} | "

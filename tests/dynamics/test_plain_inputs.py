@@ -65,6 +65,8 @@ def test_numbers_stay_numbers_in_other_inputs(given):
         assert torch.equal(simulator.step(start, other)[0].q, expected)
     for other in (inputs.plus(force), inputs.replace(external_force=force)):
         assert torch.equal(simulator.step(start, other)[0].q, pushed)
+    numbers = Inputs(np.full((len(MESH.vertices), 3), 5e-4), tendon_tension=given).plus(0.5 * force)
+    assert torch.equal(simulator.step(start, numbers)[0].q, pushed)
     alone = simulator.step(simulator.rest_state(), inputs.select(last))[0].q
     assert alone.numpy() == pytest.approx(expected[:1].numpy(), abs=1e-6)
     scene = Scene({"a": simulator.body, "b": simulator.body})

@@ -448,7 +448,7 @@ def test_friction_sticks_and_slides_on_a_slope():
 
 
 def test_regions_have_their_own_friction():
-    """Of two cubes on a slope, one slides, and the other one stands on a rough part of the plate."""
+    """Two cubes on a slope: one slides, and the other one stands on a rough part of the plate."""
     plate = box_hexahedra((0.12, 0.06, 0.01), (12, 6, 1))
     rough = select_cells(plate, y=(0.03, 0.06))
     plate = replace(plate, regions={"rough": rough})
@@ -798,7 +798,7 @@ def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
 
 
 def test_a_pin_in_a_cube_is_as_deep_as_it_is():
-    """Of 5 mm width, 10 mm deep in the middle of a cube of 40 mm: what is nearest to its end is the face above."""
+    """A pin of 5 mm, 10 mm deep in the middle of a cube of 40 mm: nearest to its end is the face above."""
     cube = box_hexahedra((0.04, 0.04, 0.04), (4, 4, 4))
     pin = box_hexahedra((0.005, 0.005, 0.012), (1, 1, 1))
     pin = replace(pin, vertices=pin.vertices + [0.0173, 0.0169, 0.03])

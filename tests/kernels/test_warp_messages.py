@@ -1,4 +1,4 @@
-"""What Warp says in a program that uses this package."""
+"""Messages of Warp in a program that uses this package."""
 
 import subprocess
 import sys

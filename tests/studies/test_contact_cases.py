@@ -121,7 +121,7 @@ def test_the_friction_of_cards_balances_moments(degrees):
 
 
 def test_a_second_storey_needs_more_friction():
-    """It stands with 5 % more friction than statics asks, and falls with less."""
+    """A house of two storeys stands with 5 % more friction than statics asks, and falls with 5 % less."""
     one, two = (CardHouse(math.radians(25.0), storeys) for storeys in (1, 2))
     assert len(two.cards) == 7
     need = two.least_friction

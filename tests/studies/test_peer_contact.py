@@ -26,9 +26,9 @@ def rows(folder, peers):
 
 
 def test_ours_approaches_coulombs_law_and_rigid_walls(folder):
-    found = rows(folder, "[]")
+    measured = rows(folder, "[]")
     for name, most in (("slide", 1.0), ("grip", 0.2)):
-        coarse, fine = found[name]
+        coarse, fine = measured[name]
         assert fine["error_mm"] < min(0.4 * coarse["error_mm"], most), name
         assert coarse["penetration_um"] == fine["penetration_um"] == 0.0
         assert coarse["load"] == pytest.approx(coarse["ms"] / 4.0)
@@ -49,9 +49,9 @@ def test_a_block_begins_where_contact_does():
 @pytest.mark.parametrize("peer", ["newton", "mujoco"])
 def test_a_peer_comes_to_the_same(folder, peer):
     pytest.importorskip(peer)
-    found = rows(folder, f"[{peer}]")
+    measured = rows(folder, f"[{peer}]")
     for name, most in (("slide", 3.0), ("grip", 0.1)):
-        last = found[name][-1]
+        last = measured[name][-1]
         assert last["solver"] == peer
         assert last["error_mm"] < most
         assert last["penetration_um"] > 0.0

@@ -253,7 +253,7 @@ class BoundContact(BoundEnergy):
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
         self._area = site.tensor(points.areas)
         self._factor = site.tensor(points.factors)  # (P,) of friction
-        self._rubs_unevenly = bool((points.factors != 1.0).any())
+        self._has_factors = bool((points.factors != 1.0).any())
         self._interpolates = any(isinstance(obstacle, DistanceGrid) for obstacle in obstacles)
         self._shapes = ObstacleSet(obstacles, contact.distance, like.device)
         self._place = site.tensor(np.array([o.position for o in obstacles]))
@@ -348,7 +348,7 @@ class BoundContact(BoundEnergy):
         if self._contact.moves:
             start = self._pushed_out(state.q.detach(), now, d.detach())
         load = self._load(d, step.constants)
-        if self._rubs_unevenly:
+        if self._has_factors:
             load = load * self._factor[:, None]
         if self._interpolates:
             length = n.norm(dim=-1, keepdim=True)

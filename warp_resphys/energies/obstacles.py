@@ -235,15 +235,7 @@ class DistanceGrid(Obstacle):
         low, high = surface.bounds + np.array([[-width], [width]])
         shape = np.ceil((high - low) / spacing).astype(int) + 1
         nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
-        own = wp.Mesh(
-            wp.array(surface.vertices, dtype=wp.vec3, device="cpu"),
-            wp.array(surface.faces.ravel(), dtype=int, device="cpu"),
-            support_winding_number=True,
-        )
-        out = wp.zeros(nodes[..., 0].size, dtype=float, device="cpu")
-        places: Any = wp.array(nodes.reshape(-1, 3), dtype=wp.vec3, device="cpu")
-        wp.launch(kernels.from_surface, out.size, [own.id, places], [out], device="cpu")
-        distances = out.numpy().astype(float).reshape(nodes.shape[:3])
+        distances = signed_distances(surface.vertices, surface.faces, nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
         return cls(distances=distances, spacing=spacing, low=(low[0], low[1], low[2]), **pose)
 
     @classmethod
@@ -266,6 +258,24 @@ class DistanceGrid(Obstacle):
             raise MeshError(f"the units of an obstacle's surface must be one of {', '.join(METRES)}, not {units}")
         vertices, shells = read_shells(Path(path).expanduser())
         return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
+
+
+def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLike) -> NDArray[np.float64]:
+    """Returns the distances (P,) of places (P, 3) from a closed surface, negative inside of it, in float32 [m].
+
+    Args:
+        vertices: (N, 3) [m].
+        triangles: (T, 3) vertices of its triangles, counter-clockwise seen from outside.
+        places: (P, 3) [m].
+    """
+    arrays = [np.asarray(vertices), np.asarray(places)]
+    corners: Any = wp.array(arrays[0], dtype=wp.vec3, device="cpu")
+    points: Any = wp.array(arrays[1], dtype=wp.vec3, device="cpu")
+    indices: Any = wp.array(np.asarray(triangles).ravel(), dtype=int, device="cpu")
+    surface = wp.Mesh(corners, indices, support_winding_number=True)
+    out = wp.zeros(len(arrays[1]), dtype=float, device="cpu")
+    wp.launch(kernels.from_surface, out.size, [surface.id, points], [out], device="cpu")
+    return np.asarray(out.numpy(), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -15,38 +15,12 @@ from ..kernels import surfaces as kernels
 from ..kernels.modules import launch_stream
 from ..mesh.mesh import Mesh, boundary_triangles
 from .launcher import Launcher, warp_view
+from .obstacles import signed_distances
 
 _FIRST_CAPACITY = 4096
 _REBUILT = 100  # Uses of a hierarchy of boxes after which it is made anew.
 _SPARE = 0.75  # radius around the middle of a way within which pairs are sought, over its length
-_AT_ONCE = 64  # vertices or environments whose triangles are compared at once
 _PARALLEL = 1e-3  # |a x b|^2 over |a|^2 |b|^2 at rest below which edges count as almost parallel (Li et al. 2020)
-
-
-def winding(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """Returns how often a closed surface of triangles (B, T, 3, 3) encloses points (B, P, 3), as (B, P).
-
-    By the sum of solid angles (van Oosterom and Strackee 1983).
-    """
-    a, b, c = (corners[:, None] - points[:, :, None, None]).unbind(3)
-    la, lb, lc = (x.norm(dim=-1) for x in (a, b, c))
-    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    return torch.atan2((a * torch.linalg.cross(b, c)).sum(-1), below).sum(2) / (2.0 * torch.pi)
-
-
-def triangle_distances(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """Returns the distances (P,) of points (P, 3) from the nearest of triangles (T, 3, 3) [m]."""
-    a, b, c = corners.unbind(1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    x = points[:, None]
-    distances, inside = [((x - a) * normal).sum(-1).abs()], []
-    for p, q in ((a, b), (b, c), (c, a)):
-        across = torch.linalg.cross((q - p).expand(len(points), -1, -1), x - p)
-        inside.append((across * normal).sum(-1) >= 0.0)
-        share = (((x - p) * (q - p)).sum(-1) / (q - p).square().sum(-1)).clamp(0.0, 1.0)
-        distances.append((x - p - share[..., None] * (q - p)).norm(dim=-1))
-    distances[0] = torch.where(torch.stack(inside).all(0), distances[0], torch.inf)
-    return torch.stack(distances).amin((0, 2))
 
 
 @dataclass(frozen=True)
@@ -162,6 +136,7 @@ class PairList:
         environment: (C,) environments of the pairs.
         nodes: (C, 4) vertices.
         kind: (C,) kind.
+        vertex_array: (P,) vertices of the surface, a Warp array.
         start: (B P + 1) first entry of every vertex of the surface in `incident`, for ``kernels.surfaces.gather``.
         incident: pair 4 + number of the vertex in it.
     """
@@ -190,7 +165,7 @@ class PairList:
             launcher.upload(part.astype(np.int32), int) for part in (surface.triangles, surface.edges)
         )
         self._piece_array = launcher.upload(surface.pieces.astype(np.int32), int)
-        self._vertex_array = launcher.upload(surface.vertices.astype(np.int32), int)
+        self.vertex_array = launcher.upload(surface.vertices.astype(np.int32), int)
         self._local = torch.full((n,), -1, device=device)
         self._local[self.vertices] = torch.arange(len(self.vertices), device=device)
         extent = np.ptp(surface.rest[surface.vertices], axis=0)
@@ -234,7 +209,7 @@ class PairList:
             pair_keys, count = broad_phase.PairKeys(), torch.zeros(1, device=own.device, dtype=torch.int32)
             keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
             pair_keys.count, pair_keys.keys = warp_view(count, wp.int32), warp_view(keys, wp.int64)
-            inputs = [triangles.id, motion, self._vertex_array, self._triangle_array, wp.int64(total), pair_keys]
+            inputs = [triangles.id, motion, self.vertex_array, self._triangle_array, wp.int64(total), pair_keys]
             own.launch(own.record(broad_phase.vertex_triangle_pairs, (own.batch, len(surface.vertices)), inputs, []))
             inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), pair_keys]
             own.launch(own.record(broad_phase.edge_edge_pairs, (own.batch, len(surface.edges)), inputs, []))
@@ -312,20 +287,19 @@ class PairList:
         depth, deepest = 0.0, -1
         pieces = self._pieces[[vertex, other]].tolist()
         for one, two in (pieces, pieces[::-1]) if pieces[0] != pieces[1] else ():
-            own, corners = self.vertices[self._pieces[self.vertices] == one], positions[self._triangles_of(two)]
-            for some in own.split(_AT_ONCE):
-                points = positions[some]
-                inside = winding(points[None], corners[None])[0] > 0.5
-                far = torch.where(inside, triangle_distances(points, corners), -1.0)
-                if float(far.max()) > depth:
-                    depth, deepest = float(far.max()), int(some[far.argmax()])
+            own = self.vertices[self._pieces[self.vertices] == one]
+            far = -self._distances(positions, two, own)
+            if far.max() > depth:
+                depth, deepest = float(far.max()), int(own[int(far.argmax())])
         if deepest >= 0:
             words += f"; deepest is {self.surface.words(deepest)}, by {1e3 * depth:.3g} mm"
         return words
 
-    def _triangles_of(self, piece: int) -> torch.Tensor:
-        """Returns the triangles (T, 3) of a piece."""
-        return self._triangles[self._pieces[self._triangles[:, 0]] == piece]
+    def _distances(self, positions: torch.Tensor, piece: int, vertices: torch.Tensor) -> NDArray[np.float64]:
+        """Returns the distances (V,) of vertices (V,) from a piece, negative within it, at positions (N, 3) [m]."""
+        triangles = self._triangles[self._pieces[self._triangles[:, 0]] == piece]
+        x = positions.cpu()
+        return signed_distances(x, triangles.cpu(), x[vertices.cpu()])
 
     def enclosed(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns (B, 2) a vertex of a piece within another one, and a vertex of that; -1 where there is none.
@@ -337,13 +311,10 @@ class PairList:
         of = [positions[:, self.vertices[self._pieces[self.vertices] == piece]] for piece in pieces]
         low, high = torch.stack([x.amin(1) for x in of], 1), torch.stack([x.amax(1) for x in of], 1)  # (B, pieces, 3)
         contained = (low[:, :, None] > low[:, None]).all(-1) & (high[:, :, None] < high[:, None]).all(-1)
-        for one, two in contained.any(0).nonzero().tolist():
-            rows = contained[:, one, two].nonzero().ravel()
-            vertex = self.vertices[self._pieces[self.vertices] == pieces[one]][0]
-            triangles = self._triangles_of(int(pieces[two]))
-            for some in rows.split(_AT_ONCE):
-                inside = winding(positions[some][:, vertex, None], positions[some][:, triangles])[:, 0] > 0.5
-                out[some[inside]] = torch.stack([vertex, triangles[0, 0]])
+        for b, one, two in contained.nonzero().tolist():
+            vertices = [self.vertices[self._pieces[self.vertices] == pieces[piece]][:1] for piece in (one, two)]
+            if self._distances(positions[b], int(pieces[two]), vertices[0])[0] < 0.0:
+                out[b] = torch.cat(vertices)
         return out
 
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -61,9 +61,9 @@ def _material_of(material: Material | Materials, body: Body, name: str) -> Mater
     """Returns the material of a body, none for a rigid one, or raises InputError."""
     if not name or isinstance(material, Material):
         return material
-    if name not in material and body.soft_cells is not None and not len(body.soft_cells):
-        return {}
     if name not in material:
+        if body.soft_cells is not None and not len(body.soft_cells):
+            return {}
         raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
     own: Material | Materials = material[name]
     return own

@@ -129,8 +129,7 @@ class SurfaceTerm(Term):
             return field
         out = torch.zeros_like(field) if out is None else out
         (s,), own = self.sets, self.launcher
-        vertices = warp_view(self._list.vertices.to(torch.int32), wp.int32)
-        inputs = [vertices, s.nodes, s.gradients, warp_view(field.contiguous(), wp.vec3d)]
+        inputs = [self._list.vertex_array, s.nodes, s.gradients, warp_view(field.contiguous(), wp.vec3d)]
         own.launch(own.record(kernels.interpolate, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
         return out
 
@@ -233,7 +232,8 @@ class SurfaceTerm(Term):
     @override
     def pair_tangents(self, values: Values, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
         own, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
-        positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
+        if self._whole is not None:
+            positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
             stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)

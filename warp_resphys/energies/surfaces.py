@@ -92,7 +92,7 @@ class SurfaceContact(Energy):
     @property
     @override
     def names(self) -> tuple[str, ...]:
-        return ("other", *self.pairs)
+        return ("other", *self.pairs) if self.pairs else super().names
 
     @property
     @override

@@ -138,7 +138,10 @@ class Inputs:
         """Returns the inputs with an external force (B, N, 3) added [N]."""
         if force is None:
             return self
-        return self.replace(external_force=force if self.external_force is None else self.external_force + force)
+        own = self.external_force
+        if own is not None and "external_force" in self.plain:
+            own = own.to(force)
+        return self.replace(external_force=force if own is None else own + force)
 
     def _has_time_axis(self) -> Mapping[str, bool]:
         """Whether each field has a time axis, by name."""

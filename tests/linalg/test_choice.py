@@ -9,6 +9,7 @@ from warp_resphys.linalg.banded import BandedSolver
 from warp_resphys.linalg.bordered import BorderedSolver, hubs
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.dense import DenseSolver
+from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 from warp_resphys.linalg.sparse import SparseSolver
 from warp_resphys.linalg.tiled import TiledSolver
 
@@ -51,6 +52,20 @@ def test_few_hubs_of_a_narrow_band_come_last_and_many_of_a_wide_one_do_not():
     rows, cols = np.array(sorted(pairs)).T
     assert len(hubs(rows, cols, count)) >= len(many)
     assert isinstance(make_linear_solver("auto", rows, cols, count, 3, CPU, torch.float64), BandedSolver)
+
+
+def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
+    """A grid of 12 nodes along every axis, which all couple to their neighbours."""
+    at = np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    near = np.abs(at[:, None] - at).max(-1) <= 1
+    rows, cols = np.nonzero(np.tril(near))
+    body = (rows, cols, len(at), 3, CPU, torch.float64, at.astype(float))
+    expected = PardisoSolver if has_pardiso() else BandedSolver
+    assert isinstance(make_linear_solver("auto", *body), expected)
+    monkeypatch.setattr("warp_resphys.linalg.choice.has_pardiso", lambda: False)
+    assert isinstance(make_linear_solver("auto", *body), BandedSolver)
+    with pytest.raises(InputError, match="pip install mkl"):
+        make_linear_solver("pardiso", *body)
 
 
 def test_bad_choices_are_refused():

@@ -11,6 +11,7 @@ from warp_resphys.linalg.banded import BandedSolver
 from warp_resphys.linalg.bordered import BorderedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
+from warp_resphys.linalg.pardiso import has_pardiso
 
 NODES, BATCH, HUB = 16, 3, 5
 
@@ -53,7 +54,8 @@ def make(kind, block, device="cpu", dtype=torch.float64):
 
 
 def layouts(device):
-    return ["dense", "sparse", "tiled", "multigrid"] + (["banded", "bordered"] if device == "cpu" else [])
+    of_cpus = ["banded", "bordered"] + (["pardiso"] if has_pardiso() else [])
+    return ["dense", "sparse", "tiled", "multigrid"] + (of_cpus if device == "cpu" else [])
 
 
 @pytest.fixture(params=[True, False], ids=["cholespy", "scipy"])

@@ -127,7 +127,9 @@ class ExactHessian(HessianApproximation):
         """Factorises the Hessian without clamping, for adjoints."""
         self.clamped.zero_()
         self._potential.update_tangent()
-        self._factor = self._factor_of(self.assembly())
+        many = self._potential.low_rank is not None or self._potential.has_pairs  # right-hand sides
+        near = None if many else self.linear.near(self.assembly())
+        self._factor = near or self._factor_of(self.assembly())
         if self._factor.failed.any():
             self._factor = self._factor_of(self.assembly(), definite=False)
         if self._coupled is not None:

@@ -50,7 +50,7 @@ class SolverSettings:
     max_iterations: int = 2000  # iterations after which a solve has failed
     memory: int = 12  # number of L-BFGS pairs
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` refactorises
-    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``multigrid``
+    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse``, ``multigrid``, ...
     factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and continue
 
@@ -133,7 +133,7 @@ class NonlinearSolver:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
         # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
-        quasi = 0 if linear.iterates else settings.refactor_after
+        quasi = 0 if linear.iterates else settings.refactor_after * linear.patience
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
         self._minimiser = Minimiser(
             potential,

@@ -1,8 +1,8 @@
 """Linear solvers by name, and the cheapest one for a sparsity pattern and a device.
 
 Soft robots are slender: with a bandwidth-reducing order, LAPACK's banded Cholesky is the cheapest on a CPU up to tens
-of thousands of unknowns, and a tiled one on a GPU. Larger bodies use multigrid on a CPU and CHOLMOD (cholespy) on a
-GPU; the smallest bodies on a GPU use batched dense Cholesky.
+of thousands of unknowns, and a tiled one on a GPU. Compact bodies use Pardiso on a CPU, or multigrid where it is not
+installed, and CHOLMOD (cholespy) on a GPU; the smallest bodies on a GPU use batched dense Cholesky.
 """
 
 from collections.abc import Callable
@@ -19,12 +19,16 @@ from .bordered import BorderedSolver, banded_rest, hubs
 from .dense import DenseSolver
 from .linear_solver import Indices, LinearSolver, bandwidth
 from .multigrid import MultigridSolver
+from .pardiso import PardisoSolver, has_pardiso
 from .sparse import SparseSolver
 from .tiled import TiledSolver
 
-LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"]
+LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
 MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU above which multigrid is cheaper
+MAX_SMALL_FLOPS = 5e8  # multiplications of a banded factor up to which no other one is cheaper
+COMPACT = 30  # squared bandwidth over unknowns from which Pardiso is cheaper than a banded factor
+MAX_PARDISO_UNKNOWNS = 80_000  # unknowns above which its factor takes too much time and memory
 BORDER_FLOPS = 44  # of an unknown beside a band, in multiplications of a banded factor
 MAX_TILED_BANDWIDTH = 600  # unknowns above which the tiles of a band hold mostly fill on a GPU
 MAX_DENSE_UNKNOWNS = 4000  # unknowns
@@ -46,12 +50,16 @@ def make_linear_solver(
     With `direct` it selects none that iterates, which would be dear for many right-hand sides of a factor.
 
     Raises:
-        InputError: an unknown name, or a banded solver on a GPU.
+        InputError: an unknown name, a solver of CPUs on a GPU, or one that is not installed.
     """
     if name not in LINEAR_SOLVERS:
         raise InputError(f"linear_solver is {name!r}: choose one of {', '.join(LINEAR_SOLVERS)}.")
-    if name in ("banded", "bordered") and device.type != "cpu":
+    if name in ("banded", "bordered", "pardiso") and device.type != "cpu":
         raise InputError(f"linear_solver={name} runs on the CPU alone: choose tiled, dense, sparse or auto on a GPU.")
+    if name == "pardiso" and not has_pardiso():
+        raise InputError(
+            "linear_solver=pardiso needs the package mkl, for x86 processors: pip install mkl, or take auto."
+        )
     if name == "auto":
         name = _cheapest(rows, cols, n_nodes, block, device)
         name = "sparse" if direct and name == "multigrid" else name
@@ -62,6 +70,7 @@ def make_linear_solver(
         "dense": DenseSolver,
         "sparse": SparseSolver,
         "multigrid": MultigridSolver,
+        "pardiso": PardisoSolver,
     }
     return solvers[name](rows, cols, n_nodes, block, device, dtype, positions)
 
@@ -81,7 +90,11 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
             rest = block * bandwidth(*banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border))
             costs["bordered"] = unknowns * rest * (rest + BORDER_FLOPS * block * len(border))
         name = min(costs, key=lambda solver: costs[solver])
-        return name if costs[name] <= MAX_BANDED_FLOPS else "multigrid"
+        pardiso = unknowns <= MAX_PARDISO_UNKNOWNS and has_pardiso()
+        compact = costs[name] > max(MAX_SMALL_FLOPS, COMPACT * unknowns**2) and pardiso
+        if costs[name] <= MAX_BANDED_FLOPS and not compact:
+            return name
+        return "pardiso" if pardiso else "multigrid"
     if width + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):
         return "tiled"
     return "dense" if unknowns <= MAX_DENSE_UNKNOWNS else "sparse"

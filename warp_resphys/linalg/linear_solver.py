@@ -182,6 +182,7 @@ class LinearSolver(ABC):
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
         iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
+        patience: number of times as many iterations for which a factor is worth keeping, as with a banded one.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
@@ -190,6 +191,7 @@ class LinearSolver(ABC):
     order: Indices
     overwrites = False
     iterates = False
+    patience = 1
 
     def __init__(
         self,
@@ -243,6 +245,11 @@ class LinearSolver(ABC):
             kept = kept.factor
         factor = self._factorise(values, definite, idle, kept)
         return factor if columns is None else CorrectedFactor(factor, columns, self.dofs)
+
+    def near(self, values: torch.Tensor) -> Factor | None:
+        """Returns a factor for a few solutions near the last matrices, without a factor of its own, or None."""
+        del values
+        return None
 
     @abstractmethod
     def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:

@@ -227,8 +227,8 @@ class SolveSettings(Settings):
     refactor_after: Natural = setting(
         4, "iterations of a step above which quasi_newton refactorises an environment before the next step"
     )
-    linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid"] = setting(
-        "auto", "for Newton's equation; banded and bordered run on the CPU alone"
+    linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
+        "auto", "for Newton's equation; banded, bordered and pardiso run on the CPU alone"
     )
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; residuals, states and gradients stay accurate"

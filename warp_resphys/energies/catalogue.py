@@ -1,22 +1,32 @@
 """Materials by the names that they have in configurations."""
 
-from typing import Any
+from typing import Any, Final
 
+from ..io.entry_points import extension
 from ..io.errors import InputError
 from .materials import ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 from .neural import NeuralMaterial
 
-MATERIALS: dict[str, type[Material]] = {
+MATERIALS: Final[dict[str, type[Material]]] = {
     kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial, NeuralMaterial)
 }
 
 
 def make_material(model: str = "corotated", **constants: Any) -> Material:
-    """Returns the named material.
+    """Returns the named material, of this package or of another one with an entry point in ``warp_resphys.materials``.
 
     Raises:
         InputError: an unknown name, a constant that the material does not have, or a value out of range.
     """
-    if model not in MATERIALS:
-        raise InputError(f"material model is {model!r}: choose one of {', '.join(MATERIALS)}.")
-    return MATERIALS[model].from_constants(constants)
+    if model in MATERIALS:
+        return MATERIALS[model].from_constants(constants)
+    found = extension("materials", model, MATERIALS, "material model")
+    kind = found.load()
+    if not (isinstance(kind, type) and issubclass(kind, Material)):
+        raise InputError(
+            f"{model} of the package {found} is {kind!r}: its entry point must name a subclass of Material."
+        )
+    try:
+        return kind.from_constants(constants)
+    except InputError as error:
+        raise InputError(f"{model} of the package {found}: {error}") from error

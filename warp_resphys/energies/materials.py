@@ -244,7 +244,9 @@ class DensityMaterial(Material):
     def __init_subclass__(cls, **more: Any) -> None:
         """Builds the law from the functions."""
         super().__init_subclass__(**more)
-        cls.law = density_law(cls.__name__, cls.energy_density, cls.volume_energy or cls.energy_density)
+        cls.law = density_law(
+            f"{cls.__module__}.{cls.__name__}", cls.energy_density, cls.volume_energy or cls.energy_density
+        )
         count = len(cls.law.LAME) - 4
         cls.rules = ("shape", "volume", "shape", "volume", *("mean",) * count)
         cls.curvature = (0.0, 0.0, 2.0, 1.0, *(0.0,) * count)

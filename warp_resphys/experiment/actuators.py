@@ -24,6 +24,7 @@ from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
+from ..settings.extensions import built, driving_settings
 from ..settings.mesh import PlaceSettings
 from ..stepping.quantity import Quantity
 
@@ -49,7 +50,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     """Builds the energies of a body besides its material.
 
     Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string``, ``obstacles`` and
-    ``self_contact``.
+    ``self_contact``, and ``energies`` of other packages.
 
     Args:
         settings: of the body.
@@ -80,6 +81,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     if settings.self_contact is not None:
         pairs = {name: FrictionPair(**dict(pair)) for name, pair in settings.self_contact.pairs.items()}
         energies.append(SurfaceContact(**dict(settings.self_contact) | {"pairs": pairs}))
+    energies += [built("energies", name, own, Energy, mesh) for name, own in settings.energies.items()]
     return energies
 
 
@@ -121,7 +123,8 @@ def driving_quantity(settings: BodySettings) -> Quantity | None:
         own = getattr(settings, group)
         if own is not None and own.commanded is not None:
             return quantities[own.commanded]
-    return None
+    own = driving_settings(settings.energies)
+    return None if own is None else cast(Quantity, own.drive)
 
 
 def driven_parts(settings: BodySettings) -> int:
@@ -130,6 +133,8 @@ def driven_parts(settings: BodySettings) -> int:
         return settings.chambers.count
     if settings.tendons is not None:
         return len(settings.tendons.routes)
+    if (own := driving_settings(settings.energies)) is not None:
+        return own.driven_parts
     assert settings.muscles is not None
     return len(settings.muscles.bundles)
 

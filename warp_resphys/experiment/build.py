@@ -37,6 +37,7 @@ from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
+from ..settings.extensions import built
 from ..settings.mesh import (
     BoxesMesh,
     FileMesh,
@@ -276,19 +277,27 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
     """
     to, points = settings.bind_to, np.asarray(places, dtype=np.float64)
     parts, rows = list[BoundMarkers](), list[list[int]]()
-    for name, own in corners_of(labels).items():
-        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[name], mesh), points[own]))
+    for body, own in corners_of(labels).items():
+        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[own]))
         rows.append(list(range(own.start, own.stop)))
     if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
-        markers = bind_markers(
-            mesh,
-            points[marked],
-            [labels[row] for row in marked],
-            kind=settings.bind,
-            vertices=None if to is None else select_vertices(mesh, **to.arguments()),
-            largest_distance=settings.largest_distance,
-            patch=settings.patch,
-        )
+        tracked = mesh, points[marked], [labels[row] for row in marked]
+        if settings.observation:
+            ((name, keys),) = settings.observation.items()
+            markers = built("observations", name, keys, Markers, *tracked)
+            if type(markers).moved is Markers.moved:
+                raise InputError(
+                    f"markers.observation.{name}: {type(markers).__name__} has no method moved, which identification "
+                    "and prediction intervals need, as places of markers are not exact: add it, as in Markers."
+                )
+        else:
+            markers = bind_markers(
+                *tracked,
+                kind=settings.bind,
+                vertices=None if to is None else select_vertices(mesh, **to.arguments()),
+                largest_distance=settings.largest_distance,
+                patch=settings.patch,
+            )
         parts, rows = [markers, *parts], [marked, *rows]
     return JoinedMarkers.of(parts, rows)
 

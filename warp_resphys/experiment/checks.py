@@ -131,6 +131,8 @@ def _check_control(run: RunSettings, body: Body) -> None:
     """Checks that the robot can be controlled."""
     if find_spec("piqp") is None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
+    if run.network.core:
+        raise InputError("control evaluates perceptrons alone: set control=none, or network.core={}.")
     if drive_of(run, body) is None:
         raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
     if run.obstacles or run.self_contact:

@@ -110,6 +110,7 @@ class Dataset:
         base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
         obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see `data.obstacle_motion`.
         sessions: session in which each trial was recorded; empty if there is one.
+        units: units of inputs that are not in `actuators.DRIVING_QUANTITIES`, such as those of other packages.
     """
 
     names: tuple[str, ...]
@@ -130,6 +131,7 @@ class Dataset:
     base: FloatArray | None = None
     obstacles: Mapping[str, FloatArray] = field(default_factory=dict)
     sessions: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def session(self, name: str) -> str:
         """Session in which a trial was recorded; empty if there is one."""
@@ -158,17 +160,18 @@ class Dataset:
         words |= {"obstacles": tuple(self.obstacles)} if self.obstacles else {}
         words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
         attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
+        units = {name: quantity.unit for name, quantity in DRIVING_QUANTITIES.items()} | dict(self.units)
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
             for name, unit in _UNITS.items():
                 if getattr(self, name) is not None:
                     axis = int(name in ("observed", "smoothed", "velocity"))
                     create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
-                create(file, name, values, units=DRIVING_QUANTITIES[name].unit or "1", time_axis=1)
+                create(file, name, values, units=units[name] or "1", time_axis=1)
             for name, values in self.obstacles.items():
                 create(file, f"obstacles/{name}", values, units=_UNITS["base"])
             for name, values in self.resting.items():
-                create(file, f"{name}_resting", values, units=DRIVING_QUANTITIES[name].unit or "1")
+                create(file, f"{name}_resting", values, units=units[name] or "1")
 
     def joined(self, other: "Dataset") -> "Dataset":
         """Returns a dataset with these trials followed by others of the same body with the same number of frames."""
@@ -273,7 +276,9 @@ def read_dataset(path: Path) -> Dataset:
         observed = read_array(file, "observed", (r, times.shape[1], len(labels) or None, 3))
         m = observed.shape[2]
         shapes = {"bound": (m, 3), "smoothed": observed.shape, "velocity": observed.shape}
-        optional = {name: read_array(file, name, shape) if name in file else None for name, shape in shapes.items()}
+        optional: dict[str, Any] = {
+            name: read_array(file, name, shape) if name in file else None for name, shape in shapes.items()
+        }
         return Dataset(
             names,
             labels,

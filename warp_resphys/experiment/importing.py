@@ -271,6 +271,7 @@ def _dataset(
         smoothed=smoothed if cutoff is not None or all(x.settings.begins in RESTING for x in observed) else None,
         inputs=inputs,
         channels={} if drive is None else {drive.quantity.name: drive.parts},
+        units={} if drive is None else {drive.quantity.name: drive.quantity.unit},
         resting=resting,
         base=base,
         obstacles={name: motion for name, motion in obstacles.items() if motion is not None},

@@ -15,11 +15,13 @@ dotted key.
 
 import hashlib
 import json
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic_core import PydanticUndefined
 
+from .entry_points import extensions
 from .errors import InputError
 from .setting_errors import sentence
 
@@ -54,6 +56,15 @@ class Settings(BaseModel):
         text = json.dumps(self.plain(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def named_extensions(self) -> Iterator[tuple[str, str]]:
+        """Yields the kind and the name of what the keys of this class, but not its groups, name in other packages."""
+        yield from ()
+
+    def packages(self) -> dict[str, str]:
+        """Returns the versions of the other packages whose classes these settings and all their groups name."""
+        own = [own for kind, name in self.named_extensions() for own in extensions(kind) if own.point.name == name]
+        return {one.package: one.version for one in own} | packages_of(dict(self))
+
     def changed(self, **values: Any) -> Self:
         """Returns a copy with other values of some keys.
 
@@ -67,6 +78,14 @@ class Settings(BaseModel):
         """Returns settings of this class with the keys that another object shares, and ``values`` for the others."""
         shared = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
         return cls(**{**shared, **values})
+
+
+def packages_of(value: Any) -> dict[str, str]:
+    """Returns `Settings.packages` of all settings in nested data."""
+    if isinstance(value, Settings):
+        return value.packages()
+    parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    return {name: version for part in parts for name, version in packages_of(part).items()}
 
 
 def setting(default: Any = PydanticUndefined, description: str = "", unit: str = "", **limits: Any) -> Any:

@@ -21,9 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from .atomic import digest
+from .entry_points import check_packages
 from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib
+from .settings import packages_of
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +68,8 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
         "settings": to_plain(stage.settings),
         "upstream": [upstream_fingerprints[name] for name in stage.upstream],
     }
+    if packages := packages_of(stage.settings):
+        content["packages"] = packages
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -172,6 +176,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),
             "versions": package_versions(),
+            "packages": packages_of(stage.settings),
             "machine": made_on(),
         },
     )
@@ -188,8 +193,8 @@ def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
     """Returns the record of a finished stage, with its ``settings``, after checking all files that it depends on.
 
     Raises:
-        DataFileError: there is no such folder, the stage is unfinished or was run by another version of this program,
-            or an output of it or of a stage upstream is missing or has changed.
+        DataFileError: there is no such folder, the stage is unfinished, was run by another version of this program, or
+            with a package that is not installed, or an output of it or of a stage upstream is missing or has changed.
     """
     folder = Path(run_dir)
     if not (folder / "stages").is_dir():
@@ -207,6 +212,7 @@ def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
             f"{folder} was written by warp-resphys {made}, and this is {here}: {again} in another run folder, or use "
             "the version that wrote it."
         )
+    check_packages(record.get("packages", {}), folder)
     for output, identity in record["outputs"].items():
         if not _is_same(folder / output, identity):
             raise DataFileError(f"{folder / output} is missing or has changed since it was written: {again}.")

@@ -16,7 +16,7 @@ from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
 from ..settings.learning import InTheLoopSettings
 from .full_batch import FullBatchTrainer
-from .networks import ResidualForce
+from .networks import OwnNetwork, ResidualForce
 from .predictors import LearnedPredictor
 from .replay import Replay, Start
 
@@ -180,6 +180,9 @@ def _remove_force(model: ResidualForce) -> None:
     """Makes the force zero through the last layers alone, so that their gradients stay non-zero."""
     for coder in model.coders:
         coder.mean.zero_()
+    if isinstance(model.network, OwnNetwork):
+        model.network.gain.zero_()
+        return
     for block in model.network.blocks:
         last = block[-1]  # type: ignore[index]
         last.weight.zero_()

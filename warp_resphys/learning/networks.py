@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from ..dynamics.modes import RestStiffness
 from ..io.errors import InputError
+from ..settings.extensions import built
 from ..settings.learning import NetworkSettings
 from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
@@ -90,6 +91,35 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str)
     return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
 
 
+class OwnNetwork(nn.Module):
+    """The network of another package, with a factor on each output.
+
+    Args:
+        core: its name with its keys, as in `NetworkSettings`.
+        n_in: inputs.
+        n_out: outputs.
+
+    Raises:
+        InputError: it cannot be built, or maps to another shape.
+    """
+
+    def __init__(self, core: Mapping[str, Mapping[str, Any]], n_in: int, n_out: int) -> None:
+        super().__init__()
+        ((name, keys),) = core.items()
+        self.core: nn.Module = built("networks", name, keys, nn.Module, n_in, n_out)
+        self.gain = nn.Parameter(torch.ones(n_out))
+        with torch.no_grad():
+            shape = tuple(self.core.eval()(torch.zeros(2, n_in)).shape)
+        self.core.train()
+        if shape != (2, n_out):
+            raise InputError(f"network.core.{name} maps (2, {n_in}) to {shape}: it must map to (2, {n_out}).")
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Maps (S, n_in) to (S, n_out)."""
+        mapped: torch.Tensor = self.gain * self.core(x)
+        return mapped
+
+
 class StateMap(nn.Module):
     """Predicts fields from a state, in standardised coordinates: a linear part plus a network for the remainder.
 
@@ -124,13 +154,17 @@ class StateMap(nn.Module):
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
         self.recurrent = architecture.recurrent
-        keys = (*_ARCHITECTURE, "recurrent") if self.recurrent is not None else _ARCHITECTURE
+        keys = (*_ARCHITECTURE, *(key for key in ("recurrent", "core") if getattr(architecture, key)))
         self.architecture = {key: getattr(architecture, key) for key in keys}
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
-        kind: type[SkipMLP | RecurrentMLP] = SkipMLP if self.recurrent is None else RecurrentMLP
-        self.network = kind(n_in, n_out, **self.architecture).to(rest.device)
+        network: SkipMLP | RecurrentMLP | OwnNetwork
+        if architecture.core:
+            network = OwnNetwork(architecture.core, n_in, n_out)
+        else:
+            network = (SkipMLP if self.recurrent is None else RecurrentMLP)(n_in, n_out, **self.architecture)
+        self.network = network.to(rest.device)
         self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
 

@@ -122,11 +122,12 @@ def network_note(settings: RunSettings, on_law: bool = False) -> str:
             f"a reduced basis of {network.position_modes} position, {network.velocity_modes} velocity and "
             f"{network.force_modes} force modes"
         )
-    blocks = f"{network.blocks} block{'s' if network.blocks > 1 else ''}"
+    blocks = f"{network.blocks} block{'s' if network.blocks > 1 else ''} of {network.layers} hidden layers of "
+    core = f"{blocks}{network.width}" if not network.core else f"the core {next(iter(network.core))}"
     how = "as published" if dict(trainer).items() >= _PUBLISHED_TRAINER.items() else "our way"
     linear = "" if trainer.linear_noise is None else ", with a linear part from ridge regression"
     text = (
-        f"ResPhys: {who}, in {basis}, {blocks} of {network.layers} hidden layers of {network.width}{linear}; trained "
+        f"ResPhys: {who}, in {basis}, {core}{linear}; trained "
         f"{how}, {trainer.epochs} epochs, weights chosen by {_SELECTED_BY[trainer.selection]}."
     )
     if settings.refinement is not None:

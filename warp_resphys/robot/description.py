@@ -16,9 +16,10 @@ from ..experiment.build import bound_markers, build_body, build_simulator, marke
 from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
+from ..io.entry_points import check_packages
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
-from ..io.settings import Settings, parse
+from ..io.settings import Settings, packages_of, parse
 from ..io.stages import finished_record, planned_settings
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
@@ -26,6 +27,7 @@ from ..learning.placement import PlacedMarkers, Placement
 from ..learning.predictors import Range
 from ..mesh.mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.learning import NetworkSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import EvaluateStage
 from ..settings.trials import MarkerSettings
@@ -132,6 +134,10 @@ class Description:
         placed = self.placement
         return seen if placed is None else PlacedMarkers.of(seen, Placement.from_plain(placed, self.labels))
 
+    def _network(self) -> NetworkSettings | None:
+        """Settings of the network."""
+        return None if self.learned is None else NetworkSettings(**self.learned.network.architecture)
+
     def write(self, path: Path) -> None:
         """Writes one safetensors file with JSON metadata.
 
@@ -139,6 +145,7 @@ class Description:
             DataFileError: the file cannot be written.
         """
         metadata: dict[str, Any] = {key: getattr(self, key) for key in _PLAIN}
+        metadata["packages"] = packages_of([self.settings, self.material, self.markers, self._network()])
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
         tensors = {"vertices": torch.from_numpy(self.mesh.vertices), "cells": torch.from_numpy(self.mesh.cells)}
         tensors |= {f"{_REGION}{name}": torch.from_numpy(cells) for name, cells in self.mesh.regions.items()}
@@ -154,9 +161,10 @@ class Description:
         """Reads a file of `write`.
 
         Raises:
-            DataFileError: the file is missing, damaged, or of another kind or version.
+            DataFileError: the file is missing, damaged, of another kind or version, or made with a package that is not installed.
         """
         tensors, fields = read_checkpoint(path, _KIND)
+        check_packages(fields.pop("packages", {}), path)
         stored, learned = fields.pop("network", None), None
         if stored is not None:
             weights = {name.removeprefix(_NETWORK): x for name, x in tensors.items() if name.startswith(_NETWORK)}

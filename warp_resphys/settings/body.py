@@ -1,11 +1,14 @@
 """Settings of a body (material, parts, actuators, loads) and of its simulator."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
+from typing_extensions import override
 
 from ..io.errors import listed
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting
+from .extensions import OwnEnergies
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
 from .obstacles import ContactSettings, ObstacleSettings, SurfaceContactSettings
 
@@ -41,6 +44,10 @@ class RegionMaterialSettings(_Constants):
 
     model: Word | None = setting(None, "constitutive model; a different one has its own constants alone")
 
+    @override
+    def named_extensions(self) -> Iterator[tuple[str, str]]:
+        yield from () if self.model is None else (("materials", self.model),)
+
 
 class MaterialSettings(_Constants):
     """A material and its constants, in SI units, as `energies.materials` lists them; null takes one out."""
@@ -51,6 +58,10 @@ class MaterialSettings(_Constants):
 
     model: Word = setting("corotated", "constitutive model")
     regions: dict[str, RegionMaterialSettings] = setting({}, "materials of regions of the mesh, by name")
+
+    @override
+    def named_extensions(self) -> Iterator[tuple[str, str]]:
+        yield "materials", self.model
 
     @model_validator(mode="before")
     @classmethod
@@ -257,9 +268,14 @@ class BodySettings(Settings):
     )
     obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
     contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
+    energies: OwnEnergies = setting({}, "energies and actuators of other packages, by name, with their own keys")
     self_contact: SurfaceContactSettings | None = setting(
         None, "contact of the body with itself and of its parts with one another; null: they pass through one another"
     )
+
+    @override
+    def named_extensions(self) -> Iterator[tuple[str, str]]:
+        yield from (("energies", name) for name in self.energies)
 
     @model_validator(mode="after")
     def _touches(self) -> Self:

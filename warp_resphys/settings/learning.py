@@ -1,11 +1,14 @@
 """Settings of identification, reconstruction of forces, networks and their training."""
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from typing_extensions import override
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Share, Some, Word, setting
 from .body import Integrator
+from .extensions import OwnCore
 from .trials import different, rising
 
 Size = Annotated[int, Field(ge=1, le=16_384)]
@@ -197,6 +200,19 @@ class NetworkSettings(Settings):
     recurrent: Annotated[int, Field(ge=1, le=1_024)] | None = setting(
         None, "size of a hidden state that is kept over the roll-out; it needs trainer=sequences"
     )
+    core: OwnCore = setting(
+        {}, "map between the coders by another package, in place of blocks and layers: its name with its own keys"
+    )
+
+    @override
+    def named_extensions(self) -> Iterator[tuple[str, str]]:
+        yield from (("networks", name) for name in self.core)
+
+    @model_validator(mode="after")
+    def _keeps_nothing(self) -> Self:
+        if self.core and self.recurrent is not None:
+            raise ValueError("core has no hidden state, but recurrent is its size: leave one of them out.")
+        return self
 
 
 class EpochSettings(Settings):

@@ -12,6 +12,7 @@ from ..io.errors import InputError, listed
 from ..io.settings import Natural, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
+from .extensions import own_settings
 from .learning import (
     AblationSettings,
     ActuationSettings,
@@ -287,6 +288,10 @@ class RunSettings(SimulatorSettings):
                 "chambers": body.chambers is not None,
                 "tendons": body.tendons is not None,
                 "muscles": body.muscles is not None and body.muscles.commanded is not None,
+            }
+            commanded |= {
+                f"energies.{name}": own_settings("energies", name, values).drive is not None
+                for name, values in body.energies.items()
             }
             driven = [f"{key}{group}" for group, is_driven in commanded.items() if is_driven]
             if len(driven) > 1:

@@ -1,0 +1,1 @@
+"""Physics of my robot for warp_resphys."""

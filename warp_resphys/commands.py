@@ -58,6 +58,10 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             word="recording.path",
         ),
         "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.mesh_inspection:make_arm"),
+        "inspect extensions": Command(
+            "materials, energies, observations and networks of installed packages",
+            "studies.extension_list:list_extensions",
+        ),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
         "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),

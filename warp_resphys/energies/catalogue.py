@@ -20,12 +20,10 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
     """
     if model in MATERIALS:
         return MATERIALS[model].from_constants(constants)
-    found = extension("materials", model, MATERIALS, "material model")
+    found = extension("materials", model, MATERIALS, f"material model is {model!r}")
     kind = found.load()
     if not (isinstance(kind, type) and issubclass(kind, Material)):
-        raise InputError(
-            f"{model} of the package {found} is {kind!r}: its entry point must name a subclass of Material."
-        )
+        raise InputError(f"{model} of the package {found} is {kind!r}: its entry point must name a Material.")
     try:
         return kind.from_constants(constants)
     except InputError as error:

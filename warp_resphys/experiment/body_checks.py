@@ -58,7 +58,7 @@ def _check_drive(drive: Drive | None, real: Drive | None) -> None:
     if simulated != played:
         raise InputError(
             f"laboratory: its body takes {played}, but that of the simulator takes {simulated}: give both the same "
-            "inputs, by chambers, tendons or muscles.commanded."
+            "inputs, by chambers, tendons, muscles.commanded or energies."
         )
 
 

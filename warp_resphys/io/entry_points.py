@@ -72,25 +72,25 @@ def _scanned(kind: str, places: tuple[str, ...]) -> list[Extension]:
     return sorted(found, key=lambda own: (own.point.name, own.package))
 
 
-def extension(kind: str, name: str, known: Iterable[str] = (), key: str = "") -> Extension:
+def extension(kind: str, name: str, known: Iterable[str] = (), said: str = "") -> Extension:
     """Returns the class of a name.
 
     Args:
         kind: one of `KINDS`.
         name: of the entry point.
         known: names that this package has itself, for the message.
-        key: beginning of the message, such as "material model"; by default the kind in words.
+        said: beginning of the message for an unknown name; by default the name, and that no package has it.
 
     Raises:
         InputError: no package has it, or several have it.
     """
-    every, key = extensions(kind), key or KINDS[kind]
+    every = extensions(kind)
     own = [candidate for candidate in every if candidate.point.name == name]
     if not own:
         choices = [*known, *(f"{candidate.point.name} (of {candidate.package})" for candidate in every)]
-        if not choices:
-            raise InputError(f"{key} is {name!r}, but no installed package has any: install the package that has it.")
-        raise InputError(f"{key} is {name!r}: choose one of {', '.join(choices)}, or install the package that has it.")
+        choose = f"choose one of {', '.join(choices)}, or " if choices else ""
+        said = said or f"{name}: no installed package has this {KINDS[kind]}"
+        raise InputError(f"{said}: {choose}install the package that has it.")
     if len(own) > 1:
         packages = " and ".join(map(str, own))
         raise InputError(f"the {KINDS[kind]} {name!r} is in {packages}: uninstall one, or rename it there.")

@@ -161,7 +161,8 @@ class Description:
         """Reads a file of `write`.
 
         Raises:
-            DataFileError: the file is missing, damaged, of another kind or version, or made with a package that is not installed.
+            DataFileError: the file is missing, damaged, of another kind or version, or made with a package that is not
+                installed.
         """
         tensors, fields = read_checkpoint(path, _KIND)
         check_packages(fields.pop("packages", {}), path)

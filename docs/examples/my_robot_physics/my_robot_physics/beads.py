@@ -45,5 +45,5 @@ class BeadSettings(ObservationSettings):
         found = locate(mesh, places)
         far = int(np.argmax(found.outside))
         if found.outside[far] > self.largest_outside:
-            raise InputError(f"the bead {labels[far]} is {1e3 * found.outside[far]:.2g} mm outside of the body: move it.")
+            raise InputError(f"{labels[far]} is {1e3 * found.distance[far]:.2g} mm outside of the body: move the bead.")
         return Beads(*map(torch.from_numpy, (mesh.cells[found.cells], found.weights, found.gradients)))

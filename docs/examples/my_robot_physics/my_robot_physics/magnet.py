@@ -2,8 +2,8 @@
 
     e = -B b . F M d  [J/m^3]
 
-with the magnetisation M [A/m] along d at rest, and the field B [T], the input, along b in the world. tests/test_magnet.py
-compares the deflection of a beam with beam theory, and gradients with differences.
+with the magnetisation M [A/m] along d at rest, and the field B [T], the input, along b in the world.
+tests/test_magnet.py compares the deflection of a beam with beam theory, and gradients with differences.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ vec5 = wp.types.vector(5, wp.float64)
 
 @wp.func
 def magnetic_energy(x: wp.vec3d, p: vec5) -> wp.float64:
-    """e [J/m^3] for x = F d and the values in their order: M, b, B."""
+    """Energy [J/m^3] for x = F d and the values in their order: M, b, B."""
     return -p[0] * p[4] * (p[1] * x[0] + p[2] * x[1] + p[3] * x[2])
 
 

@@ -8,6 +8,7 @@ is constant. mu' follows from the shear modulus mu at rest. tests/test_material.
 uniaxial tension, and its gradients with differences.
 """
 
+# ruff: noqa: RUF009
 from dataclasses import dataclass
 
 import warp as wp

@@ -23,12 +23,13 @@ def test_beads_cast_elsewhere_move_as_the_silicone_there():
     places = torch.tensor([[0.013, 0.004, 0.017]], dtype=torch.float64)
     offset = torch.tensor([[1e-3, -2e-3, 5e-4]], dtype=torch.float64)
     strain = torch.tensor([[1.2, 0.1, 0.0], [0.0, 0.9, 0.0], [0.3, 0.0, 1.0]], dtype=torch.float64)
-    moved = BeadSettings().build(MESH, places.numpy(), ["a"]).moved(offset)(torch.from_numpy(MESH.vertices)[None] @ strain.mT)
+    beads = BeadSettings().build(MESH, places.numpy(), ["a"]).moved(offset)
+    moved = beads(torch.from_numpy(MESH.vertices)[None] @ strain.mT)
     torch.testing.assert_close(moved[0], (places + offset) @ strain.mT, rtol=0.0, atol=1e-12)
 
 
 def test_a_bead_outside_is_refused():
-    with pytest.raises(InputError, match="the bead a is 10 mm outside of the body"):
+    with pytest.raises(InputError, match="a is 10 mm outside of the body"):
         BeadSettings().build(MESH, torch.tensor([[0.07, 0.01, 0.01]]).double().numpy(), ["a"])
 
 

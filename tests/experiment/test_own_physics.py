@@ -1,0 +1,229 @@
+"""The package of docs/examples in an experiment from YAML: all its classes act, and its parameters are identified."""
+
+import importlib.util
+import json
+import sys
+
+import pytest
+import torch
+
+import warp_resphys
+from support.configured import check, composed, settings
+from support.main_job import IN_RUN, run, without_reports
+from support.template import TEMPLATE, install
+from warp_resphys import box_hexahedra
+from warp_resphys.energies.base import Energy
+from warp_resphys.energies.catalogue import make_material
+from warp_resphys.experiment.build import build_body
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import read_checkpoint
+from warp_resphys.learning.networks import OwnNetwork
+from warp_resphys.robot.description import describe
+from warp_resphys.settings.extensions import built
+from warp_resphys.studies.extension_list import listing
+
+OPTIONS = [
+    "experiment=magnetic_beam",
+    "budget=quick",
+    f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+    "mesh.divisions=[6,1,1]",
+    "laboratory.mesh.divisions=[6,1,1]",
+    "simfree.trainer.epochs=6",
+    "simfree.trainer.rollout_every=6",
+    "parallel.processes=1",
+]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return install(tmp_path_factory.mktemp("site"))
+
+
+@pytest.fixture
+def installed(site, monkeypatch):
+    monkeypatch.syspath_prepend(str(site))
+    return site
+
+
+@pytest.fixture(scope="module")
+def folder(site, tmp_path_factory):
+    place = tmp_path_factory.mktemp("magnetic")
+    with pytest.MonkeyPatch.context() as patch, without_reports():
+        patch.syspath_prepend(str(site))
+        patch.chdir(place)
+        code, err = run(*OPTIONS, IN_RUN)
+    assert code == 0, err
+    return place / "run"
+
+
+def test_its_parameters_are_identified_by_name(folder):
+    """Weight and magnet bend the beam of the laboratory, of 50 kPa and 24 kA/m, from 40 kPa and 30 kA/m."""
+    found = json.loads((folder / "identification.json").read_text())["sysid"]["parameters"]
+    assert found["magnetisation"] / found["shear_modulus"] == pytest.approx(24.0 / 50.0, rel=0.05)
+    assert found["shear_modulus"] == pytest.approx(50e3, rel=0.2)
+    errors = json.loads((folder / "metrics.json").read_text())["errors_mm"]
+    assert errors["sysid"]["mean"] < 0.1 * errors["simulation"]["mean"]
+
+
+def test_its_network_is_trained_and_saved(folder, installed):
+    description = describe(folder, "resphys")
+    network = description.learned.network
+    assert isinstance(network.network, OwnNetwork)
+    assert network.architecture["core"] == {"sines": {"width": 8, "frequency": 1.0}}
+    assert sorted(name for name, _ in network.network.core.named_parameters()) == [
+        *("first.bias", "first.weight", "last.bias", "last.weight")
+    ]
+    assert float(network.network.gain.detach().abs().max()) > 0.0
+
+
+def test_the_stages_name_the_package(folder):
+    records = {path.stem: json.loads(path.read_text()) for path in (folder / "stages").glob("*.json")}
+    assert {name for name, own in records.items() if own["packages"] != {"my-robot-physics": "0.1.0"}} == set()
+
+
+def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_path, monkeypatch):
+    robot = warp_resphys.load(folder)
+    file = tmp_path / "robot.safetensors"
+    robot.save(file)
+    assert read_checkpoint(file, "robot")[1]["packages"] == {"my-robot-physics": "0.1.0"}
+    moved = [warp_resphys.load(place).settle(magnetic_field=[0.04]).body.q for place in (folder, file)]
+    torch.testing.assert_close(*moved)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
+    for place in (folder, file):
+        with pytest.raises(DataFileError, match=r"was made with my-robot-physics 0\.1\.0, a package that is not inst"):
+            warp_resphys.load(place)
+
+
+def test_another_version_is_told_and_runs_stages_again(folder, installed, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
+    monkeypatch.syspath_prepend(str(install(tmp_path / "site", version="0.2.0")))
+    with pytest.raises(DataFileError, match=r"made with my-robot-physics 0\.1\.0, and this is .* 0\.2\.0"):
+        warp_resphys.load(folder)
+    assert settings(*OPTIONS).packages() == {"my-robot-physics": "0.2.0"}
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("simulation.model=arruda", r"simulation: material model is 'arruda': .*gent, .*arruda_boyce \(of my-robot-ph"),
+        ("simulation.locking=3", r"arruda_boyce of the package my-robot-physics 0\.1\.0: .* no constant 'locking'"),
+        ("simulation.locking_stretch=0.5", r"package my-robot-physics 0\.1\.0: locking_stretch is 0\.5"),
+        (
+            "energies.magnet.magnetisatoin=3",
+            r"energies\.magnet of the package my-robot-physics 0\.1\.0: unknown key 'magnetisatoin', did you mean",
+        ),
+        ("energies.magnet.magnetisation=-3", r"0\.1\.0: magnetisation is -3: it must be a positive number, in A/m"),
+        (
+            "+energies.fan={}",
+            r"energies\.fan: no installed package has this energy: choose one of magnet \(of my-robot",
+        ),
+        ("+network.core.sine={}", r"network\.core\.sines and sine are given: choose one"),
+        ("network.core.sines.width=0", r"0\.1\.0: width is 0: it must be a whole number, one or more"),
+        ("network.recurrent=4", r"network\.core has no hidden state, but recurrent is its size"),
+        ("markers.bind=frame", r"markers\.observation takes the place of bind and bind_to"),
+        ("energies.magnet=null", r"simulator takes no input: give both the same inputs, by .* or energies"),
+        (
+            "muscles={commanded: stress, stiffness: 0, bundles: {a: {direction: [1, 0, 0]}}}",
+            r"muscles and energies\.magnet are two inputs of the body",
+        ),
+    ],
+)
+def test_wrong_settings_are_refused_in_one_sentence(installed, option, message):
+    with pytest.raises(InputError, match=message) as told:
+        check(composed(*OPTIONS, option))
+    assert "\n" not in str(told.value)
+
+
+def test_an_actuator_drives_the_body_as_its_energy_says(installed):
+    """The tip rises with the field, and its derivative by the magnetisation equals float64 differences."""
+    run = settings(*OPTIONS)
+    energy = build_body(run).energies[0]
+    assert [quantity.name for quantity in energy.inputs] == ["magnetic_field"]
+    twice = settings(*OPTIONS, "energies.magnet.magnetisation=60e3")
+    assert build_body(twice).energies[0].magnetisation == 2.0 * energy.magnetisation
+    rubber = make_material("arruda_boyce", shear_modulus=50e3)
+    simulator = warp_resphys.Simulator(build_body(run), rubber, gravity=(0.0, 0.0, 0.0))
+    tip = simulator.body.mesh.vertices[:, 0] > 0.059
+
+    def height(magnetisation, field):
+        inputs = warp_resphys.Inputs(magnetic_field=torch.tensor([[field]], dtype=torch.float64))
+        return simulator.static_equilibrium(inputs, {"magnetisation": magnetisation}).q[0, tip, 2].mean()
+
+    value = torch.tensor(30e3, dtype=torch.float64, requires_grad=True)
+    end = height(value, 0.01)
+    (slope,) = torch.autograd.grad(end, value)
+    with torch.no_grad():
+        across = (height(value + 10.0, 0.01) - height(value - 10.0, 0.01)) / 20.0
+        assert float(slope) == pytest.approx(float(across), rel=1e-5)
+        assert float(end) > float(height(value, -0.01)) + 1e-3
+
+
+def broken(tmp_path, monkeypatch, text, **points):
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "bad_physics.py").write_text(text)
+    monkeypatch.syspath_prepend(str(install(tmp_path / "bad", points, "bad-physics", "3.1")))
+
+
+def test_a_package_that_cannot_be_imported_matters_only_where_it_is_named(tmp_path, monkeypatch):
+    broken(
+        tmp_path, monkeypatch, "import numpy_of_the_future", **{"warp_resphys.materials": {"bad": "bad_physics:Bad"}}
+    )
+    assert "bad_physics" not in sys.modules
+    assert make_material("gent").model == "gent"
+    assert settings("budget=quick").packages() == {}
+    message = r"the material 'bad' of the package bad-physics 3\.1 cannot be imported .*ModuleNotFoundError: .*_future"
+    with pytest.raises(InputError, match=message):
+        make_material("bad")
+    lines = list(listing("materials"))
+    assert "  bad (of bad-physics 3.1)" in lines
+    assert any("ModuleNotFoundError" in line for line in lines)
+
+
+def test_other_classes_are_refused(tmp_path, monkeypatch):
+    points = {
+        "warp_resphys.materials": {"dict": "builtins:dict"},
+        "warp_resphys.energies": {"dict": "builtins:dict", "nothing": "bad_physics:Nothing"},
+        "warp_resphys.networks": {"wide": "bad_physics:Wide"},
+    }
+    text = (
+        "from torch import nn\n"
+        "from warp_resphys.settings.extensions import CoreSettings, EnergySettings\n"
+        "class Nothing(EnergySettings):\n    def build(self, mesh): return 3\n"
+        "class Wide(CoreSettings):\n    def build(self, inputs, outputs): return nn.Linear(inputs, 7)\n"
+    )
+    broken(tmp_path, monkeypatch, text, **points)
+    with pytest.raises(
+        InputError, match=r"dict of the package bad-physics 3\.1 is <class 'dict'>: its entry point must"
+    ):
+        make_material("dict")
+    with pytest.raises(InputError, match=r"must name a subclass of warp_resphys\.settings\.extensions\.EnergySettings"):
+        settings("+energies.dict={}")
+    mesh = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
+    with pytest.raises(InputError, match=r"nothing of the package bad-physics 3\.1 builds int: .*base\.Energy"):
+        built("energies", "nothing", {}, Energy, mesh)
+    with pytest.raises(InputError, match=r"network\.core\.wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
+        OwnNetwork({"wide": {}}, 3, 2)
+
+
+def test_two_packages_with_one_name_are_refused(installed, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(install(tmp_path / "other", name="other-physics")))
+    with pytest.raises(InputError, match=r"'arruda_boyce' is in my-robot-physics 0\.1\.0 and other-physics 0\.1\.0"):
+        make_material("arruda_boyce")
+
+
+@pytest.mark.parametrize("path", sorted((TEMPLATE / "tests").glob("test_*.py")), ids=lambda path: path.stem)
+def test_the_tests_of_the_package_pass(installed, path):
+    spec = importlib.util.spec_from_file_location(f"template_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    tests = [own for name, own in vars(module).items() if name.startswith("test_")]
+    assert tests
+    for own in tests:
+        for mark in getattr(own, "pytestmark", []):
+            for value in mark.args[1]:
+                own(value)
+            break
+        else:
+            own()

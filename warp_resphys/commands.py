@@ -62,6 +62,11 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             "materials, energies, observations and networks of installed packages",
             "studies.extension_list:list_extensions",
         ),
+        "convert": Command(
+            "recordings, such as bags, MCAP files and exported tables, to HDF5 or CSV",
+            "studies.conversion:convert",
+            words="files",
+        ),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
         "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),

@@ -66,7 +66,7 @@ class Reader:
         self.enough = standing_enough(self.data, settings.gravity)
         self._simulator, self._drive = simulator, drive
         self._folder = run_dir if self.data.folder is None else None
-        self._table = None if table is None else Table(table.columns, table.header_lines)
+        self._table = None if table is None else Table(**table.plain())
         self._bag = None if self.data.bag is None else Bag(**self.data.bag.plain())
         self._hanging: FloatArray | None = None
 

@@ -255,10 +255,19 @@ SimulatedData = ReleaseFromLoad | ReleaseFromTwist | MovingBase
 
 
 class TableSettings(Settings):
-    """Columns of CSV or TSV files without headers."""
+    """Columns of CSV or TSV files without a header, or with another one."""
 
-    columns: Many[Word | None] = setting(description="headers such as 'time [s]' or 'tip.x [mm]'; null: not read")
-    header_lines: Count = setting(0, "lines before the first row of numbers")
+    columns: Many[Word | None] = setting((), "headers such as 'time [s]' or 'tip.x [mm]'; null: not read")
+    names: dict[str, Word] = setting({}, "in place of columns, such headers by those of the file; others are not read")
+    header_lines: Count = setting(0, "lines before the first row of numbers, or with names before the header")
+
+    @model_validator(mode="after")
+    def _has_one(self) -> Self:
+        if bool(self.columns) == bool(self.names):
+            raise ValueError(
+                "columns and names: give one of them, all columns in order, or names by those of the file."
+            )
+        return self
 
 
 class BagSettings(Settings):

@@ -27,12 +27,13 @@ from ..data.recordings.quality import (
 )
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
+from ..data.recordings.text import Table
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
 from ..report.figures import STYLE, TONES, new_figure, save_png
-from ..settings.trials import BagSettings
+from ..settings.trials import BagSettings, TableSettings
 from .tables import aligned
 
 FloatArray = NDArray[np.float64]
@@ -53,6 +54,12 @@ class RecordingFile(Settings):
     rate: Positive | None = setting(None, unit="Hz")
     labels: Many[Word] | None = None
     bag: BagSettings | None = None
+    table: TableSettings | None = None
+
+    def arguments(self) -> tuple[Any, ...]:
+        """Returns the arguments of `read_recording` after the path."""
+        table = None if self.table is None else Table(**self.table.plain())
+        return self.units, self.rate, self.labels, table, None if self.bag is None else Bag(**self.bag.plain())
 
 
 class RecordingInspection(Settings):
@@ -134,7 +141,7 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     file = settings.recording
-    configured = (file.units, file.rate, file.labels, None, None if file.bag is None else Bag(**file.bag.plain()))
+    configured = file.arguments()
     recording = read_recording(str(file.path), *configured)
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)

@@ -1,4 +1,4 @@
-"""Recordings as text: a plain table, and the exports of Qualisys Track Manager (TSV) and OptiTrack Motive (CSV).
+"""Recordings as text: plain tables, and exports of Qualisys Track Manager, OptiTrack Motive and Vicon Nexus.
 
 docs/recordings.md describes the layouts. A cell that is empty or NaN is an occlusion.
 """
@@ -6,14 +6,17 @@ docs/recordings.md describes the layouts. A cell that is empty or NaN is an occl
 import csv
 import io
 import logging
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...io.errors import DataFileError, listed
+from ...io.errors import DataFileError, did_you_mean, listed
 from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 log = logging.getLogger(__name__)
@@ -28,7 +31,9 @@ _MOTIVE_UNITS = {"meters": "m", "centimeters": "cm", "millimeters": "mm"}
 # A column in a length is a misspelt marker rather than an actuation.
 _CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
 _CLOCKS = ("time", "frame")
-_SECONDS = {"s": 1.0, "ms": 1e-3}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_VICON = ("Trajectories", "Devices", "Joints", "Model Outputs", "Segments")  # sections
 _UNEVEN = 0.25  # of a frame: largest error of a time stamp
 _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
@@ -41,15 +46,17 @@ class Table:
 
     Attributes:
         columns: the header in the known format, one cell for every column; None for a column that is not read.
-        header_lines: number of lines before the numbers.
+        header_lines: number of lines before the numbers, or with ``names`` before the header.
+        names: in place of ``columns``, cells in the known format by cells of the file's header; others are not read.
     """
 
-    columns: Sequence[str | None]
+    columns: Sequence[str | None] = ()
     header_lines: int = 0
+    names: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
-    """Reads a table, a Qualisys TSV or a Motive CSV, detected from its first line.
+    """Reads a table, a Qualisys TSV, a Motive or a Vicon CSV, detected from its first line.
 
     Args:
         path: of the file.
@@ -67,17 +74,22 @@ def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
     lines, before = text.splitlines(), 0 if table is None else table.header_lines
     first = "".join(lines[:1])
     try:
-        delimiter = max("\t,;", key="".join(lines[before : before + 1]).count)
+        head = "".join(lines[before : before + 1])
+        delimiter = max("\t,;", key=(head if any(map(head.count, "\t,;")) else text[:10_000]).count)
         rows = list(csv.reader(io.StringIO(text), delimiter=delimiter))
     except csv.Error as error:
         raise DataFileError(f"{path} is no table ({error}): export it as CSV or TSV again.") from error
     rows = [[cell.strip() for cell in row] for row in rows]
+    if delimiter == ";":
+        rows = [[cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in row] for row in rows]
     if table is not None:
         return _read_described(rows, table, path)
     if first.split("\t")[0].strip() in _QUALISYS_KEYS:
         return _read_qualisys(rows, path)
     if first.startswith("Format Version"):
         return _read_motive(rows, path)
+    if rows and rows[0][:1] and rows[0][0] in _VICON:
+        return _read_vicon(rows, path)
     return _read_table(rows, path)
 
 
@@ -97,6 +109,8 @@ def _read_table(rows: Rows, path: Path) -> RawRecording:
 
 def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
     """Reads a table with described columns; a column in a length that is not of a marker is a channel."""
+    if table.names:
+        return _read_named(rows, table, path)
     rows = [*rows[: table.header_lines], *_without_empty_ends(rows[table.header_lines :], len(table.columns))]
     width = len(rows[table.header_lines]) if len(rows) > table.header_lines else 0
     if width != len(table.columns):
@@ -106,6 +120,22 @@ def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
         )
     columns = {number: _name_and_unit(cell) for number, cell in enumerate(table.columns) if cell}
     return _read_columns(rows, table.header_lines, columns, list(SI_PER_ACTUATION_UNIT), path, planar=True)
+
+
+def _read_named(rows: Rows, table: Table, path: Path) -> RawRecording:
+    """Reads the columns of a table whose header has some names."""
+    header = rows[table.header_lines] if len(rows) > table.header_lines else []
+    for name in table.names:
+        if header.count(name) != 1:
+            known = did_you_mean(name, header) or f"; it has {listed([cell for cell in header if cell])}."
+            raise DataFileError(
+                f"{path}, line {table.header_lines + 1}: data.table.names has {name!r}, which {header.count(name)} "
+                f"columns are named{known} data.table.header_lines is the number of lines before the header."
+            )
+    columns = {header.index(name): _name_and_unit(cell) for name, cell in table.names.items()}
+    first = table.header_lines + 1
+    rows = [*rows[:first], *_without_empty_ends(rows[first:], len(header))]
+    return _read_columns(rows, first, columns, list(SI_PER_ACTUATION_UNIT), path, planar=True)
 
 
 def _without_empty_ends(rows: Rows, width: int) -> Rows:
@@ -159,8 +189,12 @@ def _read_columns(
         raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
     clock, unit_of_clock = columns[clocks[0]] if clocks else ("frame", None)
     timed, clock_unit = clock.lower() == "time", unit_of_clock or "s"
+    if timed and (clock_unit == "iso" or (unit_of_clock is None and _has_dates(rows, first, clocks[0]))):
+        rows, clock_unit = _since_first(rows, first, clocks[0], path), "s"
     if timed and clock_unit not in _SECONDS:
-        raise DataFileError(f"{path} gives its time in '{clock_unit}': it must be in s or ms, as in 'time [s]'.")
+        raise DataFileError(
+            f"{path} gives its time in '{clock_unit}': it must be in s, ms, us, ns or iso, as in 'time [s]'."
+        )
     named, turned, units, channels = [], {}, set(), {}
     for number, (name, unit) in columns.items():
         label, _, axis = name.rpartition(".")
@@ -206,6 +240,34 @@ def _read_columns(
         start=start,
         turns=_turns(frames, values, turns, len(labels)),
     )
+
+
+def _has_dates(rows: Rows, first: int, column: int) -> bool:
+    """Whether the first time is a date and time, such as 2026-01-31T12:00:00.01Z."""
+    cells = [row[column] for row in rows[first:] if len(row) > column and row[column]][:1]
+    try:
+        return bool(cells) and _number(cells[0]) is None and datetime.fromisoformat(cells[0]) is not None
+    except ValueError:
+        return False
+
+
+def _since_first(rows: Rows, first: int, column: int, path: Path) -> Rows:
+    """Replaces dates and times (ISO 8601) by seconds since the first."""
+    result, start = list(rows), None
+    for line, row in enumerate(rows[first:], start=first):
+        if len(row) <= column or not any(row):
+            continue
+        try:
+            moment = datetime.fromisoformat(row[column])
+            start = start or moment
+            seconds = (moment - start).total_seconds()
+        except (ValueError, TypeError):  # TypeError: with and without a time zone
+            raise DataFileError(
+                f"{path}, line {line + 1}, column {column + 1}: {row[column]!r} is no date and time as the others: "
+                "write them as 2026-01-31T12:00:00.010, all with or all without a time zone."
+            ) from None
+        result[line] = [*row[:column], repr(seconds), *row[column + 1 :]]
+    return result
 
 
 def _quaternions(turned: dict[tuple[str, str], int], labels: Sequence[str], path: Path) -> dict[int, list[int]]:
@@ -318,6 +380,39 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
         *(_positions(frames, values[:, chosen]), labels, _MOTIVE_UNITS.get((unit or "").lower(), unit), rate),
         turns=_turns(frames, values, turns, len(labels)),
     )
+
+
+def _read_vicon(rows: Rows, path: Path) -> RawRecording:
+    """Reads the section Trajectories: its rate, names, axes and units, and a line for every frame until an empty one.
+
+    Markers lose the name of their subject where there is one subject. Velocities and accelerations are not read.
+    """
+    at = next((line for line, row in enumerate(rows) if row[:1] == ["Trajectories"]), None)
+    if at is None or len(rows) < at + 6 or "Frame" not in rows[at + 3][:1]:
+        raise DataFileError(
+            f"{path} has no whole section 'Trajectories': export it from Vicon Nexus with its trajectories and header."
+        )
+    names, axes, units = (rows[at + k] for k in (2, 3, 4))
+    label, named = "", list[tuple[str, str, int]]()
+    for column, axis in enumerate(axes):
+        label = names[column] if column < len(names) and names[column] else label
+        if column > 1 and axis.lower() in _AXES:
+            named.append((label, axis.lower(), column))
+    subjects = {label.rpartition(":")[0] for label, *_ in named}
+    if len(subjects) == 1:
+        named = [(label.rpartition(":")[2], axis, column) for label, axis, column in named]
+    labels, chosen = _markers(named, path)
+    if not labels:
+        raise DataFileError(f"{path} has no markers in its section 'Trajectories': export it again.")
+    unit = {units[column] for column in chosen if column < len(units)}
+    if len(unit) != 1:
+        raise DataFileError(f"{path}, line {at + 5}: positions are in {listed(sorted(unit))}: export them in one unit.")
+    data = [*takewhile(any, rows[at + 5 :])]
+    width = max(map(len, data), default=0)
+    filled = [*rows[: at + 5], *(row + [""] * (width - len(row)) for row in data)]  # Empty ends are occlusions.
+    values, lines = _numbers(filled, at + 5, [0, *chosen], width, path)
+    frames, _ = _frames(values[:, 0], False, lines, path)
+    return RawRecording(_positions(frames, values[:, 1:]), labels, unit.pop(), _number("".join(rows[at + 1][:1])))
 
 
 def _markers(named: Iterable[tuple[str, str, int]], path: Path, planar: bool = False) -> tuple[list[str], list[int]]:

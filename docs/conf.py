@@ -26,7 +26,7 @@ extensions = [
     "myst_nb",
 ]
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
-exclude_patterns = ["conf.py"]
+exclude_patterns = ["conf.py", "examples"]
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 
 html_theme = "furo"

@@ -175,9 +175,8 @@ print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length 
 #
 # ## From here to an experiment
 #
-# In `warp_resphys`, energies are in `warp_resphys/energies`, and `warp_resphys/experiment/actuators.py` creates them
-# from a configuration; their parameters can then be identified by name ([contributing](../contributing.md)). For
-# speed, kernels can be written by hand, as for pressure.
+# [Your own physics](../extending.md) shows how a package of yours gives this energy a name in configurations; its
+# parameters can then be identified by name. For speed, kernels can be written by hand, as for pressure.
 
 # %%
 assert abs(carried / weight - 1) < 1e-3

@@ -2,10 +2,13 @@
 
 import importlib.util
 import json
+import re
 import sys
+import tomllib
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import warp_resphys
 from support.configured import check, composed, settings
@@ -14,13 +17,16 @@ from support.template import TEMPLATE, install
 from warp_resphys import box_hexahedra
 from warp_resphys.energies.base import Energy
 from warp_resphys.energies.catalogue import make_material
-from warp_resphys.experiment.build import build_body
+from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_checkpoint
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.networks import OwnNetwork
 from warp_resphys.robot.description import describe
 from warp_resphys.settings.extensions import built
+from warp_resphys.settings.run import RunSettings
 from warp_resphys.studies.extension_list import listing
+from warp_resphys.studies.gradient_check import check_gradients
 
 OPTIONS = [
     "experiment=magnetic_beam",
@@ -211,6 +217,36 @@ def test_two_packages_with_one_name_are_refused(installed, tmp_path, monkeypatch
     monkeypatch.syspath_prepend(str(install(tmp_path / "other", name="other-physics")))
     with pytest.raises(InputError, match=r"'arruda_boyce' is in my-robot-physics 0\.1\.0 and other-physics 0\.1\.0"):
         make_material("arruda_boyce")
+
+
+def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
+    page = (TEMPLATE.parents[1] / "extending.md").read_text(encoding="utf-8")
+    toml, python, yaml = (
+        re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)[0] for kind in ("toml", "python", "yaml")
+    )
+    site = install(tmp_path / "page", tomllib.loads(toml)["project"]["entry-points"], "my-physics")
+    (site / "my_physics.py").write_text(python)
+    monkeypatch.syspath_prepend(str(site))
+    own = OmegaConf.to_container(OmegaConf.create(yaml))
+    own["identify"]["parameters"] |= {"poissons_ratio": None, "youngs_modulus": None}
+    config = composed("experiment=beam_real", "mesh.divisions=[4,1,1]")
+    config |= {key: own[key] for key in ("simulation", "energies")}
+    config["identify"] |= {
+        "parameters": own["identify"]["parameters"],
+        "elastic": None,
+        "first_guess": {},
+        "grid": None,
+    }
+    check(config)
+    run = parse(RunSettings, config)
+    simulator = build_simulator(run, run.simulation)
+    state = simulator.static_equilibrium()
+    assert float((state.q - simulator.rest_positions).abs().max()) > 1e-3
+    rows = {row.parameter: row.relative_error for row in check_gradients(simulator, "bent", steps=2)}
+    named = {name.partition(",")[0] for name in rows}
+    assert {"shear_modulus", "stiffening", "lame_lambda", "spring_stiffness", "spring_anchor"} <= named
+    ours = {name: error for name, error in rows.items() if "damping" not in name}  # These are zero.
+    assert max(ours.values()) < 1e-5
 
 
 @pytest.mark.parametrize("path", sorted((TEMPLATE / "tests").glob("test_*.py")), ids=lambda path: path.stem)

@@ -21,6 +21,7 @@ from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.io.settings import parse
+from warp_resphys.io.stages import Stage, fingerprint
 from warp_resphys.learning.networks import OwnNetwork
 from warp_resphys.robot.description import describe
 from warp_resphys.settings.extensions import built
@@ -103,11 +104,17 @@ def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_pat
 
 
 def test_another_version_is_told_and_runs_stages_again(folder, installed, tmp_path, monkeypatch):
+    def stage():
+        return fingerprint(Stage("evaluate", print, (), settings(*OPTIONS)), {})
+
+    before = stage()
+    assert before == stage()
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
     monkeypatch.syspath_prepend(str(install(tmp_path / "site", version="0.2.0")))
     with pytest.raises(DataFileError, match=r"made with my-robot-physics 0\.1\.0, and this is .* 0\.2\.0"):
         warp_resphys.load(folder)
     assert settings(*OPTIONS).packages() == {"my-robot-physics": "0.2.0"}
+    assert stage() != before
 
 
 @pytest.mark.parametrize(
@@ -190,13 +197,18 @@ def test_a_package_that_cannot_be_imported_matters_only_where_it_is_named(tmp_pa
 def test_other_classes_are_refused(tmp_path, monkeypatch):
     points = {
         "warp_resphys.materials": {"dict": "builtins:dict"},
-        "warp_resphys.energies": {"dict": "builtins:dict", "nothing": "bad_physics:Nothing"},
+        "warp_resphys.energies": {
+            "dict": "builtins:dict",
+            "nothing": "bad_physics:Nothing",
+            "unfinished": "bad_physics:Unfinished",
+        },
         "warp_resphys.networks": {"wide": "bad_physics:Wide"},
     }
     text = (
         "from torch import nn\n"
         "from warp_resphys.settings.extensions import CoreSettings, EnergySettings\n"
         "class Nothing(EnergySettings):\n    def build(self, mesh): return 3\n"
+        "class Unfinished(EnergySettings):\n    pass\n"
         "class Wide(CoreSettings):\n    def build(self, inputs, outputs): return nn.Linear(inputs, 7)\n"
     )
     broken(tmp_path, monkeypatch, text, **points)
@@ -206,6 +218,8 @@ def test_other_classes_are_refused(tmp_path, monkeypatch):
         make_material("dict")
     with pytest.raises(InputError, match=r"must name a subclass of warp_resphys\.settings\.extensions\.EnergySettings"):
         settings("+energies.dict={}")
+    with pytest.raises(InputError, match=r"unfinished of the package bad-physics 3\.1: Unfinished has no method build"):
+        settings("+energies.unfinished={}")
     mesh = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
     with pytest.raises(InputError, match=r"nothing of the package bad-physics 3\.1 builds int: .*base\.Energy"):
         built("energies", "nothing", {}, Energy, mesh)

@@ -12,6 +12,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from inspect import isabstract
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator
@@ -75,6 +76,8 @@ def own_settings(kind: str, name: str, values: Mapping[str, Any]) -> Any:
             f"{name} of the package {found} is {settings!r}: its entry point must name a subclass of "
             f"warp_resphys.settings.extensions.{wanted.__name__}."
         )
+    if isabstract(settings):
+        raise InputError(f"{name} of the package {found}: {settings.__name__} has no method build: add it.")
     with _naming(found):
         return parse(settings, values)
 

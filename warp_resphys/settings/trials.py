@@ -271,7 +271,10 @@ class TableSettings(Settings):
 
 
 class BagSettings(Settings):
-    """Topics of ROS bags, with a member after # where a message has several: /tf#tip, /joint_states#finger.effort."""
+    """Topics of bags, with a member after # where a message has several: /tf#tip, /joint_states#finger.effort.
+
+    A member of a message in JSON is a path of keys: /robot#state.tips.2.
+    """
 
     markers: dict[str, Word] = setting(description="topics by name of the marker; poses are rigid bodies")
     inputs: Many[Word] = setting((), "topics of the inputs, with their unit in brackets: '/pressure#1 [mbar]'")

@@ -3,6 +3,7 @@
 The configuration determines the stages. The settings of a stage are exactly what its files depend on.
 """
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from .energies.law_files import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
+from .experiment.duration import estimate, remedies
 from .experiment.evaluate import check_mesh, evaluate, time_models
 from .experiment.experiment import LEARNED
 from .experiment.files import (
@@ -63,7 +65,7 @@ from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
-from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages
+from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions, errors_by_load, headline
 from .report.control_section import controller_name
@@ -96,6 +98,8 @@ from .settings.stages import (
     TrainStage,
 )
 from .settings.trials import Split, Trial
+
+log = logging.getLogger(__name__)
 
 _MOST_COLUMNS = 5  # largest number of folds that are shown as columns in a terminal
 
@@ -325,6 +329,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     folds = folds_of(run)
     if folds is None:
         stages = learning_stages(run, split_of(run), ".", acquired)
+        _announce(run, stages, folder)
         run_stages(stages, folder)
         metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
@@ -337,6 +342,20 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     _print(metrics, folder, run)
 
 
+def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: float = 1.0) -> None:
+    """Logs how long the unfinished stages of a split take, unless that is short.
+
+    Args:
+        run: settings of the run.
+        stages: of a split.
+        folder: of the split.
+        times: factor of the duration, as of several folds.
+    """
+    left = unfinished(stages, folder)
+    if sentence := estimate(left, folder).sentence(remedies(left, run.budget == "quick"), times):
+        log.info("%s", sentence)
+
+
 def _run_folds(
     run: RunSettings, folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
 ) -> dict[str, Any]:
@@ -345,6 +364,9 @@ def _run_folds(
         name: Fold(name, folder / fold_folder(name), partial(learning_stages, run, split, "..", acquired))
         for name, split in splits.items()
     }
+    left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
+    if left:
+        _announce(run, left[0].stages(ALONE), left[0].folder, len(left) / workers_of(run).at_most(len(left)).count)
     run_folds(folds, workers_of(run))
     metrics = {}
     for name, fold in folds.items():

@@ -156,7 +156,7 @@ class Prepared:
     learned: Learned
 
 
-def _new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
+def new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
     """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
     rest, network = experiment.like.to(train.q.device), settings.network
     if not experiment.moving(experiment.settings.split.train):
@@ -188,7 +188,7 @@ def _supervised(
     settings: TrainingSettings,
 ) -> Prepared:
     """Prepares training on single steps, with validation by roll-outs."""
-    network = _new_network(experiment, model, train, settings)
+    network = new_network(experiment, model, train, settings)
     learned = Learned(network, _range_of(experiment, model, network, train), experiment.settings.force_frame)
     error = rollout_error(dataclasses.replace(experiment, on_failure="count"), model, judged)
     kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
@@ -238,7 +238,7 @@ def _in_the_loop(
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
-        network = _new_network(experiment, model, samples, settings)
+        network = new_network(experiment, model, samples, settings)
         assert isinstance(network, ResidualForce)
         return network.double()
 

@@ -121,6 +121,18 @@ def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:
     return all(_valid_seconds(stage, context) is not None for stage, context in _contexts(stages, Path(run_dir)))
 
 
+def unfinished(stages: Sequence[Stage], run_dir: str | Path) -> list[Stage]:
+    """Returns the stages without a record of the same settings; their outputs are not checked."""
+    left = []
+    for stage, context in _contexts(stages, Path(run_dir)):
+        path = _record(context.run_dir, stage.name)
+        with suppress(DataFileError):
+            if path.is_file() and read_json(path).get("fingerprint") == context.fingerprint:
+                continue
+        left.append(stage)
+    return left
+
+
 def _contexts(stages: Sequence[Stage], run_dir: Path) -> Iterator[tuple[Stage, StageContext]]:
     """Yields stages with their contexts."""
     fingerprints: dict[str, str] = {}

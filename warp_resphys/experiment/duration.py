@@ -1,0 +1,351 @@
+"""Estimate of the time that a run takes: a few steps of its simulators on its trials, times the steps of its stages.
+
+The bodies move as fast as if they had fallen a tenth of their length. Forces are reconstructed that support a fifth of
+their weight, and networks are trained for an epoch on random samples. Reports, laws of materials, other bodies and
+control have no estimate.
+"""
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from ..dynamics.simulator import Simulator
+from ..io.errors import ConvergenceError, number_of
+from ..io.progress import clock
+from ..io.stages import Stage
+from ..learning.parameters import configured_parameters, split_name
+from ..learning.reconstruction import make_reconstructor
+from ..learning.replay import Replay, Start
+from ..learning.training import Samples, SequenceTrainer, Trainer
+from ..settings.learning import RangeSettings
+from ..settings.stages import (
+    EvaluateStage,
+    IdentifyStage,
+    LearningStage,
+    MeshCheckStage,
+    ReconstructStage,
+    RefineStage,
+    ReportStage,
+    TimeStage,
+    TrainStage,
+)
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .build import choose_device
+from .experiment import MODELS, Experiment
+from .learn import new_network
+from .models import SIMFREE
+from .prediction_intervals import INTERVAL_MODELS
+from .trials import evenly
+
+LEAST_SECONDS: Final = 60.0  # of the estimates that are shown
+_CALLS, _MEASURED = 3, 1.0  # calls that are timed, and seconds after which no further one begins
+_MOST_TRIALS = 16  # that are simulated for the estimate
+_FALL, _SUPPORTED = 0.1, 0.2
+_EVALUATIONS = 0.6  # typical number of evaluations of a search, over the largest
+_ITERATIONS = 1.3  # evaluations of the loss in an iteration of L-BFGS
+_SHOWN = 3  # stages
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Expected duration of the stages of one split.
+
+    Attributes:
+        seconds: by stage [s].
+        without: names of stages that have no estimate.
+        vertices: of the simulated body.
+    """
+
+    seconds: Mapping[str, float]
+    without: Sequence[str] = ()
+    vertices: int = 0
+
+    @property
+    def total(self) -> float:
+        """Sum over all stages with an estimate [s]."""
+        return sum(self.seconds.values())
+
+    def sentence(self, remedies: Sequence[str], times: float = 1.0) -> str:
+        """Returns the estimate in words; empty for less than a minute.
+
+        Args:
+            remedies: changes of the configuration that make the run shorter.
+            times: factor of the duration, as of several folds.
+        """
+        if self.total * times < LEAST_SECONDS:
+            return ""
+        longest = sorted(self.seconds, key=lambda name: -self.seconds[name])[:_SHOWN]
+        parts = ", ".join(f"{name} {clock(times * self.seconds[name])}" for name in longest)
+        without = f", without {', '.join(self.without)}" if self.without else ""
+        return (
+            f"about {clock(times * self.total)} to go for {self.vertices:,} vertices{without} (longest: {parts}); "
+            f"shorter with {', '.join(remedies)}."
+        )
+
+
+def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
+    """Measures a few steps and returns the expected duration of stages of one split.
+
+    Args:
+        stages: to estimate.
+        folder: of the split; its dataset exists.
+    """
+    seconds, without, vertices = dict[str, float](), list[str](), 0
+    for stage in stages:
+        settings = stage.settings
+        own = None
+        if isinstance(settings, LearningStage):
+            pace = _Pace(Experiment(settings, folder, "count"))
+            vertices = pace.experiment.body.n_vertices
+            with contextlib.suppress(ConvergenceError):
+                own = pace.stage()
+        if own is not None:
+            seconds[stage.name] = own
+        elif not isinstance(settings, ReportStage):
+            without.append(stage.name)
+    return Estimate(seconds, without, vertices)
+
+
+def remedies(stages: Sequence[Stage], quick: bool) -> list[str]:
+    """Changes of the configuration that make stages shorter.
+
+    Args:
+        stages: of one split.
+        quick: whether the run is a first look already.
+    """
+    named = ["a coarser mesh", "fewer or shorter trials"]
+    count = max((len(own.settings.identify.parameters) for own in stages if own.name == "identify"), default=0)
+    named += [f"fewer of the {number_of(count, 'parameter')} of identify.parameters"] if count > 1 else []
+    return named if quick else [*named, "or at first budget=quick"]
+
+
+@dataclass(frozen=True)
+class _Pace:
+    """Durations of the parts of a stage.
+
+    Attributes:
+        experiment: of the settings of the stage.
+    """
+
+    experiment: Experiment
+
+    def stage(self) -> float | None:
+        """Duration of the stage [s]; None if it is unknown."""
+        match self.experiment.settings:
+            case IdentifyStage() as settings:
+                return self._identify(settings)
+            case ReconstructStage() as settings:
+                return self._each(settings.model, settings.reconstructed, self._reconstructed_step)
+            case TrainStage() as settings:
+                return self._train(settings)
+            case RefineStage() as settings:
+                evaluations = _ITERATIONS * settings.refinement.epochs
+                return evaluations * self._each(settings.model, settings.split.train, self._step_and_adjoint)
+            case EvaluateStage() as settings:
+                return self._evaluate(settings)
+            case TimeStage() as settings:
+                names = self.experiment.moving(settings.groups["1"])
+                return 3.0 * sum(self._each("simulation", [name], self._step) for name in names)
+            case MeshCheckStage() as settings:
+                whole = self._each("simulation", settings.groups["1"], self._step)
+                return whole * (1.0 + settings.mesh_check**3)
+        return None
+
+    def _evaluate(self, settings: EvaluateStage) -> float:
+        """Duration of the roll-outs of the test trials, and of those for the prediction intervals [s]."""
+        tested = [name for group in settings.groups.values() for name in group]
+        models = [model for model in self.experiment.models if model != SIMFREE]
+        seconds = sum(self._each(model, tested, self._step) for model in models)
+        calibrated = [model for model in INTERVAL_MODELS if model in models]
+        return seconds + sum(self._each(model, settings.calibration, self._step) for model in calibrated)
+
+    def _identify(self, settings: IdentifyStage) -> float:
+        wanted, names = settings.identify, settings.split.train
+        names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
+        searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
+        candidates = wanted.candidates if wanted.starts > 1 else 0
+        points = 1
+        for axis in dict(wanted.grid).values() if wanted.landscape and wanted.grid is not None else ():
+            points *= axis.points if axis is not None else 1
+        seconds = 0.0
+        for model, search in searches.items():
+            if search:
+                evaluations = _EVALUATIONS * wanted.starts * wanted.max_evaluations
+                released = any(self.experiment.begins(name) == "released" for name in names)
+                evaluations += wanted.max_evaluations * _EVALUATIONS if released else 0.0
+                seconds += evaluations * self._evaluation(model, search, names)
+                seconds += candidates * self._each(model, names, self._step)
+        landscape = points * self._each("sysid", names, self._step) if points > 1 else 0.0
+        return seconds + landscape
+
+    def _evaluation(self, model: str, search: Mapping[str, RangeSettings], names: Sequence[str]) -> float:
+        """Duration of the loss and its derivatives by all parameters [s]."""
+        simulator, sets = self.experiment.simulator(MODELS[model][0]), 1 + len(search)
+        values = configured_parameters(simulator, [split_name(name)[0] for name in search])
+        settings = self.experiment.settings
+        assert isinstance(settings, IdentifyStage)
+        values = {name: settings.identify.first_guess.get(name, value) for name, value in values.items()}
+        parameters = {name: simulator.tensor([value] * sets) for name, value in values.items()}
+
+        def calls(replay: Replay) -> Callable[[], Any]:
+            short = Replay(simulator, replay.observe, replay.trials.first((_CALLS + 0.5) * simulator.time_step))
+            if short.is_static:
+                start = Start.resting(simulator.rest_positions.expand(len(short.trials.names), -1, -1))
+                return lambda: short(start, parameters)
+            state = _moving(simulator, len(short.trials.names))
+            start = Start(state, state.q.new_zeros(state.batch))
+            steps = max(short.steps(start), 1)
+            return lambda: [short.varied(start, parameters) for _ in range(max(_CALLS // steps, 1))]
+
+        return self._each(model, names, calls, together=_CALLS)
+
+    def _train(self, settings: TrainStage) -> float:
+        training, model, split = settings.training, settings.model, settings.split
+        judged = split.validation or split.train
+        loop = training.in_the_loop
+        if loop is not None and model != SIMFREE:
+            epoch = _ITERATIONS * self._each(model, split.train, self._step_and_adjoint)
+            epoch += self._each(model, judged, self._step)
+            held_out = loop.hold_out and not split.validation and len(split.train) > 1
+            return loop.epochs * epoch * (len(split.train) if held_out else 1.0)
+        trainer, rollouts = training.trainer, training.trainer.epochs / training.trainer.rollout_every
+        rolled = 0.0 if model == SIMFREE else self._each(model, judged, self._step)
+        return trainer.epochs * self._epoch(settings) + rollouts * rolled
+
+    def _epoch(self, settings: TrainStage) -> float:
+        """Duration of an epoch of a network on the steps of the training trials [s]."""
+        experiment, training = self.experiment, settings.training
+        simulator = experiment.model_simulator(settings.model)
+        count = sum(self._steps(simulator, [name]) for name in settings.split.train)
+        rest = experiment.like.to(choose_device(settings.device), torch.float32)
+        used = min(count, 4 * training.trainer.batch_size)
+        q, v, force = (torch.randn(used, *rest.shape).to(rest) for _ in range(3))
+        names = settings.split.train[:1]
+        inputs = experiment.conditions(experiment.replay(simulator, names), {}, settings.model == SIMFREE)
+        actuation = None if inputs is None else inputs.flatten(0, -2)[:1].to(rest).expand(used, -1)
+        samples = Samples(rest + 1e-3 * q, v, (force, v) if settings.model == SIMFREE else (force,), actuation, (used,))
+        network = new_network(experiment, settings.model, samples, training)
+        kind = Trainer if network.recurrent is None else SequenceTrainer
+        trainer = kind(network, samples, samples, lambda _: 0.0, training.trainer, 0)
+        return _timed(trainer.run_epoch) * count / used
+
+    def _each(
+        self, model: str, names: Sequence[str], calls: Callable[[Replay], Callable[[], Any]], together: int = 1
+    ) -> float:
+        """Duration of the steps of trials [s].
+
+        Args:
+            model: whose simulator is used.
+            names: of the trials.
+            calls: returns a function of some trials, whose calls are timed.
+            together: number of steps of a call.
+        """
+        seconds, simulator = 0.0, self._simulator(model)
+        for batch in self.experiment.batches(names):
+            size = min(self.experiment.settings.batch or len(batch), len(batch))
+            probed = batch[: min(size, _MOST_TRIALS)]
+            replay = self.experiment.replay(simulator, probed)
+            steps = self._steps(simulator, batch)
+            seconds += _timed(calls(replay)) * len(batch) / len(probed) * (1 if replay.is_static else steps / together)
+        return seconds
+
+    def _simulator(self, model: str) -> Simulator:
+        """Simulator of a model, without a law, which is not identified yet."""
+        kind = MODELS[model][0]
+        plain = kind in ("law", "identified") and self.experiment.settings.identified is None
+        return self.experiment.simulator("simulation" if plain else kind)
+
+    def _steps(self, simulator: Simulator, names: Sequence[str]) -> int:
+        """Number of steps of the longest trial; the end of the dataset for those that are read in part."""
+        replay = self.experiment.trials(names)
+        limit = float(replay.times.max())
+        if isinstance(self.experiment.settings, IdentifyStage):
+            limits = (limit, self.experiment.settings.trial_seconds, self.experiment.settings.identify.seconds)
+            limit = min(own for own in limits if own is not None)
+        return max(math.ceil(limit / simulator.time_step - 1e-6), 1)
+
+    def _step(self, replay: Replay) -> Callable[[], Any]:
+        """Function that simulates a step; that of poses solves for their equilibrium."""
+        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
+        if replay.is_static:
+            return lambda: simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names))
+        state = _moving(simulator, len(replay.trials.names))
+
+        def step() -> None:
+            nonlocal state
+            state = simulator.step(state, inputs.at(0), constants)[0]
+
+        return torch.no_grad()(step)
+
+    def _step_and_adjoint(self, replay: Replay) -> Callable[[], Any]:
+        """Function that simulates a step and computes its gradient."""
+        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
+        state = _moving(simulator, len(replay.trials.names))
+
+        def step() -> None:
+            force = torch.zeros_like(state.q).requires_grad_()
+            if replay.is_static:
+                new = simulator.static_equilibrium(resting.plus(force), constants)
+            else:
+                new = simulator.step(state, inputs.at(0).plus(force), constants)[0]
+            new.q.sum().backward()  # type: ignore[no-untyped-call]
+
+        return step
+
+    def _reconstructed_step(self, replay: Replay) -> Callable[[], Any]:
+        """Function that reconstructs the forces of a step."""
+        settings = self.experiment.settings
+        assert isinstance(settings, ReconstructStage)
+        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
+        if replay.is_static:
+            simulator, inputs = replace(simulator, time_step=1e6, integrator="implicit_euler"), resting
+        method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
+        method = method.with_constants(constants)
+        state = _moving(simulator, len(replay.trials.names), at_rest=replay.is_static)
+        support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None]
+        acting = inputs if replay.is_static else inputs.at(0)
+
+        def step() -> None:
+            nonlocal state
+            with torch.no_grad():
+                target = simulator.step(state, acting.plus(support.expand_as(state.q)), constants)[0]
+            state = method.step(state, replay.observe(target.q), acting).state.detach()
+
+        return step
+
+
+def _moving(simulator: Simulator, batch: int, at_rest: bool = False) -> State:
+    """Undeformed bodies that swing sideways, the faster the farther from where they are fixed."""
+    state = simulator.rest_state(batch)
+    if at_rest:
+        return state
+    q = simulator.rest_positions
+    size = q.amax(0) - q.amin(0)
+    held = q[simulator.fixed].mean(0) if len(simulator.fixed) else q.mean(0)
+    away = (q - held).norm(dim=1)
+    speed = math.sqrt(2.0 * 9.81 * _FALL * float(size.max()))
+    v = torch.zeros_like(q)
+    v[:, int(size.argmin())] = speed * away / away.max()
+    v[simulator.fixed] = 0.0
+    return replace(state, v=v.expand_as(state.q).clone())
+
+
+def _timed(call: Callable[[], Any]) -> float:
+    """Mean duration of a few calls after a first one, which may compile kernels [s]."""
+    begin = time.perf_counter()
+    call()
+    first = time.perf_counter()
+    if first - begin > _MEASURED:
+        return first - begin
+    for count in range(1, _CALLS + 1):
+        call()
+        if time.perf_counter() - first > _MEASURED:
+            break
+    return (time.perf_counter() - first) / count

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import sys
+import warnings
 from collections.abc import Container, Iterator, Sequence
 from importlib import import_module, resources
 from itertools import pairwise
@@ -27,7 +28,7 @@ from yaml import MarkedYAMLError
 
 from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
 from .io.atomic import is_disk_full
-from .io.errors import ResphysError, did_you_mean
+from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
 from .io.settings import parse
@@ -81,9 +82,11 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     before = sys.argv
+    format_warning = warnings.formatwarning
     raise_exceptions = logging.raiseExceptions
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
     logging.raiseExceptions = False  # no traceback for each log line if the disk is full
+    warnings.formatwarning = _sentence_of_warning
     OmegaConf.register_new_resolver("run_label", run_label, replace=True)
     try:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
@@ -108,9 +111,19 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         raise SystemExit(USER_ERROR) from None
     finally:
         sys.argv = before
+        warnings.formatwarning = format_warning
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _sentence_of_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """A warning as `warnings.formatwarning` returns it; those of this package without a line of code."""
+    if issubclass(category, ResphysWarning):
+        return f"warning: {message}\n"
+    return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 
 def _own_options() -> list[str]:

@@ -351,7 +351,8 @@ def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: fl
         folder: of the split.
         times: factor of the duration, as of several folds.
     """
-    left = unfinished(stages, folder)
+    if not (left := unfinished(stages, folder)):
+        return
     if sentence := estimate(left, folder).sentence(remedies(left, run.budget == "quick"), times):
         log.info("%s", sentence)
 

@@ -32,6 +32,7 @@ from warp_resphys.report.run_page import largest_filtered, range_texts
 from warp_resphys.report.verdict import (
     growth_text,
     learned_in_part,
+    left_text,
     marker_verdict,
     published_growth,
     scale_text,
@@ -370,3 +371,16 @@ def test_numbers_have_sensible_digits():
     assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
     shown = [duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
+
+
+def test_a_body_that_left_the_states_of_the_training_is_said_in_bold():
+    """The corrected simulator counts, over all folds; without one that left, there is no sentence."""
+    one = {"range": {"simfree": {"first_s": {"a": 0.1}}, "resphys": {"first_s": {}}}}
+    other = {"range": {"simfree": {"first_s": {}}, "resphys": {"first_s": {"b": 0.25}}}}
+    assert left_text(one) is None
+    text = left_text({"folds": {"a": one, "b": other}})
+    assert text.startswith("<strong>In 1 test trial the body left the states of the training, the first after 0.25")
+    assert text.endswith("</strong>")
+    assert left_text(other, "a") is None
+    assert left_text(other, "b").startswith("<strong>In the test trial b the body left")
+    assert "<script>" not in left_text({"range": {"resphys": {"first_s": {"<script>": 1.0}}}})

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json, write_json
+from warp_resphys.robot.description import finished_experiment
+from warp_resphys.robot.loading import held_out_names
 from warp_resphys.robot.program import condition_names, export_network
 
 # The short segment; what is unknown of its pressures is identified.
@@ -312,6 +315,24 @@ class TestBadInput:
             write_json(folder / file, {**read_json(folder / file), **change})
         with pytest.raises(DataFileError, match=sentence):
             warp_resphys.load(folder)
+
+    def test_the_first_trials_are_those_that_nothing_was_learned_from(self, robot):
+        tested = held_out_names(robot)
+        names = warp_resphys.trial_names(robot)
+        assert names[: len(tested)] == tested
+        settings = finished_experiment(robot.folder, "resphys").settings
+        assert {*tested} == {*settings.split.test}
+        assert not {*tested} & {*settings.split.train, *settings.split.validation}
+        assert len({*names}) == len(names)
+
+    def test_a_motion_says_when_it_left_the_training(self, robot):
+        motion = played(robot, 3)
+        left = torch.zeros_like(motion.left)
+        assert "left the states" not in repr(replace(motion, left=left))
+        left[2:] = True
+        assert repr(replace(motion, left=left)).endswith(
+            f"1 left the states of the training, the first at {2 * robot.time_step:.3g} s"
+        )
 
     def test_a_simulator_can_be_loaded_before_the_run_is_evaluated(self, arm, tmp_path):
         folder = Path(shutil.copytree(arm, tmp_path / "run"))

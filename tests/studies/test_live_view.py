@@ -16,7 +16,7 @@ from support.browser import opened, until
 from support.main_job import end_of
 from warp_resphys import cli
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.robot.loading import load
+from warp_resphys.robot.loading import held_out_names, load
 from warp_resphys.robot.robot import Robot
 from warp_resphys.studies.live import LiveRobot, range_of
 from warp_resphys.studies.view import Page
@@ -175,6 +175,16 @@ def test_a_command_serves_it(finished, folder, monkeypatch):
     assert code == 0, err
     assert len(pages) == 1
     assert b"<html" in pages[0].lower()
+
+
+def test_the_first_view_is_a_trial_that_nothing_was_learned_from(finished, folder, monkeypatch):
+    pytest.importorskip("viser")
+    played = []
+    monkeypatch.setattr(LiveRobot, "play_trial", lambda self, name: played.append(name))
+    for trial in ([], ["trial=hand"]):
+        code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", "seconds=0.1", *trial)
+        assert code == 0, err
+    assert played == [held_out_names(load(finished[0]), moving=True)[0]]
 
 
 def test_a_browser_drives_and_pulls_it(finished):

@@ -210,6 +210,8 @@ class Minimiser:
             while state.active:
                 if state.factors:
                     self.refactor(state)
+                if state.directions:
+                    p.on_direction()
                 state = self.advance(state)
         finally:
             p.active.fill_(1)

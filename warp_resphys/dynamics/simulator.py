@@ -29,8 +29,9 @@ from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings, check_converged
+from .plausibility import warn_of_implausible
 from .potential_terms import PotentialTerms
-from .statics import MOST_ITERATIONS, find_equilibrium, settle
+from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
 from .trajectory import Trajectory
 
 GRAVITY = (0.0, 0.0, -9.80709)
@@ -73,6 +74,10 @@ class Simulator:
     Raises:
         InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a missing CUDA
             device.
+
+    Warns:
+        ResphysWarning: a size, a material or a gravity that looks like a wrong unit, a cell that is nearly flat, or so
+            many unknowns that steps are slow (`dynamics.plausibility`).
 
     Attributes:
         parameters: parameters by name: constants of the materials and energies, and ``gravity`` (B, 3).
@@ -133,6 +138,7 @@ class Simulator:
         self.inputs, self.parts = energies.inputs, energies.parts
         self._workspaces: dict[int, Workspace] = {}
         self._attached_mass = self.tensor(body.attached_mass)
+        warn_of_implausible(body, self.materials, self.gravity, on_cpu=self.rest_positions.device.type == "cpu")
         self._built = True
 
     def _check_barriers(self) -> None:
@@ -470,7 +476,8 @@ class Simulator:
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
         at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
         terms = self._terms.at_rest(state, inputs, constants, workspace.potential.energies, share, near)
-        x, report = equilibrium(workspace, "statics", settings, terms, start, at)
+        with progress_of(workspace.parts[0][1].potential, share, most):
+            x, report = equilibrium(workspace, "statics", settings, terms, start, at)
         check_converged(settings, report, x)
         return self._coordinates.expand(x), report
 

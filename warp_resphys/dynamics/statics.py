@@ -1,12 +1,15 @@
 """Static equilibria, under gradually increasing loads where Newton's method does not converge under all of them."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
 
+from ..energies.potential import IncrementalPotential
 from ..io.errors import ConvergenceError
+from ..io.progress import QUIET_SECONDS, Progress
 from .nonlinear_solver import SolveReport
 
 log = logging.getLogger(__name__)
@@ -18,6 +21,29 @@ _MOST_SETTLINGS = 100
 _SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
+
+
+@contextmanager
+def progress_of(potential: IncrementalPotential, share: float, most: int) -> Iterator[None]:
+    """Shows the iterations of a solve that takes longer than two seconds, with the residual over balancing forces.
+
+    Args:
+        potential: that is minimised.
+        share: of the loads.
+        most: number of iterations after which the solve fails.
+    """
+    under = "" if share == 1.0 else f" under {share:.0%} of the loads"
+    before = potential.on_direction
+    with Progress(f"static equilibrium{under}", most, "iterations at most", after=QUIET_SECONDS) as progress:
+
+        def advance() -> None:
+            progress.advance(residual=float((potential.residual_norm / potential.balance).max()))
+
+        potential.on_direction = advance
+        try:
+            yield
+        finally:
+            potential.on_direction = before
 
 
 def find_equilibrium(solve: Solve, rest: torch.Tensor, start: torch.Tensor, limited: bool) -> torch.Tensor:

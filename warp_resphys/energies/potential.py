@@ -25,6 +25,10 @@ from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
 from .placed import PlacedEnergy
 
 
+def _do_nothing() -> None:
+    """Default of `IncrementalPotential.on_direction`."""
+
+
 @dataclass(frozen=True)
 class StepTerms:
     """The data of a step in the incremental potential (equation in the module's docstring)."""
@@ -66,6 +70,7 @@ class IncrementalPotential(Launcher):
         last_pair_tangents: `pair_tangents` of the last `update_tangent`.
         all_active: whether the last `update_tangent` was for all environments.
         tangent_launches: launches that set `tangents`, available after their first use.
+        on_direction: is called before each global step of a minimisation, unless a GPU runs all of it.
     """
 
     tangent_launches: CapturedGraph | LaunchSequence
@@ -79,6 +84,7 @@ class IncrementalPotential(Launcher):
         device: torch.device,
     ) -> None:
         super().__init__(batch, device)
+        self.on_direction: Callable[[], None] = _do_nothing
         self.n_vertices = n_vertices = coordinates.n_vertices
         self.coordinates = DeviceCoordinates(coordinates, torch.empty(0, device=device, dtype=torch.float64))
         self.energies: list[Term] = []

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-import torch
 
+from ..dynamics.plausibility import mean_of, small_strain_stiffness
 from ..energies.materials import Material
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -68,11 +68,8 @@ def check_size(body: Body, material: Material, gravity: Sequence[float]) -> None
     A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
-    constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
-    terms = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
-    shear = 0.5 * sum(float(modulus.mean()) * factor for modulus, factor, rule in terms if rule == "shape")
-    density = float(constants["density"].mean())
-    stiffness = float(constants["youngs_modulus"].mean()) if "youngs_modulus" in constants else 3.0 * shear
+    constants = material.constants
+    density, stiffness = mean_of(constants["density"]), small_strain_stiffness(material)
     if stiffness <= 0.0:
         raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness

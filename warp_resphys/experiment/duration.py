@@ -35,7 +35,6 @@ from ..settings.stages import (
     TimeStage,
     TrainStage,
 )
-from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import choose_device
 from .experiment import MODELS, Experiment
@@ -48,7 +47,7 @@ LEAST_SECONDS: Final = 60.0  # of the estimates that are shown
 _CALLS, _MEASURED = 3, 1.0  # calls that are timed, and seconds after which no further one begins
 _MOST_TRIALS = 16  # that are simulated for the estimate
 _FALL, _SUPPORTED = 0.1, 0.2
-_EVALUATIONS = 0.6  # typical number of evaluations of a search, over the largest
+_EVALUATIONS = 0.5  # typical number of evaluations of a search, over the largest
 _ITERATIONS = 1.3  # evaluations of the loss in an iteration of L-BFGS
 _SHOWN = 3  # stages
 
@@ -85,8 +84,8 @@ class Estimate:
         parts = ", ".join(f"{name} {clock(times * self.seconds[name])}" for name in longest)
         without = f", without {', '.join(self.without)}" if self.without else ""
         return (
-            f"about {clock(times * self.total)} to go for {self.vertices:,} vertices{without} (longest: {parts}); "
-            f"shorter with {', '.join(remedies)}."
+            f"about {clock(times * self.total)} more (minutes and seconds) for {self.vertices:,} vertices{without} "
+            f"(longest: {parts}); shorter with {', '.join(remedies)}."
         )
 
 
@@ -98,6 +97,7 @@ def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
         folder: of the split; its dataset exists.
     """
     seconds, without, vertices = dict[str, float](), list[str](), 0
+    folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
     for stage in stages:
         settings = stage.settings
         own = None
@@ -179,7 +179,7 @@ class _Pace:
             if search:
                 evaluations = _EVALUATIONS * wanted.starts * wanted.max_evaluations
                 released = any(self.experiment.begins(name) == "released" for name in names)
-                evaluations += wanted.max_evaluations * _EVALUATIONS if released else 0.0
+                evaluations *= 1.5 if released else 1.0  # Releases are estimated again.
                 seconds += evaluations * self._evaluation(model, search, names)
                 seconds += candidates * self._each(model, names, self._step)
         landscape = points * self._each("sysid", names, self._step) if points > 1 else 0.0
@@ -295,7 +295,7 @@ class _Pace:
                 new = simulator.static_equilibrium(resting.plus(force), constants)
             else:
                 new = simulator.step(state, inputs.at(0).plus(force), constants)[0]
-            new.q.sum().backward()  # type: ignore[no-untyped-call]
+            new.q.sum().backward()
 
         return step
 
@@ -344,8 +344,8 @@ def _timed(call: Callable[[], Any]) -> float:
     first = time.perf_counter()
     if first - begin > _MEASURED:
         return first - begin
-    for count in range(1, _CALLS + 1):
+    count = 0
+    while count < _CALLS and time.perf_counter() - first < _MEASURED:
         call()
-        if time.perf_counter() - first > _MEASURED:
-            break
+        count += 1
     return (time.perf_counter() - first) / count

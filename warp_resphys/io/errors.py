@@ -1,6 +1,8 @@
-"""Errors that the user can fix: each is one sentence, and the command line exits with code 2."""
+"""Errors that the user can fix: each is one sentence, and the command line exits with code 2; and warnings."""
 
 import difflib
+import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +18,10 @@ class ResphysError(Exception):
     def __init__(self, message: object = "") -> None:
         line = "".join(letter if letter.isprintable() else " " for letter in str(message))
         super().__init__(line if len(line) <= _LONGEST else f"{line[:500]} ... {line[-300:]}")
+
+
+class ResphysWarning(UserWarning):
+    """Values that can be simulated and look like a mistake; `warnings.filterwarnings` with this class silences them."""
 
 
 class InputError(ResphysError, ValueError):
@@ -42,6 +48,14 @@ class ConvergenceError(ResphysError, RuntimeError):
         super().__init__(message)
         self.positions = positions
         self.report = report
+
+
+def warn(message: str) -> None:
+    """Issues a `ResphysWarning` at the line of the user's program that led to it."""
+    package, depth, frame = __name__.partition(".")[0], 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(f"{package}."):
+        frame, depth = frame.f_back, depth + 1
+    warnings.warn(message, ResphysWarning, stacklevel=depth)
 
 
 def listed(names: Sequence[str]) -> str:

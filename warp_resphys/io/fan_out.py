@@ -26,7 +26,7 @@ import warp as wp
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
-from .errors import InputError, ResphysError
+from .errors import InputError, ResphysError, ResphysWarning
 from .memory import WorkersMemory, forget_peak_memory, peak_memory_gib
 from .progress import be_quiet
 
@@ -142,6 +142,7 @@ def fan_out(
 def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
     """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
+    warnings.simplefilter("ignore", ResphysWarning)  # The parent has shown them.
     _start_warp()
     torch.set_num_threads(1)
     forget_peak_memory()

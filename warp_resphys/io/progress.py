@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from types import TracebackType
@@ -10,9 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
+QUIET_SECONDS = 2.0  # for ``after`` of work that is mostly short
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
 _shown = True
+_running: list[Progress] = []  # innermost last; a terminal has room for one bar
 
 
 def be_quiet() -> None:
@@ -33,11 +36,20 @@ class Progress:
         unit: Name of the units, in the plural.
         start_at: Number of units done by an interrupted run; they do not count for the rate.
         console: Output; stderr by default.
+        after: Seconds before which nothing is shown, for work that is mostly short; such a progress shows nothing
+            within that of longer work.
     """
 
     def __init__(
-        self, description: str, total: int, unit: str, start_at: int = 0, console: Console | None = None
+        self,
+        description: str,
+        total: int,
+        unit: str,
+        start_at: int = 0,
+        console: Console | None = None,
+        after: float = 0.0,
     ) -> None:
+        self._after, self._ended = after, False
         self.description, self.total, self.unit, self.done = description, total, unit, start_at
         self._start_at, self._shown = start_at, -1
         self._console = Console(stderr=True, quiet=not _shown) if console is None else console
@@ -49,23 +61,31 @@ class Progress:
 
     def __enter__(self) -> Progress:
         """Starts the clock, and shows the bar in a terminal."""
-        self._start = self._next = time.perf_counter()
+        self._start = time.perf_counter()
         self._marks = ((self._start, 0), (self._start, 0))
-        if not self._console.is_terminal:
-            self._next += _LINE_SECONDS
-            return self
+        self._next = self._start + (self._after if self._console.is_terminal else max(self._after, _LINE_SECONDS))
+        if self._after and _running:
+            self._next = math.inf
+        _running.append(self)
+        if self._console.is_terminal and not self._after:
+            self._start_bar()
+        return self
+
+    def _start_bar(self) -> None:
         columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[status]}")
         self._bars = Bars(*columns, console=self._console, refresh_per_second=5, redirect_stdout=sys.stdout.isatty())
         self._bars.start()
         self._task = self._bars.add_task(self.description, total=self.total, completed=self.done, status=self.status())
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Shows the final state."""
-        if self._bars is not None or self.done != self._shown:
-            self._show(time.perf_counter())
+        now, self._ended = time.perf_counter(), kind is None and self.unit.endswith("at most")
+        _running.remove(self)
+        waited = not self._after or (self._next < math.inf and now >= self._start + self._after)
+        if self._bars is not None or (waited and self.done != self._shown):
+            self._show(now)
         if self._bars is not None:
             self._bars.stop()
 
@@ -93,13 +113,15 @@ class Progress:
             duration = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
             parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{duration} each")
             left = (self.total - self.done) / rate
-            parts.append(f"{clock(left)} left" if left > 0 else f"in {clock(elapsed)}")
+            parts.append(f"{clock(left)} left" if left > 0 and not self._ended else f"in {clock(elapsed)}")
         for name, value in self._fields.items():
             parts.append(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}")
         return ", ".join(parts)
 
     def _show(self, now: float) -> None:
         self._shown = self.done
+        if self._bars is None and self._console.is_terminal:
+            self._start_bar()
         if self._bars is not None:
             self._bars.update(self._task, completed=self.done, status=self.status())
             self._next = now + _BAR_SECONDS

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..io.progress import QUIET_SECONDS, Progress
 from .chambers import find_chambers
 from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
 
@@ -67,19 +69,26 @@ def _half_sphere(normals: FloatArray) -> FloatArray:
 
 
 def _blocked(starts: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
-    """Returns 1 for rays (R,) that hit any triangle (T, 3, 3), else 0 (Moeller and Trumbore 1997)."""
-    origin, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    """Returns 1 for rays (R,) that hit any triangle (T, 3, 3), else 0."""
     hit = np.zeros(len(starts))
     chunk = max(1, _RAYS // len(corners))
-    for begin in range(0, len(starts), chunk):
-        rays, offset = directions[begin : begin + chunk, None], starts[begin : begin + chunk, None] - origin
-        across = np.cross(rays, second)
-        determinant = (across * first).sum(axis=-1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = (across * offset).sum(axis=-1) / determinant
-            around = np.cross(offset, first)
-            v = (around * rays).sum(axis=-1) / determinant
-            distance = (around * second).sum(axis=-1) / determinant
-            inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
-        hit[begin : begin + chunk] = inside.any(axis=1)
+    with Progress("open cavities", len(starts), "rays", after=QUIET_SECONDS) as progress:
+        for begin in range(0, len(starts), chunk):
+            own = slice(begin, begin + chunk)
+            hit[own] = _hits(starts[own], directions[own], corners).any(axis=1)
+            progress.advance(len(hit[own]))
     return hit
+
+
+def _hits(starts: FloatArray, directions: FloatArray, corners: FloatArray) -> NDArray[np.bool_]:
+    """Returns whether rays (R,) hit triangles (T, 3, 3), (R, T) (Moeller and Trumbore 1997)."""
+    origin, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    rays, offset = directions[:, None], starts[:, None] - origin
+    across = np.cross(rays, second)
+    determinant = (across * first).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = (across * offset).sum(axis=-1) / determinant
+        around = np.cross(offset, first)
+        v = (around * rays).sum(axis=-1) / determinant
+        distance = (around * second).sum(axis=-1) / determinant
+        return np.asarray((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0))

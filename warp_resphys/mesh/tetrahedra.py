@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from ..io.errors import MeshError
+from ..io.progress import QUIET_SECONDS, Progress
 from .mesh import FloatArray, IntArray, Mesh, quadratic
 from .quality import cell_volumes
 from .readers import LONGEST_DIAGONAL, METRES, SHORTEST_DIAGONAL
@@ -19,6 +20,10 @@ _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's numbers of linear cells
 _ANGLES = (40.0, 30.0, 20.0)  # angles between triangles above which their edge is preserved, tried in turn [deg]
 _VOLUME = 0.08  # largest relative difference between the volumes of mesh and surface
 _REACH = 0.5  # largest difference between the bounding boxes of mesh and surface, over the cell size
+
+
+SURFACE_SUFFIXES = (".stl", ".obj", ".ply")
+_DIMENSIONS = ("edges", "surfaces", "volume")
 
 
 class _NoGmshError(MeshError):
@@ -52,8 +57,11 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
         options |= {"Mesh.OptimizeThreshold": 0.6}  # quality below which tetrahedra are improved
         for option, value in options.items():
             gmsh.option.setNumber(option, value)
-        describe(gmsh)
-        gmsh.model.mesh.generate(3)
+        with Progress(f"tetrahedra of {what}", len(_DIMENSIONS), "steps", after=QUIET_SECONDS) as progress:
+            describe(gmsh)
+            for dimension, last in enumerate(_DIMENSIONS, start=1):
+                gmsh.model.mesh.generate(dimension)
+                progress.advance(meshed=last)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         _, nodes = gmsh.model.mesh.getElementsByType(_TETRAHEDRON)
     except Exception as error:  # gmsh has no exception classes of its own

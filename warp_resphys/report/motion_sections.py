@@ -25,9 +25,9 @@ from .data import (
     shown_models,
 )
 from .obstacles import ObstacleSurface
-from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text
+from .page import Block, Canvas, Drawn, Part, Text, data_address, drawn_file, largest_text
 from .render import Pixels, draw, write_film
-from .verdict import unbroken
+from .verdict import left_text, unbroken
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the interactive view.
@@ -123,7 +123,9 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]][0]}."
-    blocks = [] if data.sees_markers else _vertex_figures(data, trials, canvas)
+    left = left_text(data.metrics, name)
+    blocks: list[Block] = [] if left is None else [Text(left, "left_here")]
+    blocks += [] if data.sees_markers else _vertex_figures(data, trials, canvas)
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"
@@ -141,7 +143,8 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     same = "The same trial" if blocks else f"The trial {name}"
     blocks += canvas.attempt("motion.png", lambda _: _instants_figure(data, motion, same, colours, canvas))
     where = ", outside of the training loads" if name in data.others else ""
-    return Part("The motion" if data.sees_markers else f"One test trial: {name}{where}", blocks)
+    head = f"The motion in a test trial, {name}" if data.sees_markers else f"One test trial: {name}{where}"
+    return Part(head, blocks)
 
 
 def _in_space(data: RunReport, name: str) -> list[Block]:

@@ -50,7 +50,7 @@ from .sections import (
 )
 from .shapes_section import shapes_section
 from .trials_section import trials_section
-from .verdict import unbroken, verdict
+from .verdict import left_text, unbroken, verdict, when_text
 
 _LOG = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ def write_report(path: Path, data: RunReport) -> None:
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
     """Return the errors of the models and the published ones."""
-    blocks: list[Any] = []
+    blocks: list[Any] = [Text(text, "left")] if (text := left_text(data.metrics)) else []
     if laboratory := data.settings.targets.get("laboratory"):
         same = laboratory.material == data.settings.simulation
         words = [*([] if same else ["another material"]), *differences(data.settings, laboratory)]
@@ -240,26 +240,17 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
         first = left_by[model]["first_s"]
         count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
         never = " never" * (len(trials) == 1 and not first)
-        text = f"{MODELS[model][0]}: {count}{never} left the training range{_when(first)}."
+        text = f"{MODELS[model][0]}: {count}{never} left the training range{when_text(first)}."
         if model == "resphys" and first and "law" in metrics.get("errors_mm", {}):
             text += " There the learned force fades out, and the law remains."
         scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]
         left = {scale: beyond[scale][model]["first_s"] for scale in scales}
         if any(left.values()):
             counts = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
-            earliest = _when({trial: time for times in left.values() for trial, time in times.items()})
+            earliest = when_text({trial: time for times in left.values() for trial, time in times.items()})
             text += f" At higher inputs: {', '.join(counts)}{earliest}."
         sentences.append(unbroken(text))
     return sentences
-
-
-def _when(first: Mapping[str, float]) -> str:
-    if not first:
-        return ""
-    if not any(first.values()):
-        return f", from the start ({', '.join(first)})"
-    earliest = min(first, key=lambda trial: first[trial])
-    return f", the first after {first[earliest]:.2f} s ({earliest})"
 
 
 def error_section(data: RunReport, canvas: Canvas) -> Part | None:

@@ -5,6 +5,9 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from markupsafe import Markup
+
+from ..io.errors import number_of
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from ..settings.run import RunSettings
 from .conclusions import INSIDE, OUTSIDE, epochs_kept, errors_by_load, headline, untrained
@@ -45,6 +48,42 @@ def learned_in_part(settings: RunSettings, tested: Collection[str]) -> bool:
 def unbroken(text: str) -> str:
     """Return a text with no-break spaces between numbers and their units or symbols."""
     return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
+
+
+def left_text(metrics: Mapping[str, Any], trial: str | None = None) -> Markup | None:
+    """Return a bold sentence on test trials in which the body left the states of the training; None if it did not.
+
+    Args:
+        metrics: With `range`, as for `range_texts`; of folds, each has its own.
+        trial: The only trial that counts; all if omitted.
+    """
+    first: dict[str, float] = {}
+    for own in [*metrics.get("folds", {}).values(), metrics]:
+        ranges = own.get("range", {})
+        model = next((model for model in ("resphys", "resphys_uncorrected") if model in ranges), "simfree")
+        first |= ranges.get(model, {}).get("first_s", {})
+    left = {name: time for name, time in first.items() if trial in (None, name)}
+    if not left:
+        return None
+    where = f"In the test trial {trial}" if trial is not None else f"In {number_of(len(left), 'test trial')}"
+    said = unbroken(
+        f"{where} the body left the states of the training{when_text(left)}: what the network adds is a guess there."
+    )
+    return Markup("<strong>{}</strong>").format(said)
+
+
+def when_text(first: Mapping[str, float]) -> str:
+    """Return when the first of some trials left the training range, in words; empty without any.
+
+    Args:
+        first: Times [s] by trial.
+    """
+    if not first:
+        return ""
+    if not any(first.values()):
+        return f", from the start ({', '.join(first)})"
+    earliest = min(first, key=lambda trial: first[trial])
+    return f", the first after {first[earliest]:.2f} s ({earliest})"
 
 
 def vertex_verdict(

@@ -95,12 +95,30 @@ class RecordedTrial:
 
 
 def trial_names(robot: Robot) -> tuple[str, ...]:
-    """Returns the names of the trials of a robot's run.
+    """Returns the names of the trials of a robot's run, first those of the test, which no model was trained on.
 
     Raises:
         InputError: the robot was loaded from a file.
     """
-    return _experiment(robot).dataset.names
+    return (
+        *(first := held_out_names(robot)),
+        *(name for name in _experiment(robot).dataset.names if name not in first),
+    )
+
+
+def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:
+    """Returns the names of the test trials of a robot's run, from which nothing was learned.
+
+    Args:
+        robot: loaded from a run.
+        moving: whether poses are left out.
+
+    Raises:
+        InputError: the robot was loaded from a file.
+    """
+    experiment = _experiment(robot)
+    names = experiment.settings.split.test
+    return experiment.moving(names) if moving else names
 
 
 def recorded_trial(robot: Robot, name: str) -> RecordedTrial:

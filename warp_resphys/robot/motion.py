@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.obstacle_surfaces import ObstacleMotion
-from ..io.errors import InputError
+from ..io.errors import InputError, number_of
 from ..learning.replay import sample
 from ..mesh.motion_files import MovingSurface, input_columns, write_csv, write_usd, write_vtk
 from .description import Description
@@ -19,7 +19,7 @@ from .state import RobotState
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Motion:
     """T steps of B robots.
 
@@ -51,6 +51,17 @@ class Motion:
     known_inputs: Mapping[str, RobotInput]
     final: RobotState
     obstacles: tuple[ObstacleMotion, ...] = ()
+
+    def __repr__(self) -> str:
+        """Robot, numbers of steps and environments, and when the first of these left the states of the training."""
+        steps, batch = len(self.times) - 1, self.q.shape[1]
+        text = f"Motion of {self.robot.name}, {self.robot.model}: {number_of(steps, 'step')}, "
+        text += f"{number_of(batch, 'environment')}"
+        left, lost = self.left.cpu().numpy(), self.lost.cpu().numpy()
+        if left.any():
+            first = self.times[left.any(axis=1).argmax()]
+            text += f"; {left.any(axis=0).sum()} left the states of the training, the first at {first:.3g} s"
+        return text + (f"; {lost[-1].sum()} diverged" if lost.any() else "")
 
     def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:
         """Interpolates the markers at other times (F,) [s]; returns (F, B, M, 3), by cubic interpolation [m]."""

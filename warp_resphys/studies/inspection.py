@@ -10,7 +10,8 @@ from ..data.recordings.bag import is_bag
 from ..data.recordings.reading import READERS
 from ..io.errors import InputError
 from ..io.settings import Many, Positive, Word, setting
-from ..settings.mesh import MeshSettings, PlaceSettings
+from ..mesh.tetrahedra import SURFACE_SUFFIXES
+from ..settings.mesh import MeshSettings, PlaceSettings, SurfaceMesh
 from .mesh_inspection import inspect_mesh
 from .recording_quality import RecordingInspection, inspect_recording
 
@@ -27,7 +28,7 @@ class Inspection(RecordingInspection):
     @model_validator(mode="before")
     @classmethod
     def _sort_files(cls, values: Any) -> Any:
-        """Moves ``files`` to their keys: the first recording, further ones to compare it with, and a mesh."""
+        """Moves ``files`` to their keys: the first recording, others to compare it with, and a mesh or surface."""
         if not isinstance(values, Mapping) or not isinstance(values["mesh"], Mapping):
             return values
         files = values["files"] if isinstance(values["files"], list) else []
@@ -39,6 +40,8 @@ class Inspection(RecordingInspection):
         if recordings:
             changed["recording"] = {**values["recording"], "path": recordings[0]}
             changed["compare_with"] = [*values["compare_with"], *recordings[1:]]
+        if mesh["kind"] == "file" and Path(str(mesh.get("path"))).suffix.lower() in SURFACE_SUFFIXES:
+            mesh = {key: value for key, value in mesh.items() if key in SurfaceMesh.model_fields} | {"kind": "surface"}
         if mesh.get("path") is None:  # the key is there for every kind of mesh, but only some have files
             mesh.pop("path", None)
         changed["mesh"] = None if mesh["kind"] == "file" and "path" not in mesh else mesh

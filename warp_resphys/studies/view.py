@@ -25,7 +25,8 @@ from ..report.figures import TONES
 from ..report.obstacles import OBSTACLE, ObstacleSurface
 from ..report.render import MEASURED
 from ..robot.inputs import BASE
-from ..robot.loading import RecordedTrial, load, trial_names
+from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
+from ..robot.robot import Robot
 from .hand import RADIUS
 from .live import LiveRobot, range_of
 from .live_twin import LiveTwin, TwinSettings
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 _RATE: Final = 30.0  # Pictures a second, at most.
 _STATUS_EVERY: Final = 0.25  # [s]
+_HAND: Final = "hand"
 _BY_HAND: Final = "by hand"
 _EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of a machine.
 _HIGHEST_PORT: Final = 65535
@@ -86,8 +88,8 @@ def view(settings: ViewSettings, folder: Path) -> None:
         live = LiveTwin(robot, settings.source, settings.twin)
     else:
         live = LiveRobot(robot)
-        if settings.trial is not None:
-            live.play_trial(settings.trial)
+        if settings.trial != _HAND and (name := _first_trial(robot) if settings.trial is None else settings.trial):
+            live.play_trial(name)
         live.step()  # Compiles the kernels of a step before the page is opened.
         live.reset()
     logging.getLogger("websockets").setLevel(logging.WARNING)
@@ -109,6 +111,11 @@ def view(settings: ViewSettings, folder: Path) -> None:
     if isinstance(live, LiveTwin):
         for line in _summary(live):
             show(line)
+
+
+def _first_trial(robot: Robot) -> str | None:
+    """Name of the first test trial that is a motion; None if there is none, or the robot comes from a file."""
+    return None if robot.folder is None else next(iter(held_out_names(robot, moving=True)), None)
 
 
 def _summary(live: LiveTwin) -> list[str]:

@@ -1,0 +1,85 @@
+"""Warnings of sizes, units and cells that look like a mistake."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from warp_resphys.dynamics import plausibility
+from warp_resphys.dynamics.plausibility import small_strain_stiffness
+from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.energies.materials import ConvexMaterial, Corotated, StableNeoHookean
+from warp_resphys.fem.body import Body
+from warp_resphys.io.errors import ResphysWarning
+from warp_resphys.mesh.mesh import Mesh, box_hexahedra, box_tetrahedra
+
+
+def beam(scale=1.0, mesh=None):
+    """A beam of 0.1 m, times a factor."""
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)) if mesh is None else mesh
+    return Body(Mesh(scale * mesh.vertices, mesh.cells), fixed=np.flatnonzero(mesh.vertices[:, 0] == 0.0))
+
+
+@pytest.mark.parametrize(
+    ("body", "changes", "words"),
+    [
+        (beam(1e3), {}, r"the body is 10\d\.\d+ m across: .*mesh\.units"),
+        (beam(1e-3), {}, r"the body is 0\.00010\d+ m across: .*units"),
+        (beam(), {"material": Corotated(0.2)}, r"Young's modulus is 0\.2 Pa, softer than a gel"),
+        (beam(), {"material": StableNeoHookean(2e8)}, r"Young's modulus is 2e\+08 Pa, stiffer than any rubber"),
+        (beam(), {"material": Corotated(density=1.0)}, r"density is 1 kg/m\^3, lighter than a foam"),
+        (beam(), {"gravity": (0.0, 0.0, -9810.0)}, r"gravity is 9810 m/s\^2: .*mm/s\^2"),
+    ],
+)
+def test_a_wrong_unit_is_one_warning(body, changes, words):
+    """A warning names the value and the unit that is expected, at the line that makes the simulator."""
+    with pytest.warns(ResphysWarning, match=words) as caught:
+        Simulator(body, **changes)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+
+
+def test_a_nearly_flat_cell_is_named_with_its_place():
+    """A tetrahedron that is flattened to a sliver is found among others."""
+    mesh = box_tetrahedra((0.1, 0.03, 0.03), (4, 2, 2))
+    inner = int(np.argmin(np.linalg.norm(mesh.vertices - (0.05, 0.015, 0.015), axis=1)))
+    cell = mesh.cells[np.flatnonzero((mesh.cells == inner).any(1))[0]]
+    others = mesh.vertices[cell[cell != inner]]
+    towards = others.mean(0) - mesh.vertices[inner]
+    normal = np.cross(others[1] - others[0], others[2] - others[0])
+    normal /= np.linalg.norm(normal)
+    vertices = mesh.vertices.copy()
+    vertices[inner] += 0.995 * (towards @ normal) * normal
+    with pytest.warns(ResphysWarning, match=r"cell \d+ of the body around \(.*\) mm is nearly flat") as caught:
+        Simulator(beam(mesh=Mesh(vertices, mesh.cells)))
+    number = int(str(caught[0].message).split()[1])
+    assert inner in mesh.cells[number]
+
+
+def test_slow_sizes_warn_on_the_cpu_alone(monkeypatch):
+    """The number of unknowns is that of the vertices that can move."""
+    body = beam()
+    unknowns = 3 * (body.n_vertices - len(body.fixed_vertices))
+    monkeypatch.setattr(plausibility, "MANY_UNKNOWNS", unknowns - 1)
+    with pytest.warns(ResphysWarning, match=f"has {unknowns} unknowns"):
+        Simulator(body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plausibility.warn_of_implausible(body, {}, (0.0, 0.0, 0.0), on_cpu=False)
+
+
+def test_the_warnings_are_silenced_by_their_class():
+    """A filter of the class is enough, and a plausible body warns of nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Simulator(beam())
+        warnings.simplefilter("ignore", ResphysWarning)
+        Simulator(beam(1e3), Corotated(0.2))
+
+
+def test_stiffness_at_small_strains():
+    """Three times the shear modulus, where a law has no Young's modulus: G = 2 (c10 + c01) + Ogden's moduli."""
+    law = ConvexMaterial(c10=20e3, c01=5e3, ogden={4: 30e3})
+    assert small_strain_stiffness(law) == pytest.approx(3.0 * (2.0 * 25e3 + 30e3))
+    assert small_strain_stiffness(replace(Corotated(), youngs_modulus=3e5)) == 3e5

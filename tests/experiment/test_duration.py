@@ -1,0 +1,69 @@
+"""Estimates of the duration of a run."""
+
+import logging
+
+from support.configured import settings
+from warp_resphys.experiment import duration
+from warp_resphys.experiment.duration import Estimate, estimate, remedies
+from warp_resphys.experiment.trials import split_of
+from warp_resphys.io.stages import run_stages, unfinished
+from warp_resphys.pipeline import acquire, learning_stages, run_experiment
+
+TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "timing=false", "trainer.epochs=2")
+
+
+def test_an_estimate_grows_with_the_work(tmp_path):
+    """Twice the epochs double the training, and all stages with an estimate are positive; the report has none."""
+    parts = {}
+    for epochs in (20, 40):
+        run = settings(*TINY, f"trainer.epochs={epochs}", f"trainer.rollout_every={epochs}")
+        _, acquired = acquire(run, tmp_path)
+        parts[epochs] = estimate(learning_stages(run, split_of(run), ".", acquired), tmp_path)
+    assert all(seconds > 0.0 for own in parts.values() for seconds in own.seconds.values())
+    assert parts[20].seconds.keys() == {"reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
+    assert not parts[20].without
+    assert parts[40].seconds["train_resphys"] > 1.2 * parts[20].seconds["train_resphys"]
+
+
+def test_a_sentence_says_how_long_and_what_helps():
+    """Folds multiply the duration; a short run says nothing."""
+    own = Estimate({"identify": 50.0, "evaluate": 5.0}, ["plan_resphys"], 1234)
+    assert own.sentence(["a coarser mesh"]) == ""
+    text = own.sentence(["a coarser mesh", "fewer trials"], times=2.0)
+    assert text.startswith("about 1:50 more (minutes and seconds) for 1,234 vertices, without plan_resphys")
+    assert "identify 1:40" in text
+    assert text.endswith("shorter with a coarser mesh, fewer trials.")
+
+
+def test_remedies_name_the_parameters_and_the_quick_budget():
+    """The number of identified parameters is said where there are several."""
+    run = settings("experiment=beam_real")
+    stages = [own for own in learning_stages(run, split_of(run), ".", "") if own.name == "identify"]
+    assert "fewer of the 3 parameters of identify.parameters" in remedies(stages, quick=True)
+    assert remedies([], quick=False)[-1] == "or at first budget=quick"
+
+
+def test_a_run_announces_its_duration_before_the_first_stage(tmp_path, monkeypatch, caplog):
+    """The line comes after the data are there and before any force is reconstructed; a repetition has none."""
+    monkeypatch.setattr(duration, "LEAST_SECONDS", 0.0)
+    run = settings(*TINY)
+    with caplog.at_level(logging.INFO, logger="warp_resphys"):
+        run_experiment(run, tmp_path)
+    lines = [record.getMessage() for record in caplog.records]
+    announced = next(number for number, line in enumerate(lines) if line.startswith("about "))
+    assert any(line.startswith("simulate: done") for line in lines[:announced])
+    assert any(line.startswith("reconstruct_resphys: started") for line in lines[announced:])
+    caplog.clear()
+    with caplog.at_level(logging.INFO, logger="warp_resphys"):
+        run_experiment(run, tmp_path)
+    assert not any(record.getMessage().startswith("about ") for record in caplog.records)
+
+
+def test_finished_stages_are_not_estimated(tmp_path):
+    """A stage with the record of its settings is left out."""
+    run = settings(*TINY)
+    _, acquired = acquire(run, tmp_path)
+    stages = learning_stages(run, split_of(run), ".", acquired)
+    assert [own.name for own in unfinished(stages, tmp_path)] == [own.name for own in stages]
+    run_stages(stages[:1], tmp_path)
+    assert [own.name for own in unfinished(stages, tmp_path)] == [own.name for own in stages[1:]]

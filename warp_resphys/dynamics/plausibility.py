@@ -1,0 +1,94 @@
+"""Warnings of values that can be simulated and look like a mistake: units, nearly flat cells, and slow sizes."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from ..energies.materials import Material
+from ..fem.body import Body
+from ..io.errors import warn
+from ..mesh.mesh import Mesh
+from ..mesh.quality import scaled_jacobian
+from ..mesh.readers import LONGEST_DIAGONAL, SHORTEST_DIAGONAL
+
+STIFFNESS: Final = (1e3, 1e8)  # Pa, softer than gels, stiffer than rubbers
+DENSITY: Final = (10.0, 2.5e4)  # kg/m^3, lighter than foams, heavier than metals
+GRAVITY: Final = (0.1, 100.0)  # m/s^2
+FLAT_CELL: Final = 0.02  # scaled Jacobian
+MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/scaling.md)
+
+
+def warn_of_implausible(
+    body: Body, materials: Mapping[str, Material], gravity: Sequence[float], on_cpu: bool = True
+) -> None:
+    """Issues a `ResphysWarning` for every value of a simulator that looks like a mistake.
+
+    Args:
+        body: a body, or a `fem.scene.Scene`.
+        materials: by name of the region or body; an empty name for a single material.
+        gravity: acceleration (3,) [m/s^2].
+        on_cpu: whether it is simulated on the CPU.
+    """
+    for name, own, _ in body.members:
+        _warn_of_mesh(own.mesh, f"the body {name!r}" if name else "the body")
+    for name, material in materials.items():
+        _warn_of_material(material, f" of {name}" if name else "")
+    size = float(np.linalg.norm(gravity))
+    if size and not GRAVITY[0] <= size <= GRAVITY[1]:
+        warn(f"gravity is {size:g} m/s^2: give it in m/s^2, not in mm/s^2 or in g, as in (0, 0, -9.81).")
+    unknowns = 3 * (body.n_vertices - len(body.fixed_vertices))
+    if on_cpu and unknowns > MANY_UNKNOWNS:
+        warn(
+            f"the simulator has {unknowns:,} unknowns, and a step of it takes seconds on a CPU: take larger cells for "
+            "a first look, or device='cuda'."
+        )
+
+
+def _warn_of_mesh(mesh: Mesh, name: str) -> None:
+    across = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
+        warn(
+            f"{name} is {across:g} m across: lengths are in m, so check the unit of its mesh (units in Python, "
+            "mesh.units in a configuration)."
+        )
+    worst, value = _worst_cell(mesh)
+    if value < FLAT_CELL:
+        x, y, z = 1e3 * mesh.vertices[mesh.cells[worst]].mean(axis=0)
+        warn(
+            f"cell {worst} of {name} around ({x:.4g}, {y:.4g}, {z:.4g}) mm is nearly flat (its scaled Jacobian is "
+            f"{value:.2g}; 1 is ideal, 0 is flat): steps may be slow or fail there, so mesh the body anew."
+        )
+
+
+@lru_cache(maxsize=16)
+def _worst_cell(mesh: Mesh) -> tuple[int, float]:
+    """Number and quality of the cell with the smallest scaled Jacobian."""
+    quality = scaled_jacobian(mesh)
+    return int(quality.argmin()), float(quality.min())
+
+
+def _warn_of_material(material: Material, of: str) -> None:
+    stiffness, density = small_strain_stiffness(material), mean_of(material.constants["density"])
+    if stiffness and not STIFFNESS[0] <= stiffness <= STIFFNESS[1]:
+        kind = "softer than a gel" if stiffness < STIFFNESS[0] else "stiffer than any rubber"
+        warn(f"Young's modulus{of} is {stiffness:.3g} Pa, {kind}: give moduli in Pa, as in 3e5 for a soft silicone.")
+    if not DENSITY[0] <= density <= DENSITY[1]:
+        kind = "lighter than a foam" if density < DENSITY[0] else "heavier than any metal"
+        warn(f"density{of} is {density:.3g} kg/m^3, {kind}: give it in kg/m^3, as in 1070 for silicone, not in g/cm^3.")
+
+
+def small_strain_stiffness(material: Material) -> float:
+    """Mean Young's modulus of a material at small strains [Pa]; three times the shear modulus if it has no constant."""
+    constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
+    if "youngs_modulus" in constants:
+        return mean_of(constants["youngs_modulus"])
+    terms = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
+    return 1.5 * sum(mean_of(modulus) * factor for modulus, factor, rule in terms if rule == "shape")
+
+
+def mean_of(value: Any) -> float:
+    """Mean of the values of a constant."""
+    return float(torch.as_tensor(value, dtype=torch.float64).detach().mean())

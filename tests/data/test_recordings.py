@@ -160,6 +160,21 @@ def test_table_in_another_order_of_columns(tmp_path, positions):
     np.testing.assert_allclose(recording.positions, positions[:, [1, 0]], atol=1e-6)
 
 
+@pytest.mark.parametrize("between", [" ", "_"])
+def test_axes_may_stand_behind_a_space_or_an_underscore(tmp_path, positions, between):
+    path = tmp_path / "swing.csv"
+    write_table(path, positions)
+    head, _, rows = path.read_text().partition("\n")
+    renamed = [f"{name[0]}{between}{name[2].upper()}{name[3:]}" if name[1] == "." else name for name in head.split(",")]
+    path.write_text(",".join(renamed) + "\n" + rows)
+    recording = read_recording(path)
+    assert recording.labels == ("a", "b", "c")
+    np.testing.assert_allclose(recording.positions, positions, atol=1e-6)
+    path.write_text(",".join(renamed).replace(f"c{between}Y", "cat").replace(f"c{between}Z", "dog") + "\n" + rows)
+    with pytest.raises(DataFileError, match=f"is named 'c{between}X', which is neither"):
+        read_recording(path)
+
+
 def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     stamps = np.delete(np.arange(40), [10, 11, 12]) / 120.0
     path = write_table(tmp_path / "swing.csv", np.delete(positions, [10, 11, 12], axis=0), stamps=stamps + 3.0)

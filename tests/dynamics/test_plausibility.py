@@ -74,6 +74,7 @@ def test_the_warnings_are_silenced_by_their_class():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Simulator(beam())
+        Simulator(beam(), Corotated(2e9, 0.3))  # a plate of plastic
         warnings.simplefilter("ignore", ResphysWarning)
         Simulator(beam(1e3), Corotated(0.2))
 

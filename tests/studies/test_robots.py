@@ -211,3 +211,22 @@ def test_what_cannot_be_run_is_refused(arguments, said, tmp_path, monkeypatch):
     code, err = run(*arguments, *ARGUMENTS[2:])
     assert code == 2
     assert said in err
+
+
+def test_the_readme_has_the_figures_of_the_robots():
+    """Every robot of docs/robots.md has a row in README.md, with the same errors, rounded there."""
+    robots = table_of(Path("docs/robots.md").read_text(), "| Robot | Without physics [mm]")
+    readme = table_of(Path("README.md").read_text(), "| robot | without physics")
+    for robot, *measured in robots:
+        (row,) = (cells for cells in readme if cells[0].casefold().startswith(robot.casefold()))
+        shown = [cell.strip("*") for cell in row[1:5]]
+        expected = [measured[column].split()[0] for column in (0, 1, 2, 4)]
+        for text, exact in zip(shown, expected, strict=True):
+            digits = len(text.partition(".")[2])
+            assert abs(float(text) - float(exact)) <= 0.5 * 10.0**-digits + 1e-9, (robot, text, exact)
+
+
+def table_of(text, head):
+    """The cells of the rows of a Markdown table whose first line begins in a given way."""
+    lines = text[text.index(head) :].partition("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]

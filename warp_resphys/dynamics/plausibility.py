@@ -14,9 +14,11 @@ from ..mesh.mesh import Mesh
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import LONGEST_DIAGONAL, SHORTEST_DIAGONAL
 
-STIFFNESS: Final = (1e3, 1e8)  # Pa, softer than gels, stiffer than rubbers
-DENSITY: Final = (10.0, 2.5e4)  # kg/m^3, lighter than foams, heavier than metals
-GRAVITY: Final = (0.1, 100.0)  # m/s^2
+SOFTEST: Final = 1e3  # Pa, of gels
+UNLIKELY: Final = (1e8, 1e9)  # Pa, stiffer than rubbers and softer than the plastics that hard parts are made of
+# kg/m^3, of g/cm^3, kg/mm^3 and t/mm^3 that were taken for it, and heavier than metals; 0.001 makes a body massless
+DENSITIES: Final = ((0.5, 10.0), (1e-10, 1e-5), (2.5e4, np.inf))
+STRONGEST: Final = 100.0  # m/s^2
 FLAT_CELL: Final = 0.02  # scaled Jacobian
 MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/scaling.md)
 
@@ -37,7 +39,7 @@ def warn_of_implausible(
     for name, material in materials.items():
         _warn_of_material(material, f" of {name}" if name else "")
     size = float(np.linalg.norm(gravity))
-    if size and not GRAVITY[0] <= size <= GRAVITY[1]:
+    if size > STRONGEST:
         warn(f"gravity is {size:g} m/s^2: give it in m/s^2, not in mm/s^2 or in g, as in (0, 0, -9.81).")
     unknowns = 3 * (body.n_vertices - len(body.fixed_vertices))
     if on_cpu and unknowns > MANY_UNKNOWNS:
@@ -72,11 +74,11 @@ def _worst_cell(mesh: Mesh) -> tuple[int, float]:
 
 def _warn_of_material(material: Material, of: str) -> None:
     stiffness, density = small_strain_stiffness(material), mean_of(material.constants["density"])
-    if stiffness and not STIFFNESS[0] <= stiffness <= STIFFNESS[1]:
-        kind = "softer than a gel" if stiffness < STIFFNESS[0] else "stiffer than any rubber"
+    if 0.0 < stiffness < SOFTEST or UNLIKELY[0] < stiffness < UNLIKELY[1]:
+        kind = "softer than a gel" if stiffness < SOFTEST else "stiffer than any rubber"
         warn(f"Young's modulus{of} is {stiffness:.3g} Pa, {kind}: give moduli in Pa, as in 3e5 for a soft silicone.")
-    if not DENSITY[0] <= density <= DENSITY[1]:
-        kind = "lighter than a foam" if density < DENSITY[0] else "heavier than any metal"
+    if any(lower < density < upper for lower, upper in DENSITIES):
+        kind = "heavier than any metal" if density > DENSITIES[-1][0] else "lighter than a foam"
         warn(f"density{of} is {density:.3g} kg/m^3, {kind}: give it in kg/m^3, as in 1070 for silicone, not in g/cm^3.")
 
 

@@ -14,6 +14,7 @@ from rich.progress import Progress as Bars
 QUIET_SECONDS = 2.0  # for ``after`` of work that is mostly short
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
+_AT_MOST = " at most"  # of units of work that may end early
 _shown = True
 _running: list[Progress] = []  # innermost last; a terminal has room for one bar
 
@@ -81,7 +82,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Shows the final state."""
-        now, self._ended = time.perf_counter(), kind is None and self.unit.endswith("at most")
+        now, self._ended = time.perf_counter(), kind is None and self.unit.endswith(_AT_MOST)
         _running.remove(self)
         waited = not self._after or (self._next < math.inf and now >= self._start + self._after)
         if self._bars is not None or (waited and self.done != self._shown):
@@ -111,7 +112,7 @@ class Progress:
         if new > before and now > since:
             rate = (new - before) / (now - since)
             duration = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
-            parts.append(f"{rate:.3g} {self.unit}/s" if rate >= 1 else f"{duration} each")
+            parts.append(f"{rate:.3g} {self.unit.removesuffix(_AT_MOST)}/s" if rate >= 1 else f"{duration} each")
             left = (self.total - self.done) / rate
             parts.append(f"{clock(left)} left" if left > 0 and not self._ended else f"in {clock(elapsed)}")
         for name, value in self._fields.items():

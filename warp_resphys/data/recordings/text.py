@@ -197,22 +197,22 @@ def _read_columns(
         )
     named, turned, units, channels = [], {}, set(), {}
     for number, (name, unit) in columns.items():
-        label, _, axis = name.rpartition(".")
+        label, axis = _of_marker(name, [other for other, _ in columns.values()])
         if number in clocks:
             continue
-        if label and axis.lower() in _AXES:
-            named.append((label, axis.lower(), number))
+        if label and axis in _AXES:
+            named.append((label, axis, number))
             units |= {unit} if unit else set()
-        elif label and axis.lower() in _QUATERNION:
-            if (label, axis.lower()) in turned:
+        elif label and axis in _QUATERNION:
+            if (label, axis) in turned:
                 raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these bodies.")
-            turned[label, axis.lower()] = number
+            turned[label, axis] = number
         elif unit is not None and unit in channel_units:
             channels[number] = SI_PER_ACTUATION_UNIT[unit]
         else:
             raise DataFileError(
                 f"{path}: column {number + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
-                f"channel with a unit in brackets ({', '.join(channel_units)}); rename it or leave it out."
+                f"channel with a unit in brackets ({', '.join(channel_units)}); rename it or leave it out (data.table)."
             )
     labels, chosen = _markers(named, path, planar)
     turns = _quaternions(turned, labels, path)
@@ -413,6 +413,16 @@ def _read_vicon(rows: Rows, path: Path) -> RawRecording:
     values, lines = _numbers(filled, at + 5, [0, *chosen], width, path)
     frames, _ = _frames(values[:, 0], False, lines, path)
     return RawRecording(_positions(frames, values[:, 1:]), labels, unit.pop(), _number("".join(rows[at + 1][:1])))
+
+
+def _of_marker(name: str, names: Sequence[str]) -> tuple[str, str]:
+    """Returns label and axis in the name of a column, as in tip.x, or as in tip x, tip_x and tip X beside tip Y."""
+    label, _, axis = name.rpartition(".")
+    if not label and (found := re.fullmatch(r"(.+)[ _]([xyzXYZ])", name)):
+        beside = {other[-1:].lower() for other in names if other[:-1] == name[:-1]}
+        if len(beside & {*_AXES}) > 1:
+            label, axis = found[1], found[2]
+    return label, axis.lower()
 
 
 def _markers(named: Iterable[tuple[str, str, int]], path: Path, planar: bool = False) -> tuple[list[str], list[int]]:

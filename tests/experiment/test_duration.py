@@ -30,8 +30,8 @@ def test_a_sentence_says_how_long_and_what_helps():
     own = Estimate({"identify": 50.0, "evaluate": 5.0}, ["plan_resphys"], 1234)
     assert own.sentence(["a coarser mesh"]) == ""
     text = own.sentence(["a coarser mesh", "fewer trials"], times=2.0)
-    assert text.startswith("about 1:50 more (minutes and seconds) for 1,234 vertices, without plan_resphys")
-    assert "identify 1:40" in text
+    assert text.startswith("about 1 min 50 s more for 1,234 vertices, without plan_resphys")
+    assert "identify 1 min 40 s" in text
     assert text.endswith("shorter with a coarser mesh, fewer trials.")
 
 

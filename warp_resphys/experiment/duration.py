@@ -17,12 +17,12 @@ import torch
 
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, number_of
-from ..io.progress import clock
 from ..io.stages import Stage
 from ..learning.parameters import configured_parameters, split_name
 from ..learning.reconstruction import make_reconstructor
 from ..learning.replay import Replay, Start
 from ..learning.training import Samples, SequenceTrainer, Trainer
+from ..report.page import duration_text
 from ..settings.learning import RangeSettings
 from ..settings.stages import (
     EvaluateStage,
@@ -44,7 +44,7 @@ from .prediction_intervals import INTERVAL_MODELS
 from .trials import evenly
 
 LEAST_SECONDS: Final = 60.0  # of the estimates that are shown
-_CALLS, _MEASURED = 3, 1.0  # calls that are timed, and seconds after which no further one begins
+_CALLS, _MEASURED = 3, 0.5  # calls that are timed, and seconds after which no further one begins
 _MOST_TRIALS = 16  # that are simulated for the estimate
 _FALL, _SUPPORTED = 0.1, 0.2
 _EVALUATIONS = 0.5  # typical number of evaluations of a search, over the largest
@@ -81,12 +81,9 @@ class Estimate:
         if self.total * times < LEAST_SECONDS:
             return ""
         longest = sorted(self.seconds, key=lambda name: -self.seconds[name])[:_SHOWN]
-        parts = ", ".join(f"{name} {clock(times * self.seconds[name])}" for name in longest)
+        parts = ", ".join(f"{name} {duration_text(times * self.seconds[name])}" for name in longest)
         without = f", without {', '.join(self.without)}" if self.without else ""
-        return (
-            f"about {clock(times * self.total)} more (minutes and seconds) for {self.vertices:,} vertices{without} "
-            f"(longest: {parts}); shorter with {', '.join(remedies)}."
-        )
+        return f"about {duration_text(times * self.total)} more for {self.vertices:,} vertices{without} (longest: {parts}); shorter with {', '.join(remedies)}."
 
 
 def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
@@ -97,12 +94,13 @@ def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
         folder: of the split; its dataset exists.
     """
     seconds, without, vertices = dict[str, float](), list[str](), 0
+    known = dict[tuple[Any, ...], float]()
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
     for stage in stages:
         settings = stage.settings
         own = None
         if isinstance(settings, LearningStage):
-            pace = _Pace(Experiment(settings, folder, "count"))
+            pace = _Pace(Experiment(settings, folder, "count"), known)
             vertices = pace.experiment.body.n_vertices
             with contextlib.suppress(ConvergenceError):
                 own = pace.stage()
@@ -132,9 +130,11 @@ class _Pace:
 
     Attributes:
         experiment: of the settings of the stage.
+        known: durations that were measured for other stages [s].
     """
 
     experiment: Experiment
+    known: dict[tuple[Any, ...], float]
 
     def stage(self) -> float | None:
         """Duration of the stage [s]; None if it is unknown."""
@@ -204,7 +204,7 @@ class _Pace:
             steps = max(short.steps(start), 1)
             return lambda: [short.varied(start, parameters) for _ in range(max(_CALLS // steps, 1))]
 
-        return self._each(model, names, calls, together=_CALLS)
+        return self._each(model, names, calls, together=_CALLS, parameters=len(search))
 
     def _train(self, settings: TrainStage) -> float:
         training, model, split = settings.training, settings.model, settings.split
@@ -237,7 +237,12 @@ class _Pace:
         return _timed(trainer.run_epoch) * count / used
 
     def _each(
-        self, model: str, names: Sequence[str], calls: Callable[[Replay], Callable[[], Any]], together: int = 1
+        self,
+        model: str,
+        names: Sequence[str],
+        calls: Callable[[Replay], Callable[[], Any]],
+        together: int = 1,
+        parameters: int = 0,
     ) -> float:
         """Duration of the steps of trials [s].
 
@@ -246,15 +251,27 @@ class _Pace:
             names: of the trials.
             calls: returns a function of some trials, whose calls are timed.
             together: number of steps of a call.
+            parameters: number of parameters that a call differentiates by.
         """
         seconds, simulator = 0.0, self._simulator(model)
         for batch in self.experiment.batches(names):
             size = min(self.experiment.settings.batch or len(batch), len(batch))
             probed = batch[: min(size, _MOST_TRIALS)]
             replay = self.experiment.replay(simulator, probed)
-            steps = self._steps(simulator, batch)
-            seconds += _timed(calls(replay)) * len(batch) / len(probed) * (1 if replay.is_static else steps / together)
+            steps = 1.0 if replay.is_static else self._steps(simulator, batch) / together
+            same = (calls.__name__, parameters, repr(simulator), simulator.integrator, replay.is_static)
+            seconds += self._a_call(same, len(probed), lambda: calls(replay)) * len(batch) / len(probed) * steps
         return seconds
+
+    def _a_call(self, same: tuple[Any, ...], trials: int, make: Callable[[], Callable[[], Any]]) -> float:
+        """Duration of a call for some trials [s]; slow ones are measured for one number of trials alone."""
+        slow = {n: t for (*key, n), t in self.known.items() if tuple(key) == same and t > _MEASURED}
+        if (*same, trials) not in self.known and slow:
+            most = max(slow)
+            return slow[most] * trials / most
+        if (*same, trials) not in self.known:
+            self.known[*same, trials] = _timed(make())
+        return self.known[*same, trials]
 
     def _simulator(self, model: str) -> Simulator:
         """Simulator of a model, without a law, which is not identified yet."""

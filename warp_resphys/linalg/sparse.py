@@ -10,6 +10,7 @@ import torch
 from typing_extensions import override
 
 from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
+from .quiet import without_warnings_of_cholmod
 
 _COLUMNS = 128  # most right-hand sides per call of CHOLMOD on a GPU
 
@@ -53,7 +54,8 @@ class SparseSolver(LinearSolver):
     def _cholmod(self, cholespy: Any, number: int, entries: torch.Tensor) -> Any:
         i, j = (torch.as_tensor(x, dtype=torch.int32, device=self.device) for x in (self._rows, self._cols))
         try:
-            return cholespy.CholeskySolverD(self.n, i, j, entries.detach().double(), cholespy.MatrixType.COO)
+            with without_warnings_of_cholmod():
+                return cholespy.CholeskySolverD(self.n, i, j, entries.detach().double(), cholespy.MatrixType.COO)
         except (ValueError, RuntimeError):
             return None
 

@@ -1,0 +1,45 @@
+"""CHOLMOD's warnings of matrices that are not positive definite do not reach the user."""
+
+import os
+from threading import Barrier, Thread
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys.linalg.quiet import without_warnings_of_cholmod
+from warp_resphys.linalg.sparse import SparseSolver
+
+
+def test_an_indefinite_matrix_prints_nothing(capfd):
+    """The factorisation fails as before, and other output of the process is kept."""
+    pytest.importorskip("cholespy")
+    solver = SparseSolver(np.array([0]), np.array([0]), 1, 3, torch.device("cpu"), torch.float64)
+    values = torch.zeros(1, solver.n_values, dtype=torch.float64)
+    values[0, solver.address[0][[0, 4, 8]]] = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    os.write(1, b"before\n")
+    factor = solver.factor(values, definite=True)
+    print("after", flush=True)
+    assert capfd.readouterr().out == "before\nafter\n"
+    assert factor.failed.all()
+
+
+def test_output_is_restored_after_threads_that_overlap(capfd):
+    """Two threads begin before either ends; lines of others come at the end."""
+    both = Barrier(2)
+
+    def work(name: bytes) -> None:
+        with without_warnings_of_cholmod():
+            both.wait()
+            os.write(1, b"CHOLMOD warning: not positive definite\n" + name)
+            both.wait()
+
+    threads = [Thread(target=work, args=(name,)) for name in (b"one\n", b"two\n")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    print("three", flush=True)
+    lines = capfd.readouterr().out.splitlines()
+    assert sorted(lines[:2]) == ["one", "two"]
+    assert lines[2:] == ["three"]

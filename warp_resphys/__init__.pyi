@@ -51,6 +51,7 @@ from .io.errors import DataFileError as DataFileError
 from .io.errors import InputError as InputError
 from .io.errors import MeshError as MeshError
 from .io.errors import ResphysError as ResphysError
+from .io.errors import ResphysWarning as ResphysWarning
 from .learning.bounds import Bounds as Bounds
 from .learning.bounds import Prior as Prior
 from .learning.identification import Identification as Identification

@@ -1,12 +1,14 @@
 """What must never pass in silence: masks taken for indices, failures for results, settings that no longer hold."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics import statics
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.stepping.inputs import Inputs
@@ -14,6 +16,18 @@ from warp_resphys.stepping.inputs import Inputs
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
 RUBBER = Corotated(264e3, 0.45)
+
+
+def test_a_static_equilibrium_that_takes_long_shows_its_iterations(monkeypatch, capsys):
+    """Iterations and residual, in the error output; the callback of the potential is that of before afterwards."""
+    simulator = Simulator(CLAMPED, RUBBER)
+    simulator.static_equilibrium()
+    assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr(statics, "QUIET_SECONDS", 1e-9)
+    simulator.static_equilibrium(batch=2)
+    shown = capsys.readouterr().err
+    assert re.search(r"^static equilibrium: \d+/100 iterations at most, .* in 0:0\d, residual \S+e-\d+$", shown, re.M)
+    assert simulator.workspace(2).parts[0][1].potential.on_direction() is None
 
 
 @pytest.mark.parametrize("fixed", [MESH.vertices[:, 0] == 0.0, [0.7], "abc"])

@@ -297,6 +297,29 @@ class TestProgress:
         assert lines[1] == "evaluate: 11/101 frames, 1 frames/s, 1:30 left"
         assert lines[-1] == "evaluate: 41/101 frames, 1 frames/s, 1:00 left"
 
+    @pytest.mark.parametrize("terminal", [True, False])
+    def test_mostly_short_work_is_quiet_until_it_takes_long(self, clock, terminal):
+        for seconds, shown in ((0.5, False), (1.5, True)):
+            stream = io.StringIO()
+            console = Console(file=stream, force_terminal=terminal)
+            with Progress("equilibrium", 9, "iterations at most", console=console, after=2.0) as bar:
+                for _ in range(3):
+                    clock[0] += seconds
+                    bar.advance()
+            assert ("equilibrium" in stream.getvalue()) is shown
+        if not terminal:
+            assert stream.getvalue() == "equilibrium: 3/9 iterations at most, 1.5 s each, in 0:04\n"
+
+    def test_short_work_within_other_work_shows_nothing(self, clock):
+        outer, inner = io.StringIO(), io.StringIO()
+        with Progress("identify", 2, "evaluations at most", console=Console(file=outer)) as bar:
+            with Progress("equilibrium", 9, "iterations", console=Console(file=inner), after=2.0) as part:
+                clock[0] += 30.0
+                part.advance()
+            bar.advance()
+        assert inner.getvalue() == ""
+        assert outer.getvalue() != ""
+
     def test_slow_units_and_interruption(self, clock):
         stream = io.StringIO()
 

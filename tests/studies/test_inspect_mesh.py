@@ -3,6 +3,7 @@ import re
 import meshio
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
 
 from support.command_line import outcome, refusal, settings_of
@@ -10,7 +11,7 @@ from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, name_surfaces
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.cavities import open_cavities
-from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic, select_vertices
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from warp_resphys.studies.inspection import Inspection
@@ -238,3 +239,23 @@ def test_commands_end_with_one_sentence(folder, command, arguments, message):
     sentence = refusal(*command.split(), *arguments)
     assert sentence.startswith(message)
     assert sentence.count("\n") == 1
+
+
+def test_a_file_of_a_surface_is_filled(tmp_path):
+    """An STL is inspected by its name alone, in mm, as by mesh=surface; the size of its cells may be given."""
+    gmsh = pytest.importorskip("gmsh")
+    assert gmsh
+    trimesh.creation.box((40.0, 20.0, 10.0)).export(tmp_path / "box.stl")
+    settings = settings_of(Inspection, "inspect", f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01")
+    assert (settings.mesh.kind, settings.mesh.units, settings.mesh.size) == ("surface", "mm", 0.01)
+    rows = inspected(f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01")
+    assert rows["cells"].endswith("tetrahedron10")
+    assert rows["volume"] == "8.0 cm3"
+
+
+def test_a_place_without_vertices_proposes_a_range():
+    """The range lies within the mesh, and finds vertices."""
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (20, 2, 2))
+    with pytest.raises(MeshError, match=r"give a range for a face that is not flat, as in x=\[0, 0\.01\]"):
+        select_vertices(mesh, x=-0.2)
+    assert len(select_vertices(mesh, x=(0.0, 0.01)))

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -83,7 +84,8 @@ class Estimate:
         longest = sorted(self.seconds, key=lambda name: -self.seconds[name])[:_SHOWN]
         parts = ", ".join(f"{name} {duration_text(times * self.seconds[name])}" for name in longest)
         without = f", without {', '.join(self.without)}" if self.without else ""
-        return f"about {duration_text(times * self.total)} more for {self.vertices:,} vertices{without} (longest: {parts}); shorter with {', '.join(remedies)}."
+        took = f"about {duration_text(times * self.total)} more for {self.vertices:,} vertices"
+        return f"{took}{without} (longest: {parts}); shorter with {', '.join(remedies)}."
 
 
 def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
@@ -260,7 +262,7 @@ class _Pace:
             replay = self.experiment.replay(simulator, probed)
             steps = 1.0 if replay.is_static else self._steps(simulator, batch) / together
             same = (calls.__name__, parameters, repr(simulator), simulator.integrator, replay.is_static)
-            seconds += self._a_call(same, len(probed), lambda: calls(replay)) * len(batch) / len(probed) * steps
+            seconds += self._a_call(same, len(probed), partial(calls, replay)) * len(batch) / len(probed) * steps
         return seconds
 
     def _a_call(self, same: tuple[Any, ...], trials: int, make: Callable[[], Callable[[], Any]]) -> float:

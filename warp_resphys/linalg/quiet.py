@@ -26,7 +26,7 @@ class _Redirection:
             self._count += 1
             if self._count == 1:
                 _flush()
-                self._file, self._before = tempfile.TemporaryFile(), os.dup(_STDOUT)
+                self._file, self._before = tempfile.TemporaryFile(), os.dup(_STDOUT)  # noqa: SIM115
                 os.dup2(self._file.fileno(), _STDOUT)
 
     def end(self) -> None:

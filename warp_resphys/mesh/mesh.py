@@ -316,7 +316,12 @@ def select_vertices(
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         axes = [axis for axis, at in zip("xyz", (x, y, z), strict=True) if at is not None]
         there = ", ".join(f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}" for axis in axes)
-        raise MeshError(f"no vertex lies within {tolerance:g} m of {place} m: the mesh reaches {there} m")
+        raise MeshError(
+            f"no vertex lies within {tolerance:g} m of {place} m: the mesh reaches {there} m; give a range for a face "
+            f"that is not flat, as in {axes[0]}=[{low['xyz'.index(axes[0])]:.3g}, "
+            f"{low['xyz'.index(axes[0])] + 0.1 * float(np.ptp(mesh.vertices[:, 'xyz'.index(axes[0])])):.3g}], or a "
+            "larger tolerance"
+        )
     return chosen
 
 

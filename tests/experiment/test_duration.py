@@ -4,7 +4,7 @@ import logging
 
 from support.configured import settings
 from warp_resphys.experiment import duration
-from warp_resphys.experiment.duration import Estimate, estimate, remedies
+from warp_resphys.experiment.duration import ExpectedDuration, estimate, remedies
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.stages import run_stages, unfinished
 from warp_resphys.pipeline import acquire, learning_stages, run_experiment
@@ -27,7 +27,7 @@ def test_an_estimate_grows_with_the_work(tmp_path):
 
 def test_a_sentence_says_how_long_and_what_helps():
     """Folds multiply the duration; a short run says nothing."""
-    own = Estimate({"identify": 50.0, "evaluate": 5.0}, ["plan_resphys"], 1234)
+    own = ExpectedDuration({"identify": 50.0, "evaluate": 5.0}, ["plan_resphys"], 1234)
     assert own.sentence(["a coarser mesh"]) == ""
     text = own.sentence(["a coarser mesh", "fewer trials"], times=2.0)
     assert text.startswith("about 1 min 50 s more for 1,234 vertices, without plan_resphys")

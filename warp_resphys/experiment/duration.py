@@ -1,4 +1,4 @@
-"""Estimate of the time that a run takes: a few steps of its simulators on its trials, times the steps of its stages.
+"""The expected duration of a run: a few steps of its simulators on its trials, times the steps of its stages.
 
 The bodies move as fast as if they had fallen a tenth of their length. Forces are reconstructed that support a fifth of
 their weight, and networks are trained for an epoch on random samples. Reports, laws of materials, other bodies and
@@ -54,7 +54,7 @@ _SHOWN = 3  # stages
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ExpectedDuration:
     """Expected duration of the stages of one split.
 
     Attributes:
@@ -88,7 +88,7 @@ class Estimate:
         return f"{took}{without} (longest: {parts}); shorter with {', '.join(remedies)}."
 
 
-def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
+def estimate(stages: Sequence[Stage], folder: Path) -> ExpectedDuration:
     """Measures a few steps and returns the expected duration of stages of one split.
 
     Args:
@@ -110,7 +110,7 @@ def estimate(stages: Sequence[Stage], folder: Path) -> Estimate:
             seconds[stage.name] = own
         elif not isinstance(settings, ReportStage):
             without.append(stage.name)
-    return Estimate(seconds, without, vertices)
+    return ExpectedDuration(seconds, without, vertices)
 
 
 def remedies(stages: Sequence[Stage], quick: bool) -> list[str]:

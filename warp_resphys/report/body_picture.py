@@ -60,7 +60,7 @@ class MeshSummary:
 
 @in_style()
 def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:
-    """Draw a body from outside, cut open along its length, and translucent, with chambers and tendons in colours.
+    """Draw a body from outside and cut open; and translucent, with chambers and tendons in colours, if it has any.
 
     Args:
         path: The PNG file to write.
@@ -88,7 +88,8 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     ]
     labels += [name.replace("_", " ") for name in summary.tendons]
     handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
-    width, height = 3 * size[0] / _DPI, size[1] / _DPI
+    titles = ["Outside", "Cut open", summary.inside][: len(views)]
+    width, height = len(views) * size[0] / _DPI, size[1] / _DPI
     columns = max(1, int(width / _ENTRY))
     legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0
     total = height + legend + _LINE
@@ -96,8 +97,8 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     panel = figure.add_axes((0.0, legend / total, 1.0, height / total))
     panel.imshow(picture, aspect="auto", interpolation="antialiased")
     panel.set_axis_off()
-    for at, title in enumerate(("Outside", "Cut open", summary.inside)):
-        figure.text((at + 0.5) / 3, 1.0, title, ha="center", va="top")
+    for at, title in enumerate(titles):
+        figure.text((at + 0.5) / len(titles), 1.0, title, ha="center", va="top")
     if handles:
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
     with atomic_path(path) as target:
@@ -105,7 +106,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
-    """Layers of the body from outside, of its half behind a plane along it, and of chambers in the translucent body.
+    """Layers of the body from outside, of its half behind a plane along it, and of what is in the translucent body.
 
     Args:
         summary: The body.
@@ -149,4 +150,4 @@ def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list
         *routes,
         *dots,
     ]
-    return [outside, cut, translucent]
+    return [outside, cut, *([translucent] if chambers or routes or dots else [])]

@@ -2,6 +2,8 @@
 
 import logging
 
+import pytest
+
 from support.configured import settings
 from warp_resphys.experiment import duration
 from warp_resphys.experiment.duration import ExpectedDuration, estimate, remedies
@@ -12,17 +14,25 @@ from warp_resphys.pipeline import acquire, learning_stages, run_experiment
 TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "timing=false", "trainer.epochs=2")
 
 
-def test_an_estimate_grows_with_the_work(tmp_path):
-    """Twice the epochs double the training, and all stages with an estimate are positive; the report has none."""
+def test_an_estimate_is_the_time_of_a_step_by_their_number(tmp_path, monkeypatch):
+    """Where every call takes 0.1 s: that for a step of reconstruction, and for the roll-outs of two models."""
+    monkeypatch.setattr(duration, "_timed", lambda call: (call(), 0.1)[1])
     parts = {}
-    for epochs in (20, 40):
-        run = settings(*TINY, f"trainer.epochs={epochs}", f"trainer.rollout_every={epochs}")
-        _, acquired = acquire(run, tmp_path)
-        parts[epochs] = estimate(learning_stages(run, split_of(run), ".", acquired), tmp_path)
-    assert all(seconds > 0.0 for own in parts.values() for seconds in own.seconds.values())
-    assert parts[20].seconds.keys() == {"reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
-    assert not parts[20].without
-    assert parts[40].seconds["train_resphys"] > 1.2 * parts[20].seconds["train_resphys"]
+    for steps, epochs in ((6, 20), (12, 20), (6, 40)):
+        folder = tmp_path / f"{steps}_{epochs}"
+        run = settings(*TINY, f"data.steps={steps}", f"trainer.epochs={epochs}", f"trainer.rollout_every={epochs}")
+        _, acquired = acquire(run, folder)
+        parts[steps, epochs] = estimate(learning_stages(run, split_of(run), ".", acquired), folder)
+    own = parts[6, 20].seconds
+    assert own.keys() == {"reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
+    assert not parts[6, 20].without
+    assert own["reconstruct_resphys"] == pytest.approx(0.6)
+    assert own["evaluate"] == pytest.approx(2 * 0.6)
+    longer, trained = parts[12, 20].seconds, parts[6, 40].seconds
+    assert longer["reconstruct_resphys"] == pytest.approx(1.2)
+    assert longer["evaluate"] == pytest.approx(2 * 1.2)
+    assert trained["train_simfree"] == pytest.approx(2.0 * own["train_simfree"])
+    assert trained["train_resphys"] - own["train_resphys"] == pytest.approx(own["train_simfree"])
 
 
 def test_a_sentence_says_how_long_and_what_helps():

@@ -229,7 +229,7 @@ def abandon_search(progress: SolverProgress, tolerances: Tolerances, clamped: wp
         progress.phase[b] = FAILED
     elif progress.factorisations[b] == 0:
         progress.request[b] = FACTOR
-    elif clamped[b] and progress.since_factor[b] <= 1:
+    elif clamped[b]:
         progress.phase[b] = FAILED
     else:
         progress.request[b] = CLAMPED_FACTOR

@@ -1,6 +1,7 @@
 """The table of linear solvers by size."""
 
 import pytest
+import trimesh
 
 from support.command_line import outcome, refusal
 from warp_resphys.io.files import read_json
@@ -26,6 +27,28 @@ def test_a_case_that_takes_too_long_leaves_out_the_larger_ones(folder):
     assert ended.out.count("more than 0.2 s") == 1
     assert "2 x 1 x 1" in ended.out
     assert "4 x 1 x 1" not in ended.out
+
+
+def test_a_surface_is_filled_with_cells_of_given_edges(folder):
+    pytest.importorskip("gmsh")
+    trimesh.creation.icosphere(3, 50.0).export(folder / "ball.stl")
+    ball = [
+        f"surface={folder / 'ball.stl'}",
+        "lengths=[0.05,0.03]",
+        "elements=[tetrahedron4]",
+        "poissons_ratios=[0.45]",
+    ]
+    ended = outcome("benchmark", "sizes", *ball, "linear_solvers=[multigrid]", "repeats=1")
+    (written,) = folder.rglob("size_study.json")
+    coarse, fine = read_json(written)["rows"]
+    assert 0 < coarse["unknowns"] < fine["unknowns"]
+    assert "30 mm" in ended.out
+
+
+def test_a_surface_without_lengths_or_of_hexahedra_is_refused(folder):
+    surface = ("benchmark", "sizes", "surface=ball.stl")
+    assert "given lengths" in refusal(*surface, "elements=[tetrahedron4]")
+    assert "given lengths" in refusal(*surface, "elements=[hexahedron8]", "lengths=[0.01]")
 
 
 def test_a_solver_that_is_not_there(folder):

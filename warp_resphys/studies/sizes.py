@@ -11,27 +11,33 @@ import numpy as np
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
+from ..fem.body import Body
+from ..io.errors import InputError
 from ..io.files import write_json
 from ..io.machine import hardware
 from ..io.memory import peak_memory_gib
 from ..io.progress import Progress
-from ..io.settings import Natural, Positive, Settings, Some, Word, parse, setting
+from ..io.settings import Many, Natural, Positive, Settings, Some, Word, parse, setting
 from ..linalg.choice import LinearSolverName
+from ..mesh.tetrahedra import fill_surface
+from ..settings.mesh import LengthUnit
 from .beam import BeamStudy, Divisions, beam_mesh, clamped
 from .tables import Sheet, show
 from .timing import TimedRollout, run_in_new_process
 
 FIGURES: Final = ("forward_s", "adjoint_s", "memory_gib")
 _FITTED: Final = 3  # largest sizes that exponents are fitted to
-Element = Literal["hexahedron8", "tetrahedron10"]
+_HELD: Final = 0.05  # of the length of a body in a surface along x, from its smallest x
+Element = Literal["hexahedron8", "tetrahedron4", "tetrahedron10"]
 
 
 class SizeCase(Settings):
-    """A beam and a linear solver."""
+    """A body and a linear solver; a box by its divisions, the inside of a surface by the length of edges."""
 
     element: Element
     poissons_ratio: float
-    divisions: Divisions
+    divisions: Divisions | None = None
+    length: Positive | None = setting(None, unit="m")
     linear_solver: LinearSolverName
 
 
@@ -41,6 +47,9 @@ class SizeStudy(BeamStudy):
     elements: Some[Element]
     hexahedron_divisions: Some[Divisions]
     tetrahedron_divisions: Some[Divisions]
+    surface: Word | None
+    units: LengthUnit
+    lengths: Many[Positive] = setting(unit="m")
     linear_solvers: Some[LinearSolverName]
     time_step: Positive = setting(unit="s")
     steps: Natural
@@ -49,15 +58,37 @@ class SizeStudy(BeamStudy):
     device: Word
 
     def cases(self) -> list[SizeCase]:
-        """All cases, of each element, Poisson's ratio and solver in the order of size."""
-        divisions = {"hexahedron8": self.hexahedron_divisions, "tetrahedron10": self.tetrahedron_divisions}
+        """All cases, of each element, Poisson's ratio and solver in the order of size.
+
+        Raises:
+            InputError: a surface and hexahedra, or no lengths for a surface.
+        """
+        if self.surface is not None and ("hexahedron8" in self.elements or not self.lengths):
+            raise InputError("a surface is filled with tetrahedra of given lengths: set elements and lengths.")
+        boxes = {"hexahedron8": self.hexahedron_divisions}
+        sizes: dict[str, list[dict[str, Any]]] = {
+            element: [{"length": length} for length in self.lengths]
+            if self.surface is not None
+            else [{"divisions": counts} for counts in boxes.get(element, self.tetrahedron_divisions)]
+            for element in self.elements
+        }
         return [
-            SizeCase(element=element, poissons_ratio=ratio, divisions=counts, linear_solver=solver)
+            SizeCase.model_validate({"element": element, "poissons_ratio": ratio, "linear_solver": solver, **size})
             for element in self.elements
             for ratio in self.poissons_ratios
-            for counts in divisions[element]
+            for size in sizes[element]
             for solver in self.linear_solvers
         ]
+
+    def body(self, case: SizeCase) -> Body:
+        """The body of a case, fixed at the smallest x."""
+        if self.surface is None or case.length is None:
+            assert case.divisions is not None
+            return clamped(beam_mesh(case.element, self.size, case.divisions))
+        order = 1 if case.element == "tetrahedron4" else 2
+        mesh = fill_surface(self.surface, case.length, self.units, order)
+        x = mesh.vertices[:, 0]
+        return Body(mesh, fixed=np.flatnonzero(x <= x.min() + _HELD * np.ptp(x)))
 
 
 class SizeTask(Settings):
@@ -93,7 +124,6 @@ def size_study(study: SizeStudy, folder: Path) -> None:
         for ratio in study.poissons_ratios:
             same = [row for row in rows if row["element"] == element and row["poissons_ratio"] == ratio]
             powers = {name: fit.values() for name, fit in exponents(same).items()}
-            powers = {name: fit.values() for name, fit in exponents(same).items()}
             fits = [f"{name} {', '.join(f'{power:.2f}' for power in fit)}" for name, fit in powers.items()]
             show(
                 _table(f"{element}, nu {ratio:g}, steps of {1e3 * study.time_step:g} ms", same),
@@ -111,7 +141,7 @@ def measure(values: dict[str, Any]) -> dict[str, Any]:
     """
     task = parse(SizeTask, values)
     study, case = task.study, task.case
-    body = clamped(beam_mesh(case.element, study.size, case.divisions))
+    body = study.body(case)
     solver = SolverSettings(relative_tolerance=study.relative_tolerance, linear_solver=case.linear_solver)
     material = Corotated(study.youngs_modulus, case.poissons_ratio)
     simulator = Simulator(body, material, study.time_step, solver=solver, device=study.device)
@@ -132,15 +162,20 @@ def measure(values: dict[str, Any]) -> dict[str, Any]:
 
 def _table(title: str, rows: Sequence[Mapping[str, Any]]) -> Sheet:
     columns = (
-        "divisions {divisions} | linear solver {linear_solver} | unknowns {unknowns} | forward [s] {forward_s:.4g} | "
+        "size {size} | linear solver {linear_solver} | unknowns {unknowns} | forward [s] {forward_s:.4g} | "
         "adjoint [s] {adjoint_s:.4g} | memory [GiB] {memory_gib:.2f} | iterations {iterations:.1f} | "
         "factorisations {factorisations:.1f}"
     )
-    rows = [{**row, "divisions": " x ".join(map(str, row["divisions"]))} for row in rows]
+    rows = [{**row, "size": _size(row)} for row in rows]
     measured = Sheet.of(title, columns, [row for row in rows if "failed" not in row])
     lines = iter(measured.rows)
-    failed = [row.get("failed") and [row["divisions"], row["linear_solver"], row["failed"], *[""] * 5] for row in rows]
+    failed = [row.get("failed") and [row["size"], row["linear_solver"], row["failed"], *[""] * 5] for row in rows]
     return replace(measured, rows=[line or next(lines) for line in failed])
+
+
+def _size(row: Mapping[str, Any]) -> str:
+    """Divisions of a box, or edges in a surface, in words."""
+    return " x ".join(map(str, row["divisions"])) if row["divisions"] else f"{1e3 * row['length']:g} mm"
 
 
 def exponents(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:

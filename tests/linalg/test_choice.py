@@ -62,6 +62,7 @@ def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
     body = (rows, cols, len(at), 3, CPU, torch.float64, at.astype(float))
     expected = PardisoSolver if has_pardiso() else BandedSolver
     assert isinstance(make_linear_solver("auto", *body), expected)
+    assert isinstance(make_linear_solver("auto", *body, keeps=False), BandedSolver)
     monkeypatch.setattr("warp_resphys.linalg.choice.has_pardiso", lambda: False)
     assert isinstance(make_linear_solver("auto", *body), BandedSolver)
     with pytest.raises(InputError, match="pip install mkl"):

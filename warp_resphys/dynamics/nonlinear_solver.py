@@ -125,7 +125,7 @@ class NonlinearSolver:
         factors = torch.float32 if settings.factors == "single" else dtype
         self.hessian: HessianApproximation
         kind = settings.linear_solver
-        where = (potential.device, factors, pattern.positions, potential.has_pairs)
+        where = (potential.device, factors, pattern.positions, potential.has_pairs, settings.name != "newton")
         if settings.name == "projective_dynamics":
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
             self.hessian = ProjectiveHessian(potential, pattern, linear)

@@ -44,10 +44,12 @@ def make_linear_solver(
     dtype: torch.dtype,
     positions: NDArray[np.float64] | None = None,
     direct: bool = False,
+    keeps: bool = True,
 ) -> LinearSolver:
     """Returns the named solver; ``auto`` selects the cheapest for the pattern and the device.
 
-    With `direct` it selects none that iterates, which would be dear for many right-hand sides of a factor.
+    With `direct` it selects none that iterates, which would be dear for many right-hand sides of a factor; and without
+    `keeps`, for a new factor at every iterate, multigrid rather than Pardiso.
 
     Raises:
         InputError: an unknown name, a solver of CPUs on a GPU, or one that is not installed.
@@ -61,7 +63,7 @@ def make_linear_solver(
             "linear_solver=pardiso needs the package mkl, for x86 processors: pip install mkl, or take auto."
         )
     if name == "auto":
-        name = _cheapest(rows, cols, n_nodes, block, device)
+        name = _cheapest(rows, cols, n_nodes, block, device, keeps or direct)
         name = "sparse" if direct and name == "multigrid" else name
     solvers: dict[str, Callable[..., LinearSolver]] = {
         "banded": BandedSolver,
@@ -75,7 +77,7 @@ def make_linear_solver(
     return solvers[name](rows, cols, n_nodes, block, device, dtype, positions)
 
 
-def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device) -> str:
+def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device, keeps: bool) -> str:
     """Returns the name of the cheapest solver by memory and operations.
 
     A band of width w takes n w numbers and n w^2 operations, a border of m unknowns 4 n w m more, each of which takes
@@ -90,7 +92,7 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
             rest = block * bandwidth(*banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border))
             costs["bordered"] = unknowns * rest * (rest + BORDER_FLOPS * block * len(border))
         name = min(costs, key=lambda solver: costs[solver])
-        pardiso = unknowns <= MAX_PARDISO_UNKNOWNS and has_pardiso()
+        pardiso = keeps and unknowns <= MAX_PARDISO_UNKNOWNS and has_pardiso()
         compact = costs[name] > max(MAX_SMALL_FLOPS, COMPACT * unknowns**2) and pardiso
         if costs[name] <= MAX_BANDED_FLOPS and not compact:
             return name

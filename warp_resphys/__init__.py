@@ -18,10 +18,11 @@ _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _MODULES = {name: module for module, name in re.findall(r"^from \.([\w.]+) import \w+ as (\w+)$", _STUB, re.MULTILINE)}
 
 __all__ = sorted(_MODULES)
-__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
@@ -29,3 +30,13 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+def _version() -> str:
+    """The installed version; 0+unknown for a copy of the repository without an installation."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("warp-resphys")
+    except PackageNotFoundError:
+        return "0+unknown"

@@ -1,10 +1,7 @@
-"""The book has every public name and every tutorial, and all say the same version; building it is a step of its own."""
+"""The book has every public name and every tutorial; building it is a step of its own."""
 
 import re
-import tomllib
 from pathlib import Path
-
-import pytest
 
 import warp_resphys
 
@@ -54,14 +51,3 @@ def test_what_the_theory_names_is_in_the_code():
         assert (REPOSITORY / "warp_resphys").joinpath(*name.split(".")).with_suffix(".py").is_file(), name
     for path in kernels:
         assert (REPOSITORY / path).is_file(), path
-
-
-@pytest.mark.parametrize(
-    ("file", "pattern"),
-    [("CITATION.cff", r"^version: (.+)$"), ("CHANGELOG.md", r"^## (?:Unreleased \()?([\d.]+)")],
-)
-def test_there_is_one_version(file, pattern):
-    with open(REPOSITORY / "pyproject.toml", "rb") as settings:
-        version = tomllib.load(settings)["project"]["version"]
-    assert warp_resphys.__version__ == version
-    assert re.search(pattern, (REPOSITORY / file).read_text(encoding="utf-8"), flags=re.MULTILINE)[1] == version

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
+import tomllib
 import zipfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,17 +21,20 @@ from support.main_job import IN_RUN, TINY
 REPOSITORY = Path(__file__).parents[1]
 
 
+VERSION = "9.8.7"  # of the wheel, which is built from a copy without git
+
+
 def can_build():
-    """Whether setuptools is installed, and new enough to build the wheel."""
+    """Whether what builds the wheel is installed: setuptools-scm, and a setuptools that is new enough."""
     try:
-        return int(version("setuptools").partition(".")[0]) >= 77
+        return int(version("setuptools").partition(".")[0]) >= 77 and bool(version("setuptools-scm"))
     except PackageNotFoundError:
         return False
 
 
 pytestmark = pytest.mark.skipif(
     not can_build(),
-    reason="building the wheel without a network takes setuptools 77 or newer: pip install -U setuptools",
+    reason="building the wheel takes setuptools 77 and setuptools-scm: pip install -U setuptools setuptools-scm",
 )
 
 
@@ -50,15 +55,23 @@ def call(*command, folder, **environment):
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """The wheel, built from a copy, so that no build folder is left in the repository."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+def source(tmp_path_factory):
+    """A copy of what the package is built from, so that no build folder is left in the repository."""
+    source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, source)
     for name in ("warp_resphys", "kernels", "conf"):
         shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return source
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory):
+    """The wheel."""
+    target = tmp_path_factory.mktemp("wheel")
     offline = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--disable-pip-version-check")
-    call(sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", target, source, folder=target)
+    build = (sys.executable, "-m", "pip", "wheel", *offline, "--wheel-dir", target, source)
+    call(*build, folder=target, SETUPTOOLS_SCM_PRETEND_VERSION_FOR_WARP_RESPHYS=VERSION)
     (built,) = target.glob("*.whl")
     return built
 
@@ -90,6 +103,17 @@ def test_the_wheel_holds_every_module_and_configuration(wheel):
     assert any(name.endswith("LICENSE") for name in metadata)
 
 
+def test_the_source_archive_holds_kernels_and_configurations_and_a_fallback_version(source, tmp_path):
+    build = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
+    call(sys.executable, "-c", build, tmp_path, folder=source)
+    with open(REPOSITORY / "pyproject.toml", "rb") as settings:
+        expected = tomllib.load(settings)["tool"]["setuptools_scm"]["fallback_version"]
+    with tarfile.open(tmp_path / f"warp_resphys-{expected}.tar.gz") as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    for folder, suffix in (("warp_resphys", "py"), ("kernels", "py"), ("conf", "yaml")):
+        assert {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / folder).rglob(f"*.{suffix}")} <= names
+
+
 def test_the_main_job_runs_from_an_empty_folder(installed, tmp_path):
     where = call(installed / "python", "-c", "import warp_resphys; print(warp_resphys.__file__)", folder=tmp_path)
     assert Path(where.strip()).is_relative_to(installed.parent)
@@ -98,8 +122,12 @@ def test_the_main_job_runs_from_an_empty_folder(installed, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["errors_mm"]["resphys"]["mean"] < 0.1 * metrics["errors_mm"]["simulation"]["mean"]
-    assert metrics["versions"]["warp-resphys"] == version("warp-resphys")
+    assert metrics["versions"]["warp-resphys"] == VERSION
     assert (tmp_path / "run" / "report.html").stat().st_size > 100_000
+
+
+def test_the_version_is_that_of_the_wheel(installed, tmp_path):
+    assert call(installed / "warp-resphys", "--version", folder=tmp_path) == f"warp-resphys {VERSION}\n"
 
 
 def test_every_command_says_what_it_does_and_what_it_takes(installed, tmp_path):

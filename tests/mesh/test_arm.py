@@ -6,6 +6,7 @@ from math import pi
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from support.configured import composed
 from warp_resphys.experiment.build import build_mesh
@@ -58,7 +59,7 @@ def sopra_silicone():
         areas = [
             lobes(radii[i] + t * (radii[i + 1] - radii[i]), inner[i] + t * (inner[i + 1] - inner[i])) for t in heights
         ]
-        total += 0.120 * np.trapezoid(areas, heights)
+        total += 0.120 * trapezoid(areas, heights)
     return total - sum(sopra_chambers())
 
 
@@ -68,7 +69,7 @@ def lobes(radius, inner):
     angle = np.linspace(-pi / 3.0, pi / 3.0, 2001)
     d = radius - outer
     reach = d * np.cos(angle) + np.sqrt(outer**2 - (d * np.sin(angle)) ** 2)
-    return 3.0 * np.trapezoid(0.5 * reach**2, angle)
+    return 3.0 * trapezoid(0.5 * reach**2, angle)
 
 
 def polygons(section, size):

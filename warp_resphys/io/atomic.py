@@ -51,8 +51,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _sync(path: Path) -> None:
-    """Waits until the file or folder has reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Waits until the file or folder has reached the disk; Windows has no such order for folders."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -1,12 +1,16 @@
 """Peak memory of a process and its workers, and available memory."""
 
 import re
-import resource
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+try:
+    import resource
+except ModuleNotFoundError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 
 @dataclass
@@ -21,10 +25,12 @@ class WorkersMemory:
 
 
 def peak_memory_gib() -> float:
-    """Peak resident memory of this process [GiB]."""
+    """Peak resident memory of this process [GiB]; 0 on Windows, which is not asked."""
     # Unlike getrusage, without the memory of the parent process.
     if peaks := _kibibytes("/proc/self/status", "VmHWM"):
         return peaks[0] / 2**20
+    if resource is None:
+        return 0.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 

@@ -30,7 +30,9 @@ def ends_where_nobody_reads() -> Iterator[None]:
 
 
 def _is_unread(stream: TextIO) -> bool:
-    """Whether the stream is a pipe without a reader."""
+    """Whether the stream is a pipe without a reader; False on Windows, which cannot tell."""
+    if not hasattr(select, "poll"):
+        return False
     poll = select.poll()
     poll.register(stream, 0)
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))

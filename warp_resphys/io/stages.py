@@ -6,7 +6,6 @@ and of those of all stages upstream.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
@@ -19,6 +18,8 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from .atomic import digest
 from .entry_points import check_packages
@@ -294,26 +295,28 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
     path = Path(run_dir) / ".lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a")
+        path.open("a").close()
     except OSError as error:
         raise DataFileError(
             f"cannot write the run folder {run_dir} ({error.strerror}): make it writable or choose another one"
         ) from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            if not wait:
-                raise InputError(
-                    f"another process is writing the run folder {run_dir}: wait for it or choose another one"
-                ) from error
-            log.info("waiting for another process that is writing the run folder %s", run_dir)
-            fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError as error:
-            raise DataFileError(
-                f"cannot lock the run folder {run_dir} ({error.strerror}): choose one on another disk"
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        if not wait:
+            raise InputError(
+                f"another process is writing the run folder {run_dir}: wait for it or choose another one"
             ) from error
+        log.info("waiting for another process that is writing the run folder %s", run_dir)
+        lock.acquire()
+    except (OSError, NotImplementedError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise DataFileError(f"cannot lock the run folder {run_dir} ({reason}): choose one on another disk") from error
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def package_versions() -> dict[str, str]:

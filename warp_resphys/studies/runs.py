@@ -240,8 +240,14 @@ def execute(run: Run, log_file: Path, follow: Callable[[str], None]) -> str | No
 
 
 def _stop(child: "subprocess.Popen[str]") -> str:
-    """Interrupts a run as Ctrl-C does, kills it if it does not end in time, and returns the rest of stderr."""
-    child.send_signal(signal.SIGINT)
+    """Interrupts a run as Ctrl-C does, kills it if it does not end in time, and returns the rest of stderr.
+
+    Windows has no such signal: there, the run ends at once, and resumes from its last checkpoint.
+    """
+    if os.name == "nt":
+        child.terminate()
+    else:
+        child.send_signal(signal.SIGINT)
     try:
         return child.communicate(timeout=_PATIENCE)[1]
     except subprocess.TimeoutExpired:

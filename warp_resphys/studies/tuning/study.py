@@ -21,7 +21,7 @@ import optuna
 from filelock import FileLock, Timeout
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock, JournalFileSymlinkLock
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from ...io.errors import DataFileError, InputError
@@ -83,7 +83,8 @@ class Study:
                 journal.touch()
                 content = journal.read_bytes()
                 os.truncate(journal, content.rfind(b"\n") + 1)  # drops a line that was cut off by a full disk
-                storage = JournalStorage(JournalFileBackend(str(journal)))
+                guard = JournalFileOpenLock if os.name == "nt" else JournalFileSymlinkLock  # links take rights there
+                storage = JournalStorage(JournalFileBackend(str(journal), guard(str(journal))))
                 exists = _NAME in optuna.get_all_study_names(storage)  # creating it again would write to the journal
                 self._study = (optuna.load_study if exists else optuna.create_study)(study_name=_NAME, storage=storage)
         except OSError as error:

@@ -1,0 +1,103 @@
+"""Windows and macOS, imitated: modules and functions that Linux has alone are missing."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from warp_resphys.io import atomic, fan_out, memory, pipes
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.machine import available_cores, hardware
+from warp_resphys.io.stages import run_lock
+from warp_resphys.studies import runs
+
+UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
+
+
+def test_the_package_imports_without_the_modules_of_unix():
+    names = "atomic decoding fan_out files kernel_cache machine memory pipes resumable stages".split()
+    program = f"""
+import sys
+import filelock
+sys.modules.update(dict.fromkeys({UNIX_ALONE}))
+import importlib
+for name in {names}:
+    importlib.import_module("warp_resphys.io." + name)
+from warp_resphys.io.memory import available_memory_gib, peak_memory_gib
+print(available_memory_gib() > 0.0, peak_memory_gib() >= 0.0)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.stdout == "True True\n", done.stderr
+
+
+def test_memory_is_not_known_without_a_system_that_tells_it(monkeypatch):
+    monkeypatch.setattr(memory, "_kibibytes", lambda path, key: [])
+    assert memory.peak_memory_gib() > 0.01  # by getrusage, as on macOS
+    monkeypatch.setattr(memory, "resource", None)
+    assert memory.peak_memory_gib() == 0.0
+
+
+def test_cores_and_processor_without_linux(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr("warp_resphys.io.machine._CPU_INFO", Path("missing"))
+    assert available_cores() == os.cpu_count()
+    assert hardware()["processor"]
+
+
+def test_a_locked_run_folder_is_refused_by_filelock(tmp_path):
+    path = str(tmp_path / ".lock")
+    program = f"import filelock, time; lock = filelock.FileLock({path!r}); lock.acquire(); print(1, flush=True); "
+    with subprocess.Popen([sys.executable, "-c", program + "time.sleep(60)"], stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        with pytest.raises(InputError, match="another process is writing"), run_lock(tmp_path):
+            pass
+        other.kill()
+        other.wait()
+        with run_lock(tmp_path):
+            pass
+
+
+def test_files_are_written_where_folders_cannot_be_synchronised(tmp_path, monkeypatch):
+    opened = []
+    real = os.open
+
+    def refusing(path, flags, *more):
+        if os.path.isdir(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        opened.append(flags)
+        return real(path, flags, *more)
+
+    monkeypatch.setattr(atomic.os, "open", refusing)
+    monkeypatch.setattr(atomic.os, "name", "nt")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "file").write_text("content")
+    atomic._sync(folder / "file")
+    atomic._sync(folder)
+    assert opened == [os.O_RDWR]
+
+
+def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
+    monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
+    with fan_out._interrupts_blocked():
+        pass
+
+
+def test_pipes_are_not_taken_for_unread_where_that_is_not_known(monkeypatch):
+    monkeypatch.delattr(pipes.select, "poll", raising=False)
+    with pytest.raises(BrokenPipeError), pipes.ends_where_nobody_reads():
+        raise BrokenPipeError
+
+
+def test_a_run_is_ended_where_it_cannot_be_interrupted(monkeypatch):
+    program = "import time; print('ready', flush=True); time.sleep(60)"
+    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", program], **pipe) as child:
+        child.stdout.readline()
+        monkeypatch.setattr(runs.os, "name", "nt")
+        monkeypatch.setattr(child, "send_signal", lambda number: pytest.fail("there is no such signal"))
+        monkeypatch.setattr(child, "terminate", lambda: os.kill(child.pid, signal.SIGTERM))
+        assert runs._stop(child) == ""

@@ -18,7 +18,18 @@ UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
 
 def test_the_package_imports_without_the_modules_of_unix():
-    names = "atomic decoding fan_out files kernel_cache machine memory pipes resumable stages".split()
+    names = [
+        "atomic",
+        "decoding",
+        "fan_out",
+        "files",
+        "kernel_cache",
+        "machine",
+        "memory",
+        "pipes",
+        "resumable",
+        "stages",
+    ]
     program = f"""
 import sys
 import filelock

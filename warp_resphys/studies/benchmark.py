@@ -33,6 +33,7 @@ from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.obstacles import ContactSettings, ObstacleSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
+from .benchmark_history import record, write_record
 from .run_speed import command_sheet, environment_sheet, time_commands, time_environments
 from .runs import Results, made
 from .tables import Sheet, show
@@ -115,6 +116,7 @@ class BenchmarkSettings(Settings):
     environments: TimedRun
     control: TimedRun
     results: Word | None
+    record: Word | None = None
 
     def batches_of(self, solver: str, refinement: int, device: str) -> list[int]:
         """Batch sizes with which a solver is timed."""
@@ -199,6 +201,8 @@ def benchmark(settings: BenchmarkRun, folder: Path) -> None:
     made_by = made("benchmark", ("benchmark.environments.run", "benchmark.control.run"))
     results = Results("Benchmark", date, verdict, [*(sheet.for_page() for sheet in sheets), made_by])
     results.write(folder / PAGE, settings.benchmark.results, f"{date}-benchmark-{device}")
+    if settings.benchmark.record is not None:
+        print(f"Record: {write_record(Path(settings.benchmark.record), record(result, machine(result)))}")
 
 
 def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:

@@ -170,6 +170,17 @@ def test_linters_find_nothing(tool, files):
     assert checked.returncode == 0, checked.stdout
 
 
+def test_the_paper_cites_what_exists_and_numbers_that_the_documentation_has():
+    paper, entries = text("paper/paper.md"), re.findall(r"^@\w+\{(\w+),$", text("paper/paper.bib"), flags=re.MULTILINE)
+    assert set(re.findall(r"@(\w+)[\];. ]", paper)) == set(entries)
+    sources = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
+    documented = "".join(path.read_text(encoding="utf-8") for path in sources)
+    measured = paper.partition("# What has been measured")[2].partition("# Limits")[0]
+    numbers = set(re.findall(r"\d+\.\d+|\d+,\d{3}", measured))
+    assert len(numbers) > 15
+    assert {number for number in numbers if number not in documented} == set()
+
+
 def test_fragments_have_a_valid_name_and_one_entry():
     types = "|".join(entry["directory"] for entry in PROJECT["tool"]["towncrier"]["type"])
     for path in (REPOSITORY / "changes").iterdir():

@@ -53,8 +53,8 @@ def test_histories_are_quotients_by_machine_and_date(tmp_path):
         ("2026-01-01", "A (R) 7", 3.0),
         ("2026-01-01", "B", 7.0),
     ):
-        write_record(tmp_path, record(result(date, forward_ms=forward), machine))
-    write_record(tmp_path, record(result("2026-03-01", contact=True), "B"))
+        write_record(tmp_path, record(result(date, forward_ms=forward), machine, ["seed=1"]))
+    write_record(tmp_path, record(result("2026-03-01", contact=True), "B", []))
     assert (tmp_path / "2026-02-01-a-r-7.json").is_file()
     records = read_records(tmp_path)
     case = "newton, nu 0.45, 24 unknowns, batch 1"
@@ -65,6 +65,7 @@ def test_histories_are_quotients_by_machine_and_date(tmp_path):
     page = history_page(records, "picture.png")
     assert f"| {case} | 1.00 | 1.50 |" in page
     assert f"| {case}, on a floor |  | 0.75 |" in page
+    assert "2026-02-01: `warp-resphys benchmark seed=1`" in page
     lines = [line for axes in history_figure(records).axes for line in axes.lines]
     assert [list(line.get_ydata()) for line in lines] == [[1.0, 1.5], [2.0], [0.75]]
 

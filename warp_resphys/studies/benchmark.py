@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from pydantic import Field
 
 from ..dynamics.assembly import HessianAssembly
@@ -202,7 +203,8 @@ def benchmark(settings: BenchmarkRun, folder: Path) -> None:
     results = Results("Benchmark", date, verdict, [*(sheet.for_page() for sheet in sheets), made_by])
     results.write(folder / PAGE, settings.benchmark.results, f"{date}-benchmark-{device}")
     if settings.benchmark.record is not None:
-        print(f"Record: {write_record(Path(settings.benchmark.record), record(result, machine(result)))}")
+        kept = record(result, machine(result), HydraConfig.get().overrides.task)
+        print(f"Record: {write_record(Path(settings.benchmark.record), kept)}")
 
 
 def run_benchmark(settings: BenchmarkRun) -> dict[str, Any]:

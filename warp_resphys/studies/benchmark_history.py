@@ -7,8 +7,10 @@ dates.
 """
 
 import re
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +23,18 @@ from ..report.figures import in_style, save_png
 
 _CASE: Final = ("solver", "model", "poissons_ratio", "refinement", "unknowns", "batch", "contact")
 _TIMES: Final = ("plain_ms", "forward_ms", "backward_ms")  # of a step of the whole batch
-_KEYS: Final = {"date", "commit", "device", "dtype", "machine", "hardware", "versions", "yardstick_ms", "cases"}
+_KEYS: Final = {
+    "date",
+    "commit",
+    "device",
+    "dtype",
+    "machine",
+    "hardware",
+    "versions",
+    "command",
+    "yardstick_ms",
+    "cases",
+}
 _HEAD: Final = """# History of the benchmark
 
 Times of a step with gradients, forward and backward, in yardsticks: a product and a Cholesky factor of 480 x 480
@@ -35,12 +48,13 @@ python -m warp_resphys.studies.benchmark_history docs/results/benchmarks docs/be
 """
 
 
-def record(result: Mapping[str, Any], machine: str) -> dict[str, Any]:
+def record(result: Mapping[str, Any], machine: str, overrides: Sequence[str]) -> dict[str, Any]:
     """The part of a result of `studies.benchmark.run_benchmark` that is kept.
 
     Args:
         result: the content of benchmark.json.
         machine: the name of the GPU or processor that was measured.
+        overrides: settings of the command line.
     """
     return {
         "date": result["date"],
@@ -50,6 +64,7 @@ def record(result: Mapping[str, Any], machine: str) -> dict[str, Any]:
         "machine": machine,
         "hardware": result["hardware"],
         "versions": result["versions"],
+        "command": shlex.join(["warp-resphys", "benchmark", *overrides]),
         "yardstick_ms": result["yardstick_ms"],
         "cases": [{key: row[key] for key in (*_CASE, "repeats", *_TIMES)} for row in result["steps"]],
     }
@@ -96,16 +111,17 @@ def history_page(records: Sequence[Mapping[str, Any]], picture: str) -> str:
     """The page of the history in Markdown: a picture, and for every machine a table of cases by date."""
     parts = [_HEAD, f"![Forward and backward time in yardsticks, by date]({picture})\n"]
     for machine, cases in histories(records).items():
-        dates = sorted({date for values in cases.values() for date in values})
+        dates = sorted({day for values in cases.values() for day in values})
         own = [entry for entry in records if f"{entry['machine']}, {entry['dtype']}" == machine]
         parts.append(f"## {machine}\n\n| case | {' | '.join(dates)} |\n|---|{'---|' * len(dates)}")
         for name, values in cases.items():
-            cells = (f"{values[date]:.2f}" if date in values else "" for date in dates)
+            cells = (f"{values[day]:.2f}" if day in values else "" for day in dates)
             parts.append(f"| {name} | {' | '.join(cells)} |")
         latest = {entry["date"][:10]: entry for entry in own}
-        yardsticks = (f"{latest[date]['yardstick_ms']:.2f}" for date in dates)
+        yardsticks = (f"{latest[day]['yardstick_ms']:.2f}" for day in dates)
         parts.append(f"| yardstick [ms] | {' | '.join(yardsticks)} |")
-        parts.append(f"| commit | {' | '.join(latest[date]['commit'] for date in dates)} |\n")
+        parts.append(f"| commit | {' | '.join(latest[day]['commit'] for day in dates)} |\n")
+        parts += [f"{day}: `{latest[day]['command']}`\n" for day in dates]
     return "\n".join(parts)
 
 
@@ -115,8 +131,11 @@ def history_figure(records: Sequence[Mapping[str, Any]]) -> Figure:
     with in_style():
         figure = Figure(figsize=(7.0, 3.2 * len(shown)), layout="constrained")
         for axes, (machine, cases) in zip(figure.subplots(len(shown), squeeze=False)[:, 0], shown.items(), strict=True):
-            for name, values in cases.items():
-                axes.plot(list(values), list(values.values()), marker="o", label=name)
+            for number, (name, values) in enumerate(cases.items()):
+                days = [date.fromisoformat(day) for day in values]
+                axes.plot(days, list(values.values()), marker="osD^v"[number // 10 % 5], label=name)
+            days = sorted({date.fromisoformat(day) for values in cases.values() for day in values})
+            axes.set_xticks(days, [f"{day}" for day in days])
             axes.set(yscale="log", title=machine, ylabel="time / yardstick")
             axes.legend(fontsize="xx-small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

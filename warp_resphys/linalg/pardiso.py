@@ -147,9 +147,10 @@ class _Memory:
     def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray, definite: bool) -> None:
         self._pattern, self._kind = pattern, _KINDS[definite]
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
-        # Own options; METIS; solutions overwrite; pivots; scaling; matching; two-level threads; precision; from zero.
-        options = {0: 1, 1: 2, 5: 1, 9: 8, 10: not definite, 12: not definite, 23: definite}
-        for place, value in {**options, 27: values.dtype == np.float32, 34: 1}.items():
+        # Own options; METIS; solutions overwrite; pivots; scaling; matching; precision; from zero. Threads on two
+        # levels (23) gave wrong factors without an error up to oneMKL 2026.0, where one replaced another.
+        options = {0: 1, 1: 2, 5: 1, 9: 8, 10: not definite, 12: not definite, 27: values.dtype == np.float32, 34: 1}
+        for place, value in options.items():
             self._options[place] = value
         self.call(_ANALYSIS, values)
 

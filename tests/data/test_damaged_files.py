@@ -2,7 +2,6 @@
 
 import contextlib
 import multiprocessing
-import resource
 import time
 import tracemalloc
 import warnings
@@ -21,6 +20,7 @@ from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.mesh.mesh import box_tetrahedra
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
 
+resource = pytest.importorskip("resource", reason="this system cannot limit a process")
 FRAMES = np.arange(12)
 POSITIONS = 0.1 * np.random.default_rng(0).normal(size=(12, 3, 3)).cumsum(axis=0)  # [m]
 

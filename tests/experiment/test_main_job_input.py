@@ -2,7 +2,6 @@
 
 import os
 import re
-import resource
 import shutil
 from pathlib import Path
 
@@ -13,6 +12,8 @@ import pytest
 
 from support.main_job import IN_RUN, SHORT, STAGES, TINY, errors, files, ran, run, same_errors
 from warp_resphys import box_hexahedra
+
+resource = pytest.importorskip("resource", reason="this system cannot limit a process")
 
 
 class TestBadInput:

@@ -4,6 +4,7 @@ Building it runs the tutorials; those that have not changed since the last build
 """
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ from sphinx.application import Sphinx
 import warp_resphys
 
 _REPOSITORY = Path(__file__).parents[1]
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
 
 project = "warp_resphys"
-author = "the authors of warp_resphys"
+_LICENSE = (_REPOSITORY / "LICENSE").read_text(encoding="utf-8")
+copyright = re.search(r"^Copyright \(c\) (.+)$", _LICENSE, re.MULTILINE)[1]
+author = copyright.partition(" ")[2]
 version = release = warp_resphys.__version__
 
 extensions = [
@@ -24,9 +28,11 @@ extensions = [
     "sphinx-mathjax-offline",
     "sphinx_copybutton",
     "myst_nb",
+    "notebooks",
+    "signatures",
 ]
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
-exclude_patterns = ["conf.py", "examples"]
+exclude_patterns = ["conf.py", "examples", "extensions"]
 nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
 
 html_theme = "furo"
@@ -50,6 +56,9 @@ nb_output_stderr = "remove"  # Warp says there that it found no GPU; an error st
 
 autodoc_default_options = {"members": True}
 add_module_names = False
+maximum_signature_line_length = 60  # a longer signature has one parameter a line
+python_trailing_comma_in_multi_line_signatures = False
+python_display_short_literal_types = True
 autodoc_inherit_docstrings = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

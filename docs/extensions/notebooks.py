@@ -1,0 +1,36 @@
+"""Tutorials as notebooks: next to the page of each tutorial its notebook, with a link below the title."""
+
+from pathlib import Path
+from typing import Any
+
+import jupytext
+from sphinx.application import Sphinx
+
+
+def tutorials(app: Sphinx) -> list[Path]:
+    """Returns the files of the tutorials that are programs."""
+    return sorted(Path(app.srcdir, "tutorials").glob("*.py"))
+
+
+def write_notebooks(app: Sphinx, error: Exception | None) -> None:
+    """Writes the notebooks into the book, without outputs."""
+    if error is None and app.builder.format == "html":
+        for path in tutorials(app):
+            target = Path(app.outdir, "tutorials", path.stem).with_suffix(".ipynb")
+            target.parent.mkdir(exist_ok=True)
+            jupytext.write(jupytext.read(path, fmt="py:percent"), target)
+
+
+def link_notebook(app: Sphinx, page: str, _template: str, context: dict[str, Any], _doctree: Any) -> None:
+    """Adds the link to the notebook below the title of a tutorial."""
+    for path in tutorials(app):
+        if page == f"tutorials/{path.stem}" and "body" in context:
+            link = f'<p class="notebook"><a href="{path.stem}.ipynb" download>Download this page as a notebook</a></p>'
+            context["body"] = context["body"].replace("</h1>", f"</h1>\n{link}", 1)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Called by Sphinx."""
+    app.connect("build-finished", write_notebooks)
+    app.connect("html-page-context", link_notebook)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

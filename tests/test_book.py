@@ -1,7 +1,10 @@
 """The book has every public name and every tutorial; building it is a step of its own."""
 
 import re
+import runpy
 from pathlib import Path
+
+import pytest
 
 import warp_resphys
 
@@ -51,3 +54,71 @@ def test_what_the_theory_names_is_in_the_code():
         assert (REPOSITORY / "warp_resphys").joinpath(*name.split(".")).with_suffix(".py").is_file(), name
     for path in kernels:
         assert (REPOSITORY / path).is_file(), path
+
+
+LONGEST = 120  # characters of a line of code that fit the column at 1280 px
+
+
+def test_no_line_of_code_is_longer_than_the_column():
+    long = []
+    for page in DOCS.rglob("*.md"):
+        blocks = re.findall(r"^ *```.*?\n(.*?)^ *```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        long += [(page.name, line) for block in blocks for line in block.splitlines() if len(line) > LONGEST]
+    for program in DOCS.glob("tutorials/*.py"):
+        lines = program.read_text(encoding="utf-8").splitlines()
+        long += [(program.name, line) for line in lines if len(line) > LONGEST and not line.startswith("# ")]
+    assert long == []
+    style = (DOCS / "style" / "book.css").read_text(encoding="utf-8")
+    font = float(re.search(r"\.highlight pre \{ font-size: ([\d.]+)rem", style)[1])
+    column = float(re.search(r"min-width: 80em\) \{\s+\.content \{\s+width: (\d+)em", style)[1])
+    assert LONGEST * 0.6002 * font + 2.0 < column  # a character is 0.6 of its size wide; padding and border
+
+
+def test_the_index_begins_with_what_a_first_program_uses():
+    index = (DOCS / "api" / "index.md").read_text(encoding="utf-8")
+    names = re.findall(r"\{py:obj\}`(\w+) <", index)
+    first = [names.index(name) for name in ("Mesh", "Body", "Corotated", "Simulator", "Tendons", "Robot", "Quantity")]
+    assert first == sorted(first)
+    assert first[0] == 0
+    assert len(names) == len(set(names))
+
+
+def test_the_copyright_has_the_name_and_year_of_the_license():
+    pytest.importorskip("sphinx")
+    (line,) = re.findall(r"Copyright \(c\) (.+)", (REPOSITORY / "LICENSE").read_text(encoding="utf-8"))
+    assert runpy.run_path(str(DOCS / "conf.py"))["copyright"] == line
+
+
+def test_signatures_have_short_types_and_fields_their_comments():
+    pytest.importorskip("sphinx")
+    extension = runpy.run_path(str(DOCS / "extensions" / "signatures.py"))
+    long = "~numpy.ndarray[tuple[~typing.Any, ...], ~numpy.dtype[~numpy.float64]]"
+    written = f"(a: {long} | ~torch.Tensor, b: dict = <factory>, c: ~x.y.Z = <function f.<lambda>>, d: torch.dtype)"
+    assert extension["shorten"](written) == (
+        "(a: NDArray[float64] | Tensor, b: dict = <factory>, c: Z = ..., d: torch.dtype)"
+    )
+    parameters, _ = extension["readable"](
+        None, "class", "", warp_resphys.Mesh, None, "(regions: dict = <factory>)", None
+    )
+    assert parameters == "(regions: dict = {})"
+    source = "class A:\n    x: int  # [m]\n    # of the\n    # body\n    y: int = 1\n    z: str = '#'\n"
+    assert extension["field_comments"](source) == {"x": "[m]", "y": "of the body"}
+
+
+def test_every_tutorial_is_a_notebook_with_a_link():
+    pytest.importorskip("sphinx")
+    pytest.importorskip("jupytext")
+    extension = runpy.run_path(str(DOCS / "extensions" / "notebooks.py"))
+
+    class Application:
+        srcdir = DOCS
+
+    context = {"body": "<h1>A finger</h1>"}
+    extension["link_notebook"](Application, "tutorials/finger", "", context, None)
+    assert 'href="finger.ipynb"' in context["body"]
+    unlinked = {"body": "<h1>GPU</h1>"}
+    extension["link_notebook"](Application, "tutorials/gpu", "", unlinked, None)
+    assert unlinked == {"body": "<h1>GPU</h1>"}
+    assert [path.name for path in extension["tutorials"](Application)] == sorted(
+        path.name for path in DOCS.glob("tutorials/*.py")
+    )

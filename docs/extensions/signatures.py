@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import inspect
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,13 +91,15 @@ def hide_numbered_fields(
     return True if str(getattr(described, "__doc__", "")).startswith("Alias for field number") else None
 
 
-def public_first(_app: Sphinx) -> None:
-    """Puts the public names of a module before its other names."""
-    for name, module in warp_resphys._MODULES.items():
-        analyzer = ModuleAnalyzer.for_module(f"warp_resphys.{module}")
+def public_first(app: Sphinx) -> None:
+    """Puts the public names of a module before its other names, in the order of the index."""
+    index = Path(app.srcdir, "api", "index.md").read_text(encoding="utf-8")
+    names = re.findall(r"\{py:obj\}`(\w+) <", index)
+    for place, name in enumerate(names):
+        analyzer = ModuleAnalyzer.for_module(f"warp_resphys.{warp_resphys._MODULES[name]}")
         analyzer.analyze()
         if name in analyzer.tagorder:
-            analyzer.tagorder[name] -= 1_000_000
+            analyzer.tagorder[name] = place - len(names)
 
 
 class ShortProperty(PyProperty):

@@ -367,7 +367,7 @@ _OWN = {"my_robot", "my_tentacle", "my_arm", "--cfg"}  # experiments that the re
 def documented():
     """Every command line with arguments in the documentation and in the help, without comments."""
     commands_found = set()
-    patterns = ("*.md", "docs/*.md", "docs/tutorials/*.md", "conf/**/*.yaml")
+    patterns = ("*.md", "docs/*.md", "docs/bring_your_robot/*.md", "docs/tutorials/*.md", "conf/**/*.yaml")
     for path in [path for pattern in patterns for path in REPOSITORY.glob(pattern)]:
         text = re.sub(r"\\\n *", "", path.read_text(encoding="utf-8"))
         lines = re.findall(r"^[# ]*warp-resphys (.*)$|`warp-resphys ([^`]*)`", text, flags=re.MULTILINE)

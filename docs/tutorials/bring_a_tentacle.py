@@ -10,7 +10,7 @@
 #
 # A tapered silicone rod hangs from its base, pulled by two tendons. It was recorded at rest, in one pose after
 # another, with markers without names. The mesh is generated from the rod's dimensions.
-# [The guide](../bring_your_robot.md#a-second-robot-tendons-poses-and-markers-without-names) explains how to adapt this.
+# [The guide](../bring_your_robot/tentacle.md) explains how to adapt this.
 #
 # ## Poses
 #

@@ -47,7 +47,7 @@ real = simulator(stiff=350e3, soft=90e3)
 print(", ".join(name for name in real.parameters if "modulus" in name or "cap" in name))
 
 # %% [markdown]
-# The beam is let go from straight and swings down. The markers are seen with noise of 0.1 mm.
+# The straight beam is released and swings down. The markers have noise of 0.1 mm.
 
 # %%
 places = [[0.1, 0.0, 0.03], [0.1, 0.03, 0.03], [0.095, 0.015, 0.03]]  # at rest, m
@@ -65,11 +65,11 @@ for name, value in identified.parameters.items():
     print(f"{name}: {value / 1e3:.1f} kPa, standard deviation {deviation[name] / 1e3:.1f} kPa")
 
 # %% [markdown]
-# ## What a second modulus is worth
+# ## The value of a second modulus
 #
-# A simpler model has one modulus. On the markers it comes close: how far the tip sags and how
-# fast it swings fix two numbers, and a mean modulus gives nearly both. Where no marker sits it is wrong. So the models
-# are compared on the whole body, which only a simulated robot shows:
+# A simpler model has one modulus. At the markers it comes close: the sag of the tip and the period of its swing are two
+# numbers, and a mean modulus reproduces both almost. Elsewhere it is wrong. The models are therefore compared on the
+# whole body, which is known for a simulated robot only:
 
 # %%
 rubber = wr.Corotated(200e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
@@ -129,10 +129,10 @@ print(
 # In an experiment, regions, rigid parts, further meshes, glue and materials are YAML, as in
 # [`experiment=beam_regions`](../simulator.md).
 #
-# ## What to take from this
+# ## Summary
 #
-# Both moduli come back within two per cent from three markers on the cap; on the whole body one modulus is dozens of
-# times further off than two.
+# Both moduli are recovered to within two per cent from three markers on the cap; on the whole body, the error with one
+# modulus is dozens of times that with two.
 
 # %%
 wanted = {"stiff_youngs_modulus": 350e3, "soft_youngs_modulus": 90e3}

@@ -575,16 +575,22 @@ class TestCommand:
         )
 
 
-TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
+TUTORIAL = [ROOT / "docs" / "bring_your_robot" / f"{page}.md" for page in ("mesh", "first_run", "tentacle")]
+
+
+def tutorial_blocks():
+    """Languages and texts of the code blocks of the guide, in its order."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in TUTORIAL)
+    return re.findall(r"```(\w*)\n(.*?)```", text, flags=re.DOTALL)
 
 
 def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     """Its mesh, its configuration and its output, on the recordings that it was written with."""
-    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    blocks = tutorial_blocks()
     (mesh,), (written, _) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
     log, _ = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
     monkeypatch.chdir(tmp_path)
-    exec(compile(mesh, TUTORIAL.name, "exec"), {})
+    exec(compile(mesh, TUTORIAL[0].name, "exec"), {})
     (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
     place = tmp_path / "configs" / "experiment" / "my_robot.yaml"
     place.parent.mkdir(parents=True)
@@ -600,7 +606,7 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
 
 
 def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
-    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    blocks = tutorial_blocks()
     _, written = [text for kind, text in blocks if kind == "yaml"]
     _, log = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
     monkeypatch.chdir(tmp_path)

@@ -41,10 +41,12 @@ def shorten(text: str) -> str:
     return _FUNCTION.sub("...", _QUALIFIED.sub("", _PRIVATE.sub(".", text)))
 
 
-def readable(_app: Sphinx, _what: str, _name: str, described: Any, _options: Any, parameters: Any, result: Any) -> Any:
+def readable(_app: Sphinx, what: str, _name: str, described: Any, _options: Any, parameters: Any, result: Any) -> Any:
     """Returns the parameters and the result of a signature, shortened; default factories become calls."""
     if parameters is None:
         return None
+    if what == "class" and parameters == "(*args, **kwargs)":  # of a protocol
+        return "", result
     if dataclasses.is_dataclass(described):
         for field in dataclasses.fields(described):
             if field.init and field.default_factory is not dataclasses.MISSING:

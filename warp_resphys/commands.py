@@ -63,7 +63,7 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             "studies.extension_list:list_extensions",
         ),
         "convert": Command(
-            "recordings, such as bags, MCAP files and exported tables, to HDF5 or CSV",
+            "recordings, such as bags, MCAP files and exported tables, to HDF5",
             "studies.conversion:convert",
             words="files",
         ),

@@ -21,7 +21,7 @@ from .energies.law_files import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
-from .experiment.duration import estimate, remedies
+from .experiment.duration import estimate, may_be_long, remedies
 from .experiment.evaluate import check_mesh, evaluate, time_models
 from .experiment.experiment import LEARNED
 from .experiment.files import (
@@ -351,7 +351,8 @@ def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: fl
         folder: of the split.
         times: factor of the duration, as of several folds.
     """
-    if not (left := unfinished(stages, folder)):
+    left = unfinished(stages, folder)
+    if not left or not may_be_long(left, folder):
         return
     if sentence := estimate(left, folder).sentence(remedies(left, run.budget == "quick"), times):
         log.info("%s", sentence)

@@ -6,7 +6,7 @@ import pytest
 
 from support.configured import settings
 from warp_resphys.experiment import duration
-from warp_resphys.experiment.duration import ExpectedDuration, estimate, remedies
+from warp_resphys.experiment.duration import ExpectedDuration, estimate, may_be_long, remedies
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.stages import run_stages, unfinished
 from warp_resphys.pipeline import acquire, learning_stages, run_experiment
@@ -56,6 +56,7 @@ def test_remedies_name_the_parameters_and_the_quick_budget():
 def test_a_run_announces_its_duration_before_the_first_stage(tmp_path, monkeypatch, caplog):
     """The line comes after the data are there and before any force is reconstructed; a repetition has none."""
     monkeypatch.setattr(duration, "LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(duration, "_SHORT", 0.0)
     run = settings(*TINY)
     with caplog.at_level(logging.INFO, logger="warp_resphys"):
         run_experiment(run, tmp_path)
@@ -67,6 +68,32 @@ def test_a_run_announces_its_duration_before_the_first_stage(tmp_path, monkeypat
     with caplog.at_level(logging.INFO, logger="warp_resphys"):
         run_experiment(run, tmp_path)
     assert not any(record.getMessage().startswith("about ") for record in caplog.records)
+
+
+def test_a_short_run_is_not_measured(tmp_path, monkeypatch):
+    """Few steps of a coarse beam take no time that is worth an estimate, many steps and identification do."""
+    run = settings(*TINY)
+    _, acquired = acquire(run, tmp_path)
+    stages = learning_stages(run, split_of(run), ".", acquired)
+    assert not may_be_long(stages, tmp_path)
+    monkeypatch.setattr(duration, "_SHORT", 1000.0)
+    assert may_be_long(stages, tmp_path)
+    identified = settings("experiment=beam_real")
+    assert may_be_long(learning_stages(identified, split_of(identified), ".", acquired), tmp_path)
+
+
+def test_an_estimate_that_fails_ends_no_run(tmp_path, monkeypatch):
+    """A stage whose steps cannot be measured has no estimate."""
+
+    def failing(call):
+        raise MemoryError
+
+    monkeypatch.setattr(duration, "_timed", failing)
+    run = settings(*TINY)
+    _, acquired = acquire(run, tmp_path)
+    expected = estimate(learning_stages(run, split_of(run), ".", acquired), tmp_path)
+    assert not expected.seconds
+    assert "reconstruct_resphys" in expected.without
 
 
 def test_finished_stages_are_not_estimated(tmp_path):

@@ -66,7 +66,11 @@ def test_a_matrix_far_from_the_last_one_gets_its_factor(solver, shift, monkeypat
 def test_a_first_matrix_needs_a_factor_and_a_singular_one_has_no_solution(solver):
     dense, values = matrix(4)
     np.testing.assert_allclose(solutions(solver.near(values)), np.linalg.solve(dense, RIGHT[0]), rtol=1e-9, atol=1e-12)
-    assert np.isnan(solutions(solver.near(torch.full_like(values, torch.nan)))).all()
+    singular = np.linalg.qr(dense)[0][:, :5]
+    for broken in (singular @ singular.T, np.full_like(dense, np.nan)):
+        values = torch.as_tensor(broken[np.triu_indices(NODES)])[None]
+        assert solver.factor(values, definite=False).failed.all()
+        assert np.isnan(solutions(solver.near(values))).all()
 
 
 def test_memory_is_given_back_with_the_solver(monkeypatch):

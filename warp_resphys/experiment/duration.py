@@ -5,7 +5,7 @@ their weight, and networks are trained for an epoch on random samples. Reports, 
 control have no estimate.
 """
 
-import contextlib
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ from typing import Any, Final
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..io.errors import ConvergenceError, number_of
+from ..io.errors import number_of
 from ..io.stages import Stage
 from ..learning.parameters import configured_parameters, split_name
 from ..learning.reconstruction import make_reconstructor
@@ -44,6 +44,8 @@ from .models import SIMFREE
 from .prediction_intervals import INTERVAL_MODELS
 from .trials import evenly
 
+log = logging.getLogger(__name__)
+
 LEAST_SECONDS: Final = 60.0  # of the estimates that are shown
 _CALLS, _MEASURED = 3, 0.5  # calls that are timed, and seconds after which no further one begins
 _MOST_TRIALS = 16  # that are simulated for the estimate
@@ -51,6 +53,7 @@ _FALL, _SUPPORTED = 0.1, 0.2
 _EVALUATIONS = 0.5  # typical number of evaluations of a search, over the largest
 _ITERATIONS = 1.3  # evaluations of the loss in an iteration of L-BFGS
 _SHOWN = 3  # stages
+_SHORT = 1e6  # steps times vertices of all reconstructed trials that take about a minute
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,25 @@ class ExpectedDuration:
         return f"{took}{without} (longest: {parts}); shorter with {', '.join(remedies)}."
 
 
+def may_be_long(stages: Sequence[Stage], folder: Path) -> bool:
+    """Whether stages may take over a minute: those that identify or refine, or reconstruct many steps.
+
+    Args:
+        stages: of one split.
+        folder: of the split; its dataset exists.
+    """
+    folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
+    work = 0.0
+    for settings in (stage.settings for stage in stages):
+        if isinstance(settings, IdentifyStage | RefineStage):
+            return True
+        if isinstance(settings, ReconstructStage):
+            experiment, names = Experiment(settings, folder, "count"), settings.reconstructed
+            steps = _Pace(experiment, {}).steps(experiment.simulator("simulation"), names)
+            work += steps * len(names) * experiment.body.n_vertices
+    return work > _SHORT
+
+
 def estimate(stages: Sequence[Stage], folder: Path) -> ExpectedDuration:
     """Measures a few steps and returns the expected duration of stages of one split.
 
@@ -97,15 +119,16 @@ def estimate(stages: Sequence[Stage], folder: Path) -> ExpectedDuration:
     """
     seconds, without, vertices = dict[str, float](), list[str](), 0
     known = dict[tuple[Any, ...], float]()
-    folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
     for stage in stages:
         settings = stage.settings
         own = None
         if isinstance(settings, LearningStage):
             pace = _Pace(Experiment(settings, folder, "count"), known)
             vertices = pace.experiment.body.n_vertices
-            with contextlib.suppress(ConvergenceError):
+            try:
                 own = pace.stage()
+            except Exception as error:  # An estimate never ends a run.
+                log.debug("%s has no estimate: %s", stage.name, error)
         if own is not None:
             seconds[stage.name] = own
         elif not isinstance(settings, ReportStage):
@@ -225,7 +248,7 @@ class _Pace:
         """Duration of an epoch of a network on the steps of the training trials [s]."""
         experiment, training = self.experiment, settings.training
         simulator = experiment.model_simulator(settings.model)
-        count = sum(self._steps(simulator, [name]) for name in settings.split.train)
+        count = sum(self.steps(simulator, [name]) for name in settings.split.train)
         rest = experiment.like.to(choose_device(settings.device), torch.float32)
         used = min(count, 4 * training.trainer.batch_size)
         q, v, force = (torch.randn(used, *rest.shape).to(rest) for _ in range(3))
@@ -260,7 +283,7 @@ class _Pace:
             size = min(self.experiment.settings.batch or len(batch), len(batch))
             probed = batch[: min(size, _MOST_TRIALS)]
             replay = self.experiment.replay(simulator, probed)
-            steps = 1.0 if replay.is_static else self._steps(simulator, batch) / together
+            steps = 1.0 if replay.is_static else self.steps(simulator, batch) / together
             same = (calls.__name__, parameters, repr(simulator), simulator.integrator, replay.is_static)
             seconds += self._a_call(same, len(probed), partial(calls, replay)) * len(batch) / len(probed) * steps
         return seconds
@@ -281,7 +304,7 @@ class _Pace:
         plain = kind in ("law", "identified") and self.experiment.settings.identified is None
         return self.experiment.simulator("simulation" if plain else kind)
 
-    def _steps(self, simulator: Simulator, names: Sequence[str]) -> int:
+    def steps(self, simulator: Simulator, names: Sequence[str]) -> int:
         """Number of steps of the longest trial; the end of the dataset for those that are read in part."""
         replay = self.experiment.trials(names)
         limit = float(replay.times.max())

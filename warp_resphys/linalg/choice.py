@@ -92,11 +92,10 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
             rest = block * bandwidth(*banded_rest(rows, cols, n_nodes, border)[:2], n_nodes - len(border))
             costs["bordered"] = unknowns * rest * (rest + BORDER_FLOPS * block * len(border))
         name = min(costs, key=lambda solver: costs[solver])
-        pardiso = keeps and unknowns <= MAX_PARDISO_UNKNOWNS and has_pardiso()
-        compact = costs[name] > max(MAX_SMALL_FLOPS, COMPACT * unknowns**2) and pardiso
-        if costs[name] <= MAX_BANDED_FLOPS and not compact:
-            return name
-        return "pardiso" if pardiso else "multigrid"
+        compact = costs[name] > max(MAX_SMALL_FLOPS, min(COMPACT * unknowns**2, MAX_BANDED_FLOPS))
+        if compact and keeps and unknowns <= MAX_PARDISO_UNKNOWNS and has_pardiso():
+            return "pardiso"
+        return name if costs[name] <= MAX_BANDED_FLOPS else "multigrid"
     if width + 2 * TILE <= min(unknowns // 2, MAX_TILED_BANDWIDTH):
         return "tiled"
     return "dense" if unknowns <= MAX_DENSE_UNKNOWNS else "sparse"

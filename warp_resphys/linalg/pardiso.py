@@ -17,6 +17,8 @@ from .conjugate_gradients import conjugate_gradients
 from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
 
 _ANALYSIS, _FACTOR, _SOLVE, _RELEASE = 11, 22, 33, -1  # phases
+_NO_MEMORY = -2  # error
+_PERTURBED = 13  # place of the number of pivots that were made larger
 _KINDS: Final = {True: 2, False: -2}  # of symmetric matrices: positive definite or not
 _EXACT = 1e-12  # relative accuracy of solutions by an earlier factor
 _MOST_ITERATIONS = 20  # after which a factor is cheaper
@@ -29,7 +31,8 @@ class PardisoSolver(LinearSolver):
     """Pardiso (Schenk and Gaertner 2004) of Intel's oneMKL, in an order by nested dissection.
 
     A factor costs as much as some fifty solutions, and the analysis of the pattern, made once, a third of it: factors
-    are kept for long, and `near` solves by conjugate gradients with an earlier one.
+    are kept for long, and `near` solves by conjugate gradients with an earlier one, so that the last digits of its
+    solutions depend on which one that is.
     """
 
     patience = 3
@@ -90,7 +93,7 @@ class _Room:
         if definite not in self._memories:
             self._memories[definite] = _Memory(self.pattern, system.values, definite)
         self._memory = self._memories[definite]
-        self.owner = system if self._memory.call(_FACTOR, system.values) == 0 else None
+        self.owner = system if self._memory.factorise(system.values) else None
         return self.owner is system
 
     def solve(self, rows: torch.Tensor) -> torch.Tensor:
@@ -158,8 +161,17 @@ class _Memory:
         if not sys.is_finalizing():
             self.call(_RELEASE)
 
+    def factorise(self, values: FloatArray) -> bool:
+        """Returns whether the matrix of values (n_values,) has a factor, without a pivot that was made larger."""
+        finite = np.isfinite(values.sum())  # It sees no NaN in an indefinite matrix.
+        return bool(finite and self.call(_FACTOR, values) == 0 and self._options[_PERTURBED] == 0)
+
     def call(self, phase: int, values: FloatArray | None = None, right: FloatArray | None = None) -> int:
         """Runs a phase on contiguous arrays, and returns Pardiso's error, zero for none.
+
+        Raises:
+            MemoryError: there is not enough memory.
+            RuntimeError: the phase failed, but for a matrix without a factor.
 
         Args:
             phase: its number.
@@ -180,6 +192,10 @@ class _Memory:
         matrix_arguments = (matrix, starts, columns, None, columns_of_rhs, options, silent)
         library.pardiso(internal, *head, *matrix_arguments, rhs, solution, ctypes.byref(error))
         library.MKL_Set_Num_Threads_Local(0)
+        if error.value == _NO_MEMORY:
+            raise MemoryError(f"a factor of {unknowns} unknowns needs more memory than there is: take larger cells.")
+        if error.value and phase != _FACTOR:
+            raise RuntimeError(f"Pardiso fails with error {error.value} in phase {phase}.")
         return error.value
 
 
@@ -199,6 +215,7 @@ def mkl() -> Any:
     return ctypes.CDLL(str(path.locate()))
 
 
+@cache
 def has_pardiso() -> bool:
     """Whether this machine has Pardiso."""
     try:

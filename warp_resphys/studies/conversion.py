@@ -48,7 +48,7 @@ def convert(settings: Conversion, folder: Path) -> None:
 
 def _recordings(files: Sequence[str]) -> Iterator[Path]:
     """Yields recordings, and those in folders that are no bags."""
-    for path in map(Path, files):
+    for path in (Path(name).expanduser() for name in files):
         if not path.is_dir() or is_bag(path):
             yield path
             continue

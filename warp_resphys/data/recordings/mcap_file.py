@@ -48,7 +48,9 @@ class JsonMessage:
         stamp = next((given[key] for key in ("stamp", "timestamp") if key in given), None) if given else None
         if isinstance(stamp, dict):
             rest = next((stamp[key] for key in ("nanosec", "nsec", "nanos", "nsecs") if key in stamp), 0)
-            return float(next((stamp[key] for key in ("sec", "seconds", "secs") if key in stamp), 0)) + 1e-9 * rest
+            return float(next((stamp[key] for key in ("sec", "seconds", "secs") if key in stamp), 0)) + 1e-9 * float(
+                rest
+            )
         return float(stamp) if isinstance(stamp, int | float) else np.nan
 
     def member(self, name: str | None) -> Any:

@@ -197,7 +197,7 @@ def _read_columns(
         )
     named, turned, units, channels = [], {}, set(), {}
     for number, (name, unit) in columns.items():
-        label, axis = _of_marker(name, [other for other, _ in columns.values()])
+        label, axis = _of_marker(name, unit, [other for other, _ in columns.values()])
         if number in clocks:
             continue
         if label and axis in _AXES:
@@ -415,12 +415,18 @@ def _read_vicon(rows: Rows, path: Path) -> RawRecording:
     return RawRecording(_positions(frames, values[:, 1:]), labels, unit.pop(), _number("".join(rows[at + 1][:1])))
 
 
-def _of_marker(name: str, names: Sequence[str]) -> tuple[str, str]:
-    """Returns label and axis in the name of a column, as in tip.x, or as in tip x, tip_x and tip X beside tip Y."""
+def _of_marker(name: str, unit: str | None, names: Sequence[str]) -> tuple[str, str]:
+    """Returns label and axis in the name of a column, as in tip.x, or as in tip_x or tip X if all three axes are there.
+
+    Args:
+        name: of the column.
+        unit: of the column; with one that is no length it is no coordinate but as in tip.x.
+        names: of all columns.
+    """
     label, _, axis = name.rpartition(".")
-    if not label and (found := re.fullmatch(r"(.+)[ _]([xyzXYZ])", name)):
+    if not label and unit in (None, *METRES_PER_UNIT) and (found := re.fullmatch(r"(.+)[ _]([xyzXYZ])", name)):
         beside = {other[-1:].lower() for other in names if other[:-1] == name[:-1]}
-        if len(beside & {*_AXES}) > 1:
+        if beside >= {*_AXES}:
             label, axis = found[1], found[2]
     return label, axis.lower()
 

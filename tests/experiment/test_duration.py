@@ -76,7 +76,7 @@ def test_a_short_run_is_not_measured(tmp_path, monkeypatch):
     _, acquired = acquire(run, tmp_path)
     stages = learning_stages(run, split_of(run), ".", acquired)
     assert not may_be_long(stages, tmp_path)
-    monkeypatch.setattr(duration, "_SHORT", 1000.0)
+    monkeypatch.setattr(duration, "_SHORT", 10.0)
     assert may_be_long(stages, tmp_path)
     identified = settings("experiment=beam_real")
     assert may_be_long(learning_stages(identified, split_of(identified), ".", acquired), tmp_path)

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from support.command_line import outcome, refusal
 from support.mcaps import write_json, write_ros
 from warp_resphys.data.recordings.bag import Bag
+from warp_resphys.data.recordings.mcap_file import JsonMessage
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.text import Table
 from warp_resphys.io.errors import DataFileError, InputError
@@ -47,6 +48,14 @@ def test_messages_in_json_are_read_by_paths_of_keys(tmp_path):
     arm = read.positions[:, read.labels.index("plate +x")] - read.positions[:, at[2]]
     np.testing.assert_allclose(arm, TURNS.apply([0.05, 0.0, 0.0]), atol=1e-9)
     np.testing.assert_allclose(read.actuation[:, 0], 1e6 * (TIMES - 100.0), atol=1e-3)
+
+
+@pytest.mark.parametrize("units", [1.0, 1e3, 1e6, 1e9], ids=["s", "ms", "us", "ns"])
+def test_a_number_is_the_time_since_1970_in_its_unit(units, tmp_path):
+    times = [JsonMessage("/robot", {"timestamp": moment * units}, tmp_path).stamp for moment in (1.7e9, 1.7e9 + 0.25)]
+    np.testing.assert_allclose(times, [1.7e9, 1.7e9 + 0.25], rtol=0.0, atol=1e-6)
+    text = {"timestamp": {"sec": "100", "nsec": "20000000"}}  # as protobuf writes whole numbers
+    assert JsonMessage("/robot", text, tmp_path).stamp == pytest.approx(100.02)
 
 
 def test_without_stamps_the_times_of_the_file_count(tmp_path):

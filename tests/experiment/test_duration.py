@@ -15,7 +15,7 @@ TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "timing=false"
 
 
 def test_an_estimate_is_the_time_of_a_step_by_their_number(tmp_path, monkeypatch):
-    """Where every call takes 0.1 s: that for a step of reconstruction, and for the roll-outs of two models."""
+    """Calls of 0.1 s give that for a step of reconstruction, and for a step of the roll-outs of two models."""
     monkeypatch.setattr(duration, "_timed", lambda call: (call(), 0.1)[1])
     parts = {}
     for steps, epochs in ((6, 20), (12, 20), (6, 40)):

@@ -20,11 +20,11 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
     """
     if model in MATERIALS:
         return MATERIALS[model].from_constants(constants)
-    found = extension("materials", model, MATERIALS, f"material model is {model!r}")
-    kind = found.load()
+    source = extension("materials", model, MATERIALS, f"material model is {model!r}")
+    kind = source.load()
     if not (isinstance(kind, type) and issubclass(kind, Material)):
-        raise InputError(f"{model} of the package {found} is {kind!r}: its entry point must name a Material.")
+        raise InputError(f"{model} of the package {source} is {kind!r}: its entry point must name a Material.")
     try:
         return kind.from_constants(constants)
     except InputError as error:
-        raise InputError(f"{model} of the package {found}: {error}") from error
+        raise InputError(f"{model} of the package {source}: {error}") from error

@@ -182,7 +182,7 @@ class LinearSolver(ABC):
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
         iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
-        patience: number of times as many iterations for which a factor is worth keeping, as with a banded one.
+        patience: number of iterations for which a factor is worth keeping, relative to a banded one.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 

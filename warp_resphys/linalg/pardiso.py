@@ -169,28 +169,27 @@ class _Memory:
     def call(self, phase: int, values: FloatArray | None = None, right: FloatArray | None = None) -> int:
         """Runs a phase on contiguous arrays, and returns Pardiso's error, zero for none.
 
-        Raises:
-            MemoryError: there is not enough memory.
-            RuntimeError: the phase failed, but for a matrix without a factor.
-
         Args:
             phase: its number.
             values: (n_values,) entries of the matrix.
             right: (m, n) right-hand sides, which the solutions overwrite.
+
+        Raises:
+            MemoryError: there is not enough memory.
+            RuntimeError: a phase fails, other than the factorisation of a matrix without a factor.
         """
         unknowns, error = len(self._pattern[0]) - 1, ctypes.c_int32(0)
         count = 1 if right is None else right.size // unknowns
         room = None if right is None else np.empty_like(right)
-        numbers = [ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, self._kind, phase, unknowns, count, 0)]
+        *head, sides, silent = (ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, self._kind, phase, unknowns, count, 0))
         arrays = [self._internal, values, *self._pattern, self._options, right, room]
         internal, matrix, starts, columns, options, rhs, solution = (
             None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in arrays
         )
         library = mkl()
         library.MKL_Set_Num_Threads_Local(torch.get_num_threads())
-        *head, columns_of_rhs, silent = numbers
-        matrix_arguments = (matrix, starts, columns, None, columns_of_rhs, options, silent)
-        library.pardiso(internal, *head, *matrix_arguments, rhs, solution, ctypes.byref(error))
+        outcome = (options, silent, rhs, solution, ctypes.byref(error))
+        library.pardiso(internal, *head, matrix, starts, columns, None, sides, *outcome)
         library.MKL_Set_Num_Threads_Local(0)
         if error.value == _NO_MEMORY:
             raise MemoryError(f"a factor of {unknowns} unknowns needs more memory than there is: take larger cells.")
@@ -219,6 +218,7 @@ def mkl() -> Any:
 def has_pardiso() -> bool:
     """Whether this machine has Pardiso."""
     try:
-        return mkl() is not None
+        mkl()
     except (ModuleNotFoundError, OSError):
         return False
+    return True

@@ -236,7 +236,8 @@ class SolveSettings(Settings):
     max_iterations: Natural = setting(500, "after which a step fails")
     memory: Natural = setting(12, "pairs that L-BFGS keeps")
     refactor_after: Natural = setting(
-        4, "iterations of a step above which quasi_newton refactorises an environment before the next step"
+        4,
+        "iterations of a step (pardiso: three times as many) above which quasi_newton refactorises for the next one",
     )
     linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
         "auto", "for Newton's equation; banded, bordered and pardiso run on the CPU alone"

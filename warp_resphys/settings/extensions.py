@@ -69,16 +69,16 @@ def own_settings(kind: str, name: str, values: Mapping[str, Any]) -> Any:
     Raises:
         InputError: it is unknown, its package cannot be imported, or has a class of another kind, or a wrong key.
     """
-    found = extension(kind, name)
-    wanted, settings = _CLASSES[kind], found.load()
+    source = extension(kind, name)
+    wanted, settings = _CLASSES[kind], source.load()
     if not (isinstance(settings, type) and issubclass(settings, wanted)):
         raise InputError(
-            f"{name} of the package {found} is {settings!r}: its entry point must name a subclass of "
+            f"{name} of the package {source} is {settings!r}: its entry point must name a subclass of "
             f"warp_resphys.settings.extensions.{wanted.__name__}."
         )
     if isabstract(settings):
-        raise InputError(f"{name} of the package {found}: {settings.__name__} has no method build: add it.")
-    with _naming(found):
+        raise InputError(f"{name} of the package {source}: {settings.__name__} has no method build: add it.")
+    with _naming(source):
         return parse(settings, values)
 
 
@@ -101,24 +101,24 @@ def built(kind: str, name: str, values: Mapping[str, Any], result: type[Any], *a
     Raises:
         InputError: see `own_settings`; or the package refuses the arguments, or builds another object.
     """
-    settings, found = own_settings(kind, name, values), extension(kind, name)
-    with _naming(found):
+    settings, source = own_settings(kind, name, values), extension(kind, name)
+    with _naming(source):
         made = settings.build(*arguments)
     if not isinstance(made, result):
         raise InputError(
-            f"{name} of the package {found} builds {type(made).__name__}: its method build must return a subclass of "
+            f"{name} of the package {source} builds {type(made).__name__}: its method build must return a subclass of "
             f"{result.__module__}.{result.__name__}."
         )
     return made
 
 
 @contextmanager
-def _naming(found: Extension) -> Iterator[None]:
+def _naming(source: Extension) -> Iterator[None]:
     """Names the package in errors."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{found.point.name} of the package {found}: {error}") from error
+        raise InputError(f"{source.point.name} of the package {source}: {error}") from error
 
 
 def _without_null(values: Any) -> Any:

@@ -149,6 +149,6 @@ def _name(case: Mapping[str, Any]) -> str:
 
 if __name__ == "__main__":
     source, target = map(Path, sys.argv[1:])
-    found = read_records(source)
-    write_text(target, history_page(found, target.with_suffix(".png").name))
-    save_png(history_figure(found), target.with_suffix(".png"))
+    records = read_records(source)
+    write_text(target, history_page(records, target.with_suffix(".png").name))
+    save_png(history_figure(records), target.with_suffix(".png"))

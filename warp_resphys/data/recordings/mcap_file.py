@@ -42,7 +42,7 @@ class JsonMessage:
 
     @property
     def stamp(self) -> float:
-        """Time of its header or its timestamp [s], NaN without one."""
+        """Time of its header or its timestamp [s], NaN without one; a number is in s, or since 1970 in ms, us or ns."""
         header = self.content if isinstance(self.content, dict) else {}
         given = header.get("header", header)
         stamp = next((given[key] for key in ("stamp", "timestamp") if key in given), None) if given else None
@@ -51,7 +51,10 @@ class JsonMessage:
             return float(next((stamp[key] for key in ("sec", "seconds", "secs") if key in stamp), 0)) + 1e-9 * float(
                 rest
             )
-        return float(stamp) if isinstance(stamp, int | float) else np.nan
+        if not isinstance(stamp, int | float):
+            return np.nan
+        # Times since 1970 beyond the year 5000 in one unit are in the next smaller one.
+        return stamp / next((units for units in (1.0, 1e3, 1e6) if abs(stamp) < 1e11 * units), 1e9)
 
     def member(self, name: str | None) -> Any:
         """Returns the part of the message at a path of keys; None where it lacks that.

@@ -128,8 +128,8 @@ class ExactHessian(HessianApproximation):
         self.clamped.zero_()
         self._potential.update_tangent()
         many = self._potential.low_rank is not None or self._potential.has_pairs  # right-hand sides
-        near = None if many else self.linear.near(self.assembly())
-        self._factor = near or self._factor_of(self.assembly())
+        values = self.assembly()
+        self._factor = (None if many else self.linear.near(values)) or self._factor_of(values)
         if self._factor.failed.any():
             self._factor = self._factor_of(self.assembly(), definite=False)
         if self._coupled is not None:

@@ -509,8 +509,7 @@ class Simulator:
         constants = self.prepare(parameters)
         states, reports, unchecked = [state], [], []
         together = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK
-        for t in range(steps):
-            current = inputs.at(t)
+        for t, current in enumerate(inputs.by_step(steps)):
             if t == 0:
                 self._checked(state, current, constants)
             elif current is not inputs:

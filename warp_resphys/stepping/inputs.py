@@ -1,6 +1,6 @@
 """Time-dependent inputs of a batch of bodies: forces, motion of the fixed vertices, hung weights, actuation."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -164,6 +164,13 @@ class Inputs:
         if not any(has_time.values()):
             return self
         return self._derived({n: v[min(step, len(v) - 1)] if has_time[n] else v for n, v in self.fields.items()})
+
+    def by_step(self, steps: int) -> Iterator["Inputs"]:
+        """Yields the inputs of steps in turn, whose gradients are joined once and not step by step as those of `at`."""
+        times = {name: values.unbind() for name, values in self.fields.items() if self._has_time_axis()[name]}
+        for t in range(steps):
+            now = {name: values[min(t, len(values) - 1)] for name, values in times.items()}
+            yield self._derived(self.fields | now) if times else self
 
     def window(self, first: torch.Tensor, steps: int) -> "Inputs":
         """Returns the inputs of consecutive steps that start at another step in each environment.

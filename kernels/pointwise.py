@@ -19,6 +19,7 @@ from typing import Any
 
 import warp as wp
 
+from .matrices import symmetric_eigen
 from .modules import named_module
 from .points import deformation_gradient, line_at
 from .values import value_reader
@@ -191,7 +192,7 @@ def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any
                 rows[n, i] = slope[i]
         block = (HALF * weights[p] / (TWELVE * h)) * (rows + wp.transpose(rows))
         if clamp[b] != 0:
-            q, e = wp.eig3(block)
+            q, e = symmetric_eigen(block)
             positive = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
             block = q * positive * wp.transpose(q)
         tangent_out[b, p, 0] = block

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .matrices import symmetric_eigen
+
 SMALLEST_STRETCH_SUM = wp.float64(1.0e-3)  # lower bound of sums of stretches in denominators
 ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
@@ -27,7 +29,7 @@ def spectral_blocks(
     The index of `flip` and `twist` is the axis that is not in their pair.
     """
     if clamp:
-        q, e = wp.eig3(normal)
+        q, e = symmetric_eigen(normal)
         clamped = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
         normal = q * clamped * wp.transpose(q)
         for k in range(3):

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_resphys.kernels.matrices import cofactor, nearest_unimodular, polar_rotation, signed_svd
+from warp_resphys.kernels.matrices import cofactor, nearest_unimodular, polar_rotation, signed_svd, symmetric_eigen
 from warp_resphys.kernels.spectral import spectral_blocks
 
 wp.set_module_options({"enable_backward": False})
@@ -49,11 +49,41 @@ def test_decompositions():
     np.testing.assert_allclose(cof[regular], np.linalg.det(MATRICES[regular])[:, None, None] * inverse, atol=1e-11)
     np.testing.assert_allclose(np.einsum("nik,nk,njk->nij", u, s, v), MATRICES, atol=1e-13)
     np.testing.assert_allclose([np.linalg.det(u), np.linalg.det(v), np.linalg.det(rotation)], 1.0, atol=1e-12)
-    assert (np.abs(s[:, 2]) <= s[:, :2].min(1)).all()
+    inverted = np.linalg.det(MATRICES) < 0.0
+    assert (s[~inverted] >= 0.0).all()
+    assert (s[inverted, 2] < 0.0).all()
+    assert (np.abs(s[inverted, 2]) <= s[inverted, :2].min(1)).all()
     upright = np.linalg.det(MATRICES) > 1e-3
     np.testing.assert_allclose(rotation[upright], [scipy.linalg.polar(f)[0] for f in MATRICES[upright]], atol=1e-12)
     # Of all rotations R the trace of R^T F is largest: s_1 + s_2 +- s_3.
     np.testing.assert_allclose(np.einsum("nij,nij->n", rotation, MATRICES), s.sum(1), atol=1e-12)
+
+
+@wp.kernel
+def eigenpairs(a: wp.array[wp.mat33d], v_out: wp.array[wp.mat33d], e_out: wp.array[wp.vec3d]):
+    i = wp.tid()
+    v, e = symmetric_eigen(a[i])
+    v_out[i] = v
+    e_out[i] = e
+
+
+def test_eigenvectors_of_symmetric_matrices():
+    """Those with nearly and exactly equal eigenvalues, of any size, and zero."""
+    turns = [np.linalg.qr(RANDOM.normal(size=(3, 3)))[0] for _ in range(6)]
+    spectra = [(3.0, 1.0, -2.0), (1.0, 1.0 + 1e-9, 1.0 - 1e-7), (2.0, 2.0, 0.0), (1e9, 1.0, 1e-9), (0.0, 0.0, 0.0)]
+    a = np.array([q * e @ q.T for q in turns for e in spectra] + [np.diag(e) for e in spectra])
+    a = (a + a.transpose(0, 2, 1)) / 2.0
+    v, e = (wp.zeros(len(a), dtype=kind, device="cpu") for kind in (wp.mat33d, wp.vec3d))
+    wp.launch(eigenpairs, len(a), [wp.array(a, dtype=wp.mat33d, device="cpu"), v, e], device="cpu")
+    size = np.linalg.norm(a, axis=(1, 2))[:, None]
+    expected = np.linalg.eigvalsh(a)
+    assert (np.abs(np.sort(e.numpy(), axis=1) - expected) <= 1e-14 * size).all()
+    np.testing.assert_allclose(
+        np.einsum("nki,nkj->nij", v.numpy(), v.numpy()), np.broadcast_to(np.eye(3), a.shape), atol=1e-14
+    )
+    np.testing.assert_allclose(np.linalg.det(v.numpy()), 1.0, atol=1e-14)
+    again = np.einsum("nik,nk,njk->nij", v.numpy(), e.numpy(), v.numpy())
+    assert (np.abs(again - a).max((1, 2)) <= 1e-14 * size[:, 0]).all()
 
 
 def test_the_nearest_unimodular_matrix():

@@ -4,6 +4,7 @@ import gc
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 from warp_resphys.linalg.linear_solver import Factor
@@ -81,3 +82,22 @@ def test_memory_is_given_back_with_the_solver(monkeypatch):
     del factor, solver
     gc.collect()
     assert phases == [-1]
+
+
+def test_torch_may_change_its_number_of_threads():
+    n, width = 1200, 400
+    rows, cols = (index[np.subtract(*np.tril_indices(n)) <= width] for index in np.tril_indices(n))
+    solver = PardisoSolver(rows, cols, n, 1, torch.device("cpu"), torch.float64)
+    random, right, before = np.random.default_rng(5), torch.ones(1, n, 1, dtype=torch.float64), torch.get_num_threads()
+    try:
+        for threads in (2, *[1] * 8):
+            torch.set_num_threads(threads)
+            entries = np.where(rows == cols, 4.0 * width, random.normal(size=len(rows)))
+            values = torch.zeros(1, solver.n_values, dtype=torch.float64)
+            values[0, solver.address[:, 0]] = torch.as_tensor(entries)
+            x = solver.factor(values).solve(right)[0, :, 0].numpy()
+            lower = scipy.sparse.csr_array((entries, (rows, cols)), shape=(n, n))
+            product = lower @ x + lower.T @ x - 4.0 * width * x
+            np.testing.assert_allclose(product, 1.0, atol=1e-12)
+    finally:
+        torch.set_num_threads(before)

@@ -149,6 +149,7 @@ class _Memory:
 
     def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray, definite: bool) -> None:
         self._pattern, self._kind = pattern, _KINDS[definite]
+        self._threads = torch.get_num_threads()  # A factor by another number than the analysis may crash.
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
         # Own options; METIS; solutions overwrite; pivots; scaling; matching; precision; from zero. Threads on two
         # levels (23) gave wrong factors without an error up to oneMKL 2026.0, where one replaced another.
@@ -187,7 +188,7 @@ class _Memory:
             None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in arrays
         )
         library = mkl()
-        library.MKL_Set_Num_Threads_Local(torch.get_num_threads())
+        library.MKL_Set_Num_Threads_Local(self._threads)
         outcome = (options, silent, rhs, solution, ctypes.byref(error))
         library.pardiso(internal, *head, matrix, starts, columns, None, sides, *outcome)
         library.MKL_Set_Num_Threads_Local(0)

@@ -8,14 +8,14 @@
 # %% [markdown]
 # # Bring your robot: a beam
 #
-# From CSV files of measured markers to a corrected simulator. The robot is a silicone beam that is
+# This page leads from CSV files of measured markers to a corrected simulator. The robot is a silicone beam that is
 # clamped at one end, held straight by hand, and released, with or without a weight at its tip.
 # [The guide](../bring_your_robot.md) explains all options and errors; this page shows one complete example.
 #
 # ## Recordings
 #
-# Real recordings come from cameras. Here a finer simulation of another material replaces them: in the cameras' frame,
-# in millimetres, with noise, and with markers that are misplaced by 0.3 mm in each coordinate.
+# Real recordings come from cameras. Here a finer simulation with another material stands in for them. Its markers are
+# in the cameras' frame, in millimetres, noisy, and misplaced by about 0.3 mm per coordinate.
 
 # %%
 import json
@@ -87,7 +87,8 @@ print(
 #
 # A file in `configs/experiment` describes your robot: the body, its data sheet, the trials, and the nominal marker
 # positions. Everything else comes from the package's defaults for released bodies (`/recordings: released`).
-# `budget=quick` on the command line is for a first look; the numbers below it only make this page short.
+# The last lines, from `starts: 1` on, only shorten the run for this page; leave them out for a real robot, and use
+# `budget=quick` on the command line for a first look.
 
 # %%
 Path("configs/experiment").mkdir(parents=True)
@@ -155,14 +156,14 @@ for name, error in errors.items():
 print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 
 # %% [markdown]
-# The error after identification is 1.5 mm, five times the error of the markers' placement, and the learned force does
-# not help: with two motions it overfits. This indicates that the simulator lacks physics. Silicone creeps, and this
-# material has no memory.
+# The error after identification is 1.5 mm, five times the error of the marker positions. The learned force does
+# not help, because it overfits two motions. This indicates that the simulator lacks physics: silicone creeps, and the
+# material of the simulator has no memory.
 #
 # ## Better physics
 #
-# A Prony branch adds memory: a share of the shear modulus relaxes with a time constant
-# ([materials](../tendons.md#a-body-that-creeps)). A configuration based on the first one identifies both.
+# A Prony branch adds memory: an additional shear modulus, given as a ratio to the long-term one, relaxes with a time
+# constant ([materials](../tendons.md#a-body-that-creeps)). A configuration based on the first one identifies both.
 
 # %%
 Path("configs/experiment/my_creeping_robot.yaml").write_text("""# @package _global_
@@ -187,8 +188,8 @@ share, within = identified["prony_ratio_1"], identified["prony_time_1"]
 print(f"a share of {share:.2f} within {within:.2f} s (true: 0.15 within 0.10 s)")
 
 # %% [markdown]
-# Now the error is that of the markers' placement, 0.3 mm, which physics cannot reduce, and a learned force is not
-# needed. If the physics is unknown, as in the walls of a pneumatic arm, use a learned force, with
+# Now the error is that of the marker positions, 0.3 mm, which better physics cannot reduce, and a learned force is not
+# needed. If the missing physics is unknown, as in the walls of a pneumatic arm, use a learned force and
 # more recordings ([residual forces](residual_forces.py), [a pneumatic arm](pneumatic_arm.py)).
 #
 # ## Use the result

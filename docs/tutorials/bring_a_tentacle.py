@@ -14,8 +14,8 @@
 #
 # ## Poses
 #
-# Again a simulation replaces the robot. It is stiffer than the data sheet's rod, has a finer mesh, and its first tendon
-# is displaced by a millimetre from the drawing, which is typical of a real robot.
+# A simulation stands in for the robot. It is stiffer than the data sheet's rod and has a finer mesh, and its first
+# tendon is displaced by a millimetre from the drawing, as is typical of a real robot.
 
 # %%
 import json
@@ -162,9 +162,9 @@ for name, value in identified["parameters"].items():
     print(f"{name:24s} {value:10.4g}")
 
 # %% [markdown]
-# Six poses of three markers determine the stiffness and the tendons' offsets, with the true millimetre for the first
-# one. The remaining error is little more than the noise, so that no learned force was kept.
-# `simfree`, a network that replaces the simulator, has no physics to rely on.
+# Six poses of three markers determine the stiffness and the tendons' offsets; that of the first tendon is close to the
+# true millimetre. The remaining error is little more than the noise, so no learned force was kept.
+# `simfree`, a network that replaces the simulator, has larger errors because it contains no physics.
 #
 # ## Application
 #

@@ -8,8 +8,9 @@
 # %% [markdown]
 # # Distance, stiffness and slip speed of contact
 #
-# [Contact](../contact.md) has three numbers that no data sheet has: the distance at which it begins, the stiffness of
-# its barrier, and the speed at which friction is fully developed. Here is what goes wrong with bad ones.
+# [Contact](../contact.md) has three constants that are not in any data sheet: the distance at which it begins, the
+# stiffness of its barrier, and the speed at which friction is fully developed. This page shows the effects of bad
+# values, and how to choose good ones.
 #
 # ## Distance: the gap is a thickness
 
@@ -54,10 +55,10 @@ for ax, distance in zip(axes, (5e-4, 6e-3), strict=True):
 figure.tight_layout()
 
 # %% [markdown]
-# On the right, the bar is in effect some millimetres thicker. Take a hundredth to a tenth of the smallest length that
+# On the right, the bar is in effect some millimetres thicker. Choose a hundredth to a tenth of the smallest length that
 # matters.
 #
-# ## Vertices alone touch obstacles
+# ## Only vertices touch obstacles
 #
 # A thin bar between two vertices sinks into the body, by up to s² / 8 R for a spacing s and a radius R, or through it:
 
@@ -70,13 +71,13 @@ for ax, divisions in zip(axes, ((8, 1, 2), (48, 1, 2)), strict=True):
 figure.tight_layout()
 
 # %% [markdown]
-# Refine the mesh along the body until its vertices are closer to one another than the obstacle is wide, or make the
-# thing a body of its own ([surfaces](../contact.md#bodies-and-themselves) see edges and triangles, too).
+# Refine the mesh along the body until the spacing of its vertices is less than the width of the obstacle, or make the
+# obstacle a body of its own: contact of [surfaces](../contact.md#bodies-and-themselves) includes edges and triangles.
 #
-# ## Stiffness: how much of the distance is left
+# ## Stiffness: the remaining gap
 #
-# A block of 20 mm on a floor, with more and more weight. The gap that is left follows from the pressure over the
-# stiffness: a soft barrier gives way like a layer of the body, and a stiff one makes impacts sudden.
+# A block of 20 mm rests on a floor under increasing load. The remaining gap follows from the ratio of pressure to
+# stiffness: a soft barrier yields like a layer of the body, and a stiff one makes impacts sudden.
 
 # %%
 cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))
@@ -100,13 +101,13 @@ ax.legend()
 figure.tight_layout()
 
 # %% [markdown]
-# Nothing goes through the floor, whatever the stiffness. Begin with Young's modulus of the body.
+# The block never passes through the floor, whatever the stiffness. Begin with Young's modulus of the body.
 #
-# ## Slip speed: what should stick creeps
+# ## Slip speed: sticking bodies creep
 #
-# A block on a slope of 15 degrees, with a coefficient of friction of 0.4 that should hold it. Below the slip speed,
-# friction grows with the speed of sliding, so that the block creeps, at a share of the slip speed. A smaller one costs
-# some iterations where bodies begin to slide.
+# A block lies on a slope of 15 degrees, with a coefficient of friction of 0.4 that should hold it. Below the slip
+# speed, friction grows with the sliding speed, so that the block creeps at a fraction of the slip speed. A smaller slip
+# speed costs some iterations where bodies begin to slide.
 
 # %%
 a, slip_speeds, creeps = np.radians(15.0), np.array([1e-4, 1e-3, 1e-2, 1e-1]), []
@@ -126,5 +127,5 @@ for slip_speed in slip_speeds:
 assert np.allclose(creeps, slip_speeds * (1.0 - np.sqrt(1.0 - np.tan(a) / 0.4)), rtol=0.02)
 
 # %% [markdown]
-# Take a few percent of the speeds at which bodies slide, and look at whether what should stick creeps too far in the
-# time of a trial.
+# Choose a few per cent of the speeds at which bodies slide, and check that sticking bodies do not creep too far during
+# a trial.

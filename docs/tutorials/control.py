@@ -9,10 +9,10 @@
 # # Control
 #
 # A corrected simulator can be used for planning. Here the tip of a hanging rod, pulled by three tendons, draws a
-# circle: the tensions are planned with the data sheet's parameters, and with parameters identified from recordings;
-# another simulation, with a finer mesh and another material, stands in for the robot and executes both plans.
-# [The guide](../control.md) describes each stage; this page runs all of it at a size that takes a minute or two,
-# and then drives the robot from Python.
+# circle. The tensions are planned once with the data sheet's parameters and once with parameters identified from
+# recordings. Another simulation, with a finer mesh and another material, stands in for the robot and executes both.
+# [The guide](../control.md) describes the stages. This page runs all of them at a size that takes a minute or two,
+# and then plays a plan from Python.
 #
 # ## The experiment
 #
@@ -69,7 +69,7 @@ run = Path("runs/drawing/default")
 # %% [markdown]
 # ## Comparison of controllers
 #
-# `control.json` has the mean distance of the tip from its reference: for each plan in open loop,
+# `control.json` has the mean distance of the tip from its reference: for the plans in open loop,
 # for a receding horizon, which plans at every step from the observed markers, and for two baselines
 # without a simulator, a linear model of the recordings and feedback by the robot's Jacobian.
 
@@ -97,7 +97,7 @@ axes[0].legend(loc="center", frameon=False)
 plt.show()
 
 # %% [markdown]
-# The motion begins at the robot's rest position and leads to the circle in the first fifth of its duration.
+# The motion begins at the robot's rest position and reaches the circle in the first fifth of its duration.
 #
 # ## A plan is a table
 #
@@ -126,7 +126,7 @@ plt.show()
 # ## Summary
 #
 # With parameters identified from six short recordings, the error of the plan is two thirds of that with the data
-# sheet's parameters; the receding horizon has an error of less than a millimetre, and less than both baselines.
+# sheet's parameters. The error of the receding horizon is less than a millimetre, and less than that of both baselines.
 
 # %%
 assert off.max() < 0.2

@@ -10,8 +10,8 @@
 #
 # A soft slab with three muscles along its lower side crawls by friction: it arches, so that one end presses harder on
 # the floor than the other, and the other end slides. Gradients pass through contact and friction
-# ([the equations](../theory.md#contact)), also where vertices stick, slide and lift off, and find a gait that is faster
-# than any of a grid of waves.
+# ([the equations](../theory.md#contact)), also where vertices stick, slide and lift off. They lead to a gait that is
+# faster than all waves of a grid.
 #
 # ## The body and the floor
 
@@ -56,8 +56,8 @@ simulator = Simulator(Body(mesh, energies=[Muscles(muscles), floor]), silicone, 
 # %% [markdown]
 # ## Gaits
 #
-# A gait is a stress of every muscle, between 0 and 10 kPa, with a period of half a second: a constant and two
-# harmonics, through a sigmoid. Three periods are simulated; the first one begins gently.
+# A gait is a periodic stress of every muscle, between 0 and 10 kPa, with a period of half a second: a constant and two
+# harmonics, through a sigmoid. Three periods are simulated; the stress is ramped up in the first one.
 
 # %%
 PERIOD, STEPS, MOST = 0.5, 150, 1e4  # s, steps, Pa
@@ -107,8 +107,8 @@ print(
 # %% [markdown]
 # ## A gait by gradients
 #
-# Also with 36 simulations, where one with its gradient counts as two: eight random waves, then fourteen steps of Adam
-# from the best of them.
+# The same effort of 36 simulations, where one with its gradient counts as two: eight random waves, then fourteen steps
+# of Adam from the best of them.
 
 # %%
 torch.manual_seed(0)
@@ -142,7 +142,7 @@ right.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# Its side, every tenth of a second of the last period, one above the other:
+# Side views of the slab, every tenth of a second of the last period, from top to bottom:
 
 # %%
 nx, _, nz = CELLS
@@ -160,10 +160,10 @@ axis.set(xlabel="x [mm]", aspect="equal", yticks=[])
 plt.show()
 
 # %% [markdown]
-# ## What pushes
+# ## Friction over a period
 #
-# `Simulator.contacts` has gaps, normal forces, friction and the slide of every vertex in a step; they are
-# differentiable too. Over the last period, the forces of friction of each half of the slab:
+# `Simulator.contacts` returns gaps, normal forces, friction and the slide of every vertex in a step; they are
+# differentiable too. The figure shows the friction of both halves of the slab over the last period:
 
 # %%
 forces = []
@@ -187,8 +187,8 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# One half holds while the other slides; over a period the sum is about zero. The weight of the slab is
-# 0.6 N, so that friction could hold 0.36 N.
+# One half sticks while the other slides; over a period the sum is about zero. The weight of the slab is
+# 0.6 N, so friction can be at most 0.36 N.
 
 # %%
 assert reached[-1] > 1.5e3 * ways[best]

@@ -8,9 +8,10 @@
 # %% [markdown]
 # # Write your own energy
 #
-# Materials, pressure, fibres, tendons, muscles and water are energies. A new one is a Warp function and a class of a
+# Materials, pressure, fibres, tendons, muscles and water are energies. A new energy is a Warp function and a class of a
 # few lines; solver, adjoint, tape and identification support it without changes. This
-# page implements a floor, on which a block falls, and an elastic string.
+# page implements a floor, on which a block falls, and an elastic string. (For real use, the package has
+# [contact](../contact.md) with friction.)
 #
 # ## The equation
 #
@@ -18,16 +19,16 @@
 #
 # $$ e = \tfrac{k}{3} d^3, \qquad \text{a force } k d^2 \text{ upwards}, \qquad \text{a stiffness } 2 k d, $$
 #
-# which is twice differentiable where contact begins, so that Newton steps and gradients do not see a corner. Its
+# which is twice continuously differentiable where contact begins, as Newton's method and gradients require. Its
 # parameters are $k$ [N/m²] and $z_0$ [m].
 #
 # ## The function and the class
 #
 # An energy is a sum over points. Its argument is a weighted sum of a few vertices: the position of a vertex, the vector
 # from one to another, or, as a matrix, the deformation gradient in a cell. The energy of a point is a Warp function of
-# this argument and of the point's values: the parameters and inputs that the class declares, in their order, with units
-# and ranges, which are checked. Warp differentiates the function for the forces; the second derivatives, for
-# Newton steps and gradients, are fourth-order differences of the forces, exact to about nine digits.
+# this argument and of the point's values. These are the parameters and inputs in the order in which the class declares
+# them, with units and ranges, which are checked. Warp differentiates the function for the forces. The second
+# derivatives, for Newton steps and gradients, are fourth-order differences of the forces, exact to about nine digits.
 
 # %%
 from dataclasses import dataclass
@@ -102,8 +103,8 @@ print(f"carried {carried:.4f} N, weight {weight:.4f} N")
 # %% [markdown]
 # ## Its gradients
 #
-# Derivatives of the block's height after the first rebound with respect to both parameters of the floor, compared with
-# central differences. Every new energy should have this test.
+# The derivatives of the block's height after the first rebound, with respect to both parameters of the floor, are
+# compared with central differences. Every new energy should have this test.
 
 # %%
 state = simulator.rest_state()
@@ -173,10 +174,10 @@ print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length 
 # Memory is declared in the same way, with a function of the start and the end of a step;
 # `warp_resphys.energies.friction` is an example of 40 lines.
 #
-# ## From here to an experiment
+# ## Use in an experiment
 #
-# [Your own physics](../extending.md) shows how a package of yours gives this energy a name in configurations; its
-# parameters can then be identified by name. For speed, kernels can be written by hand, as for pressure.
+# [Your own physics](../extending.md) shows how a package of yours gives this energy a name in configurations, so that
+# its parameters can be identified by name. For speed, kernels can be written by hand, as for pressure.
 
 # %%
 assert abs(carried / weight - 1) < 1e-3

@@ -33,8 +33,8 @@ print(f"{len(mesh.vertices)} vertices, {len(mesh.cells)} cells, clamped at {len(
 # %% [markdown]
 # ## Equilibrium
 #
-# `static_equilibrium` computes the body at rest. States have the shape (B, N, 3): B environments, here one, of
-# N vertices.
+# `static_equilibrium` computes the body at rest. States have the shape (B, N, 3): B environments, here one, with
+# N vertices each.
 #
 # The result can be compared with beam theory. Under a uniform load $w = \rho g A$ the deflection of a cantilever's tip
 # is the sum of Euler-Bernoulli bending and Timoshenko shear,
@@ -54,9 +54,9 @@ print(f"the tip sinks by {1e3 * sag:.3f} mm; Timoshenko's beam by {1e3 * expecte
 # %% [markdown]
 # The agreement is this good because two errors of about five per cent cancel. For small strains, the second term of
 # this energy has a third of Lamé's $\lambda$ ([theory](../theory.md#materials)), so that this silicone is as soft as
-# one of 250 kPa; and the clamp, which beam theory neglects, prevents the contraction of the section and stiffens a
-# beam as short as this one. `StableNeoHookean` is linear elasticity for small strains, so that only the effect of the
-# clamp remains.
+# one of 250 kPa. The clamp, which beam theory neglects, prevents the lateral contraction of the cross-section and
+# stiffens a beam as short as this one. `StableNeoHookean` is linear elasticity for small strains, so that only the
+# effect of the clamp remains.
 
 # %%
 third = 264e3 * 0.45 / ((1 + 0.45) * (1 - 2 * 0.45)) / 3  # Pa, of Lame's first parameter
@@ -111,7 +111,7 @@ plt.show()
 #
 # ## Batches
 #
-# Environments of a batch are solved together. A parameter may have a value for each of them, of shape (B, 1).
+# Environments of a batch are solved together. A parameter may have one value per environment, with shape (B, 1).
 
 # %%
 moduli = torch.tensor([[150e3], [264e3], [400e3]], dtype=torch.float64)  # Pa
@@ -143,9 +143,9 @@ for value, period in zip(moduli[:, 0].tolist(), periods, strict=True):
 # %% [markdown]
 # ## Summary
 #
-# The equilibrium agrees with beam theory, up to clamp and material; with the midpoint rule at small steps the tip
-# returns to its initial height in the last swings, with implicit Euler it does not; periods depend on the modulus as
-# predicted. The following checks stop the build of the book if a figure of this page is wrong.
+# The equilibrium agrees with beam theory, apart from the effects of clamp and material. With the midpoint rule and
+# small steps the tip returns to its initial height in the last swings; with implicit Euler it does not. Periods depend
+# on the modulus as predicted. The following checks stop the build of the book if a figure of this page is wrong.
 
 # %%
 assert abs(sag / expected - 1) < 0.02

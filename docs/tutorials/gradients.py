@@ -63,8 +63,8 @@ print(f"d(height at the end) / dE = {exact:.9e} m/Pa")
 # %% [markdown]
 # ## Check
 #
-# The error of central differences decreases with the square of the step, until rounding dominates. With a wrong
-# gradient the error would not fall below a floor.
+# The error of central differences decreases with the square of the step, until rounding dominates. If the gradient
+# were wrong, the error would stop decreasing earlier, at the error of the gradient.
 
 # %%
 relative = 10.0 ** -np.arange(1.0, 7.5, 0.5)
@@ -86,8 +86,8 @@ print(f"smallest: {min(errors):.1e}")
 # ## Identification
 #
 # Now a noisy motion is given, as for a robot. Its material is stiffer than the data sheet's, and viscous.
-# One backward pass computes the gradient of the squared error with respect to both parameters, as it would for a
-# thousand. L-BFGS minimises the error.
+# One backward pass computes the gradient of the squared error with respect to both parameters, at a cost that does not
+# depend on their number. L-BFGS minimises the error.
 
 # %%
 truth = {"modulus": 300e3, "viscosity": 4e-3}  # Pa, s
@@ -125,8 +125,8 @@ figure.legend(loc="outside upper center", ncols=3, frameon=False)
 plt.show()
 
 # %% [markdown]
-# In an experiment the stage `identify` does this, with several starts, priors, uncertain marker positions,
-# and a posterior of the parameters ([experiments](../experiments.md)).
+# In an experiment the stage `identify` does this, with several starts, priors, uncertain marker positions
+# and a posterior of the parameters ([experiments](../experiments.md)); in Python, use `warp_resphys.identify`.
 #
 # ## Gradients on a Warp tape
 #
@@ -163,8 +163,8 @@ print(
 # %% [markdown]
 # ## Summary
 #
-# Differences agree with the adjoint to a part in ten million; the parameters are identified within the accuracy that
-# the noise allows; torch and Warp give the same gradient.
+# Differences agree with the adjoint to one part in ten million, the parameters are identified within the accuracy that
+# the noise allows, and torch and Warp give the same gradient.
 
 # %%
 assert min(errors) < 1e-7

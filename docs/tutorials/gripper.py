@@ -8,9 +8,9 @@
 # %% [markdown]
 # # A gripper, and a grasp by gradients
 #
-# Two soft fingers with tendons grasp a soft ball on a table, lift it, and shake it. Everything touches everything: the
-# ball the table, the fingers the ball ([the equations](../theory.md#contact)). Gradients pass through all of it, and
-# find a course of the tension that needs less than ten constant ones that were tried.
+# Two soft fingers with tendons grasp a soft ball on a table, lift it, and shake it. The ball touches the table, and the
+# fingers touch the ball ([the equations](../theory.md#contact)). Gradients pass through all contacts. They lead to a
+# variable tension with a smaller mean than the best of ten constant tensions.
 #
 # ## Fingers, ball and table
 
@@ -106,7 +106,7 @@ def grasp(knots):
 # %% [markdown]
 # ## Constant tensions
 #
-# Ten of them, from 0.9 to 1.8 N, in one batch:
+# Ten constant tensions from 0.9 to 1.8 N, in one batch:
 
 # %%
 constant = torch.linspace(0.9, 1.8, 10, dtype=torch.float64)
@@ -117,13 +117,13 @@ for tension, height in zip(constant.tolist(), heights.tolist(), strict=True):
 least = int(torch.where(heights >= HELD, efforts, torch.inf).argmin())
 
 # %% [markdown]
-# ## A course of the tension by gradients
+# ## A variable tension by gradients
 #
-# Also ten simulations, where one with its gradient counts as two: five steps of Adam from 1.4 N, for less tension and
-# against every millimetre that is missing. A ball that was dropped has no gradient that leads back, so the steps
-# are small, and the best course that holds the ball counts. Start, size and number of the steps were chosen by trials
-# of this task: with more steps the ball falls. The constant tension of 1.3 N misses the mark by 0.1 mm, and would need
-# 1.16 N on average.
+# The same effort of ten simulations, where one with its gradient counts as two: five steps of Adam from 1.4 N. The loss
+# is the mean tension plus a penalty on every missing millimetre of height. For a dropped ball, no gradient leads back
+# to the grasp, so the steps are small, and the best tension that holds the ball is kept. Initial value, size and number
+# of steps were tuned on this task: with more steps the ball falls. The constant tension of 1.3 N misses the
+# height by 0.1 mm; its mean would be 1.16 N.
 
 # %%
 knots = torch.full((1, 6), 1.4, dtype=torch.float64, requires_grad=True)
@@ -159,7 +159,7 @@ right.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# The gripper from the front at rest, closed, lifted, and in the middle of shaking:
+# The gripper from the front: at rest, closed, lifted, and during shaking:
 
 # %%
 q = motion.q[:, 0].detach().numpy()
@@ -178,10 +178,10 @@ axes[0].set(ylabel="z [mm]")
 plt.show()
 
 # %% [markdown]
-# ## What holds
+# ## Contact forces
 #
-# `Simulator.contacts` has gaps, normal forces and friction of every vertex in a step. While the ball hangs between the
-# fingers, they carry its weight of 75 mN, mostly by friction:
+# `Simulator.contacts` returns gaps, normal forces and friction of every vertex in a step. While the ball hangs between
+# the fingers, they carry its weight of 75 mN, mostly by friction:
 
 # %%
 state, forces = simulator.rest_state(), None

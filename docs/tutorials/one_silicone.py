@@ -8,8 +8,8 @@
 # %% [markdown]
 # # One silicone, many robots
 #
-# A learned force belongs to the mesh that it was learned on. A material does not: this page learns the law of a
-# silicone from a beam that is released under weights, and puts it on bodies that no trial has shown.
+# A learned force is specific to the mesh of its training; a material is not. This page learns the law of a
+# silicone from a beam that is released under weights, and applies it to bodies without any trials.
 #
 # The silicone of the simulated laboratory is a Mooney-Rivlin rubber that relaxes, so that Young's modulus, Poisson's
 # ratio and damping cannot describe it.
@@ -46,7 +46,7 @@ print("\n".join(line for line in printed.splitlines() if "law" in line and "erro
 # %% [markdown]
 # ## The law
 #
-# `law.json` has the terms that the trials ask for, with their deviations, and the classes of laws that were tried with
+# `law.json` has the selected terms with their standard deviations, and the classes of laws that were tried with
 # their errors on the validation trials. The laboratory has c10 30 kPa and c01 14 kPa, and 26.4 kPa that relax in 80 ms.
 
 # %%
@@ -58,8 +58,9 @@ print(f"\nerror over the amplitude: {law['validation']['law']:.2g}, of SysID {la
 # %% [markdown]
 # ## Other bodies
 #
-# `Robot.on(mesh)` puts the material of a robot on another body. The true silicone is put there as well, which only a
-# simulated laboratory can do. Where a body is stretched further than the beam was, the law extrapolates.
+# `Robot.on(mesh)` gives another body the material of a robot. The same bodies are also simulated with the true
+# silicone, which only a simulated laboratory can do. Where a body is stretched further than the beam was, the law
+# extrapolates.
 
 # %%
 bodies = {
@@ -106,5 +107,5 @@ axes[0].legend(frameon=False, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# On the command line, `law=runs/beam/law.json` gives the law to any other experiment, and `shapes` tests it on other
-# bodies beside targets of their own: [experiments](../experiments.md#other-bodies-of-the-same-material).
+# On the command line, `law=runs/beam/law.json` uses the law in any other experiment, and `shapes` tests it on other
+# bodies: [experiments](../experiments.md#other-bodies-of-the-same-material).

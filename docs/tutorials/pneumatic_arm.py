@@ -8,9 +8,9 @@
 # %% [markdown]
 # # A pneumatic arm
 #
-# A silicone arm with three chambers hangs from its base; air pressure in a chamber lengthens its side,
+# A silicone arm with three chambers hangs from its base. Air pressure in a chamber lengthens its side,
 # and the arm bends away. This page generates such an arm from its dimensions, bends it, uses the adjoint to compute the
-# pressures that bring the tip to a target, and switches a valve. [The guide](../pressure.md) adds markers,
+# pressures that bring the tip to a target, and opens a valve. [The guide](../pressure.md) adds markers,
 # identification and a learned force (`experiment=sopra`).
 #
 # ## The arm
@@ -55,8 +55,8 @@ def arm(energies):
 # %% [markdown]
 # ## Fibres
 #
-# Air pushes in all directions. Without a thread around it, a chamber widens more than it lengthens, and bends the arm
-# less. Fibres are an energy of the chamber's surface that resists stretching along the thread.
+# Air pressure acts in all directions. Without a thread around it, a chamber widens more than it lengthens, and bends
+# the arm less. Fibres are an energy of the chamber's surface that resists stretching along the thread.
 
 # %%
 threads = Fibres(chambers, (8.0, -8.0), stiffness=1e4)  # degrees; N/m
@@ -81,7 +81,7 @@ plt.show()
 # %% [markdown]
 # ## Pressures for a target
 #
-# Which pressures bring the tip to a given position? `static_equilibrium` is differentiable: its adjoint is
+# Which pressures bring the tip to a given position? `static_equilibrium` is differentiable, and its adjoint is
 # one linear solve. L-BFGS minimises the distance, with bounds on the pressures.
 
 # %%
@@ -131,8 +131,8 @@ plt.show()
 #
 # An experiment needs a mesh with closed chambers, pressures and markers in CSV files, and about twenty lines of
 # configuration: [robots driven by pressure](../pressure.md). With the threads of SoPrA in the simulator
-# (`experiment=sopra_fibres`), the error on its simulated laboratory is 0.45 mm after identification, and 0.23 mm with
-# the learned force ([results](../results/index.md)).
+# (`experiment=sopra_fibres`), the error on its simulated laboratory is 0.44 mm after identification, and 0.23 mm with
+# the learned force ([robots](../robots.md#sopra)).
 #
 # The pressures were computed for a simulator. Their accuracy on a robot depends on the correction of the simulator:
 # see [control](control.py).

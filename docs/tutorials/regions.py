@@ -9,11 +9,11 @@
 # # Two silicones and a rigid cap
 #
 # Many soft robots are cast of several materials and end in a printed part. This beam has 5 cm of stiff silicone, 4 cm
-# of soft silicone and a rigid cap of 1 cm, on which three markers sit. They identify both moduli.
+# of soft silicone and a rigid cap of 1 cm with three markers, from which both moduli are identified.
 #
-# Cells have names as *regions* of the mesh. A region has a material of its own, and its parameters by its name:
-# `soft_youngs_modulus`. A *rigid part* is an affine body: four control vertices carry all of its vertices, and a stiff
-# energy keeps it from deforming.
+# *Regions* of the mesh are named sets of cells. A region has its own material, and parameters with its name as a
+# prefix: `soft_youngs_modulus`. A *rigid part* is an affine body: four control vertices carry all of its vertices, and
+# a stiff energy keeps it from deforming.
 
 # %%
 import matplotlib.pyplot as plt
@@ -67,9 +67,9 @@ for name, value in identified.parameters.items():
 # %% [markdown]
 # ## The value of a second modulus
 #
-# A simpler model has one modulus. At the markers it comes close: the sag of the tip and the period of its swing are two
-# numbers, and a mean modulus reproduces both almost. Elsewhere it is wrong. The models are therefore compared on the
-# whole body, which is known for a simulated robot only:
+# A simpler model has one modulus. At the markers it comes close, because a mean modulus almost reproduces the sag of
+# the tip and the period of its swing. Elsewhere it is wrong. The models are therefore compared on the
+# whole body, which is known only for a simulated robot:
 
 # %%
 rubber = wr.Corotated(200e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
@@ -94,9 +94,9 @@ axis.legend(frameon=False, loc="center right")
 plt.show()
 
 # %% [markdown]
-# ## How rigid the cap is
+# ## Rigidity of the cap
 #
-# Distances between its vertices over the whole swing, relative to its size:
+# The largest change in the distances between its vertices over the whole swing, relative to its size:
 
 # %%
 cap = np.unique(mesh.cells[mesh.regions["cap"]])
@@ -107,8 +107,9 @@ print(f"the cap deforms by {strain:.1e} of its size")
 # %% [markdown]
 # ## Two bodies at once
 #
-# A scene simulates several bodies in one batch of solves: parameters, inputs and memory begin with the body's name.
-# They do not touch each other. A cube falls beside the beam:
+# A scene simulates several bodies in one solve; the names of parameters, inputs and memory begin with the body's name.
+# Without [contact](../contact.md#bodies-and-themselves) in the scene, bodies pass through one another. Here a cube
+# falls beside the beam:
 
 # %%
 cube = wr.Body(wr.box_hexahedra(size=(0.02, 0.02, 0.02), divisions=(2, 2, 2)))
@@ -127,12 +128,12 @@ print(
 
 # %% [markdown]
 # In an experiment, regions, rigid parts, further meshes, glue and materials are YAML, as in
-# [`experiment=beam_regions`](../simulator.md).
+# [`experiment=beam_regions`](../simulator.md#several-materials-rigid-parts-several-bodies).
 #
 # ## Summary
 #
-# Both moduli are recovered to within two per cent from three markers on the cap; on the whole body, the error with one
-# modulus is dozens of times that with two.
+# Both moduli are recovered to within two per cent from three markers on the cap. On the whole body, the error with one
+# modulus is more than twenty times that with two.
 
 # %%
 wanted = {"stiff_youngs_modulus": 350e3, "soft_youngs_modulus": 90e3}

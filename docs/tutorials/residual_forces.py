@@ -9,10 +9,10 @@
 # # Residual forces
 #
 # Identification optimises a simulator's parameters, but errors of its physics remain. The method of this
-# package reconstructs the forces that correct them, step by step, and learns to predict these:
+# package reconstructs the forces that correct these errors, step by step, and learns to predict them:
 #
-# 1. **reconstruct**: from each observed state, which force takes the simulator to the next one?
-# 2. **learn** that force as a function of the state,
+# 1. **reconstruct** the force that takes the simulator from an observed state to the next observed state;
+# 2. **learn** this force as a function of the state;
 # 3. **roll out** the simulator with the learned force, from its own states.
 #
 # The command `warp-resphys` does this for an experiment. This page does it in Python, for a beam whose simulator has
@@ -99,7 +99,7 @@ print(f"largest resultant force on the body: {force.sum(2).norm(dim=-1).max():.2
 #
 # The network's inputs are a few modes of the positions and velocities, its outputs a few modes of the force (proper
 # orthogonal decomposition of the training samples). Its linear part is fitted by ridge regression, and the network
-# learns the remainder. Tensors of torch and arrays of Warp share their memory without copies.
+# learns the remainder. Torch tensors and Warp arrays share their memory without copies.
 
 # %%
 samples = [series[:STEPS, train].flatten(0, 1) for series in (motion.q, motion.v, force)]
@@ -150,8 +150,8 @@ plt.show()
 # ## From markers
 #
 # For a real robot only a few points are observed. The regularised force then brings these points close to
-# the measurements, with little effect on the rest. Here four vertices of the tip and four at half length
-# are observed, with a regularisation for noise of a tenth of a millimetre.
+# the measurements, with little effect on the rest of the body. Here four vertices of the tip and four at half length
+# are observed, with noise of a tenth of a millimetre and a regularisation to match.
 
 # %%
 middle = select_vertices(mesh, x=0.05)
@@ -173,8 +173,8 @@ alone = error(uncorrected)[1:41].mean().item()
 print(f"error of all vertices from 8 noisy ones: {sum(off) / len(off):.2f} mm; without a force {alone:.2f} mm")
 
 # %% [markdown]
-# `warp-resphys experiment=marker_ablation` studies the number of markers. [Bring your robot](bring_a_beam.py) leads
-# from the markers of your own robot to a report.
+# `warp-resphys experiment=marker_ablation` studies the number of markers. [Bring your robot](bring_a_beam.py) shows
+# the way from the markers of your own robot to a report.
 
 # %%
 assert misfit < 1e-6

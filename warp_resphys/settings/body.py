@@ -97,14 +97,14 @@ class RigidSettings(Settings):
     """A rigid region, such as an end cap or an insert, by `fem.rigid.Rigid`."""
 
     density: Positive = setting(1200.0, unit="kg/m^3")
-    stiffness: Positive = setting(1.0e9, "of the energy that penalises deformation", "Pa")
+    stiffness: Positive = setting(1.0e9, "stiffness of the energy that penalises deformation", "Pa")
 
 
 class PartSettings(Settings):
     """A further mesh of the body, with cells of the same kind, which form a region with the name of the part."""
 
     mesh: MeshSettings
-    shift: Vector = setting((0.0, 0.0, 0.0), "from the coordinates of its own mesh", "m")
+    shift: Vector = setting((0.0, 0.0, 0.0), "displacement from the coordinates of its own mesh", "m")
 
 
 class GlueSettings(Settings):
@@ -120,15 +120,15 @@ class ChamberSettings(Settings):
     """Closed chambers of the mesh, each with its own pressure."""
 
     count: Natural = setting(description="expected number of chambers of the mesh")
-    axis: Direction = setting(description="along which chambers are numbered")
+    axis: Direction = setting(description="direction in which chambers are numbered")
 
 
 class FibreSettings(Settings):
     """Fibres wound around the chambers."""
 
-    angles: Many[float] = setting(description="from the circumference, one for each family", unit="degrees")
+    angles: Many[float] = setting(description="angles from the circumference, one per family", unit="degrees")
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
-    stiffness: NotNegative = setting(description="of a family, per length", unit="N/m")
+    stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")
 
 
 class RouteSettings(Settings):
@@ -137,7 +137,7 @@ class RouteSettings(Settings):
     guides: Curve = setting(description="points through which it runs", unit="m")
     pieces: Divisions = setting(1, "pieces into which each straight part is divided")
     fixed_guides: Many[int] = setting((), "numbers of guides, from 0, that stay in the world, such as pulleys")
-    entry_angle: NotNegative = setting(0.0, "of contact before the first guide, such as around pulleys", "rad")
+    entry_angle: NotNegative = setting(0.0, "contact angle before the first guide, such as around pulleys", "rad")
     offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
         (), "directions of an identified offset of the route: three numbers each, or three for each guide"
     )
@@ -184,7 +184,7 @@ class TendonSettings(Settings):
 class BundleSettings(Settings):
     """A muscle: its cells and its direction."""
 
-    direction: Direction = setting(description="of the fibres")
+    direction: Direction = setting(description="direction of the fibres")
     within: BoxSettings = setting(BoxSettings(), "cells with the muscle")
 
 
@@ -209,7 +209,7 @@ class MuscleSettings(Settings):
 class MediumSettings(Settings):
     """A fluid around the body."""
 
-    density: NotNegative = setting(description="of the fluid", unit="kg/m^3")
+    density: NotNegative = setting(description="density of the fluid", unit="kg/m^3")
     linear: NotNegative = setting(0.0, "viscous drag of the surface", "N s/m^3")
     normal: NotNegative = setting(0.0, "coefficient of the drag normal to the surface")
     tangential: NotNegative = setting(0.0, "coefficient of the drag along the surface")
@@ -233,14 +233,14 @@ class SolveSettings(Settings):
         1.0e-8, "residual at which a step is solved, over the forces in equilibrium"
     )
     absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
-    max_iterations: Natural = setting(500, "after which a step fails")
-    memory: Natural = setting(12, "pairs that L-BFGS keeps")
+    max_iterations: Natural = setting(500, "iterations after which a step fails")
+    memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
     refactor_after: Natural = setting(
         4,
         "iterations of a step (pardiso: three times as many) above which quasi_newton refactorises for the next one",
     )
     linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
-        "auto", "for Newton's equation; banded, bordered and pardiso run on the CPU alone"
+        "auto", "linear solver of Newton's equation; banded, bordered and pardiso run only on the CPU"
     )
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; residuals, states and gradients stay accurate"
@@ -297,12 +297,12 @@ class BodySettings(Settings):
 class SteppedSettings(BodySettings):
     """A body and its time integration."""
 
-    time_step: TimeStep = setting(0.01, "of the simulator", "s")
+    time_step: TimeStep = setting(0.01, "time step of the simulator", "s")
     integrator: Integrator = setting("implicit_euler", "time integrator")
 
 
 class TargetSettings(SteppedSettings):
-    """The simulation that plays the real body."""
+    """The simulation that stands in for the real body."""
 
     # `run.filled` moves constants that stand directly in ``target`` into its material.
     model_config = ConfigDict(
@@ -311,16 +311,16 @@ class TargetSettings(SteppedSettings):
         }
     )
 
-    material: MaterialSettings = setting(description="of its body")
+    material: MaterialSettings = setting(description="material of its body")
 
 
 class SimulatorSettings(SteppedSettings):
     """Settings of a simulator, without the material."""
 
-    gravity: Vector = setting((0.0, 0.0, -9.80709), unit="m/s^2")
+    gravity: Vector = setting((0.0, 0.0, -9.80709), "acceleration of gravity", "m/s^2")
     solver: SolveSettings = SolveSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
-    dtype: Literal["float64", "float32"] = setting("float64", "of the simulation; experiments need float64")
+    dtype: Literal["float64", "float32"] = setting("float64", "precision of the simulation; experiments need float64")
     coupling: Literal["implicit", "explicit"] = setting(
         "implicit", "pressure acts on the chambers at the end of a step (implicit) or at its start (explicit)"
     )

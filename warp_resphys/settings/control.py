@@ -31,7 +31,7 @@ class PlanSettings(Settings):
     spacing: Positive = setting(0.05, "between the knots of the inputs", "s")
     effort: Positive = setting(1.0e-3, "cost of inputs at their upper limits", "mm^2")
     change: Positive = setting(1.0e-3, "cost of inputs that change at their largest rate", "mm^2")
-    iterations: Natural = setting(6, "on the reduced model")
+    iterations: Natural = setting(6, "iterations on the reduced model")
     corrections: Count = setting(3, "with the robot's simulator")
     gradient: Literal["reduced", "adjoint"] = setting(
         "reduced", "gradients of the corrections: of the reduced model, or by the simulator's adjoint"
@@ -46,17 +46,17 @@ class HorizonSettings(Settings):
     pieces: Natural = setting(6, "constant pieces of the inputs in the horizon")
     effort: Positive = setting(1.0e-2, "cost of inputs at their upper limits", "mm^2")
     change: Positive = setting(1.0e-2, "cost of inputs that change at their largest rate", "mm^2")
-    iterations: Natural = setting(1, "at each step")
+    iterations: Natural = setting(1, "iterations per step")
 
 
 class EstimateSettings(Settings):
     """Standard deviations of the estimator, `control.estimate.Noise`."""
 
-    observed: Positive = setting(1.0e-4, "of a coordinate of a marker", "m")
+    observed: Positive = setting(1.0e-4, "standard deviation of a coordinate of a marker", "m")
     rate: Positive = setting(
-        0.3, "of the change of rates in a step beside the model, over their deviation in an oscillation of 1 mm"
+        0.3, "deviation of the unmodelled change of rates in a step, over their deviation in an oscillation of 1 mm"
     )
-    bias: Positive = setting(5.0e-3, "of the drift of the bias in a second", "m")
+    bias: Positive = setting(5.0e-3, "deviation of the drift of the bias in a second", "m")
 
 
 class FeedbackSettings(Settings):
@@ -74,9 +74,9 @@ class ReductionSettings(Settings):
         (4, 6, 8), "numbers of coordinates of the reduced model, of which the one with the least error is chosen"
     )
     equilibria: Natural = setting(192, "states at rest")
-    tangents: Natural = setting(96, "of these, states whose vibrations are computed")
-    motions: Natural = setting(6, "for the model, and as many for its error")
-    seconds: Positive = setting(2.5, "of a motion", "s")
+    tangents: Natural = setting(96, "number of these states whose vibrations are computed")
+    motions: Natural = setting(6, "number of motions for the fit, and as many for its error")
+    seconds: Positive = setting(2.5, "duration of a motion", "s")
     batch: Natural = setting(32, "equilibria that are computed at once")
 
 
@@ -88,10 +88,10 @@ class FigureSettings(Settings):
         ("eight", "circle", "R", "E", "S"), "circle, eight or capital letters"
     )
     seconds: Numbers = setting((4.0, 2.0), "durations of a path, beside a quarter of that before it", "s")
-    centre: Vector = setting(description="of the figure", unit="m")
-    size: Positive = setting(0.05, "of the larger side", "m")
-    right: Direction = setting((1.0, 0.0, 0.0), "of the plane of the figure")
-    up: Direction = setting((0.0, 1.0, 0.0), "of the plane of the figure")
+    centre: Vector = setting(description="centre of the figure", unit="m")
+    size: Positive = setting(0.05, "length of the larger side", "m")
+    right: Direction = setting((1.0, 0.0, 0.0), "direction to the right in the plane of the figure")
+    up: Direction = setting((0.0, 1.0, 0.0), "upward direction in the plane of the figure")
     limits: LimitsOfInputs
 
 

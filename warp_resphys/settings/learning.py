@@ -17,15 +17,15 @@ Size = Annotated[int, Field(ge=1, le=16_384)]
 class PriorSettings(Settings):
     """Normal prior of a parameter."""
 
-    mean: float = setting(description="in the parameter's unit")
-    deviation: Positive = setting(description="in the parameter's unit")
+    mean: float = setting(description="mean, in the parameter's unit")
+    deviation: Positive = setting(description="standard deviation, in the parameter's unit")
 
 
 class SpanSettings(Settings):
     """A range of values of a parameter."""
 
-    lower: float = setting(description="in the parameter's unit")
-    upper: float = setting(description="in the parameter's unit")
+    lower: float = setting(description="lower bound, in the parameter's unit")
+    upper: float = setting(description="upper bound, in the parameter's unit")
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
 
     @model_validator(mode="after")
@@ -79,11 +79,13 @@ class GridTable(Settings):
 class PlacementSettings(Settings):
     """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
 
-    markers: Positive | None = setting(None, "of each coordinate of a marker's or a rigid body's position", "m")
-    mounting: Positive | None = setting(None, "of each component of a rigid body's rotation on its part", "degrees")
-    shift: Positive | None = setting(None, "of each coordinate of the recordings' origin", "m")
-    turn: Positive | None = setting(None, "of each component of the recordings' rotation", "degrees")
-    between_sessions: Positive = setting(0.5, "of what a session differs from all by, over those above")
+    markers: Positive | None = setting(None, "deviation of a coordinate of a marker's or rigid body's position", "m")
+    mounting: Positive | None = setting(
+        None, "deviation of a component of a rigid body's rotation on its part", "degrees"
+    )
+    shift: Positive | None = setting(None, "deviation of a coordinate of the recordings' origin", "m")
+    turn: Positive | None = setting(None, "deviation of a component of the recordings' rotation", "degrees")
+    between_sessions: Positive = setting(0.5, "deviations between sessions, relative to those above")
 
 
 def _without_null(values: Any) -> Any:
@@ -101,8 +103,8 @@ Guesses = Annotated[dict[str, float], BeforeValidator(_without_null, json_schema
 class IdentifiedSettings(Settings):
     """Differences of the identified from the uncorrected simulator."""
 
-    integrator: Integrator | None = setting(None, "of the identified simulator; null: that of the uncorrected one")
-    substeps: Natural = setting(1, "of a time step, with an integrator of its own")
+    integrator: Integrator | None = setting(None, "integrator of the identified simulator; null: as uncorrected")
+    substeps: Natural = setting(1, "substeps per time step, with an integrator of its own")
     elastic: Ranges | None = setting(
         None, "ranges of youngs_modulus and poissons_ratio for the published identification of these two"
     )
@@ -115,15 +117,15 @@ class IdentifySettings(IdentifiedSettings):
         {}, "ranges by name, listed in docs/identification; null, or ~identify.parameters.NAME, takes one out"
     )
     placement: PlacementSettings | None = setting(None, "identify positions of markers and pose of the recordings")
-    first_guess: Guesses = setting({}, "of parameters without a value in the data sheet; null takes one out")
+    first_guess: Guesses = setting({}, "first guess of parameters without a value in the data sheet; null removes one")
     trials: Natural | None = setting(None, "training trials, evenly chosen; null: all")
     seconds: Positive | None = setting(None, "duration of each that is used; null: all", "s")
     starts: Natural = setting(1, "searches: from the first guess, and from the best random candidates")
     candidates: Count = setting(4, "random candidates")
-    max_evaluations: Natural = setting(10, "of the loss and its gradient, for each start")
+    max_evaluations: Natural = setting(10, "evaluations of the loss and its gradient per start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
     landscape: bool = setting(False, "whether the report shows the loss on the grid, which takes a while")
-    grid: GridTable | None = setting(None, "of the loss landscape")
+    grid: GridTable | None = setting(None, "grid of the loss landscape")
 
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:
@@ -160,7 +162,7 @@ class LawSettings(Settings):
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
     seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")
     max_evaluations: Natural | None = setting(
-        None, "of the loss and its gradient, in a search; null: 10, and 60 for a network"
+        None, "evaluations of the loss and its gradient in a search; null: 10, and 60 for a network"
     )
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which the search ends")
 
@@ -175,7 +177,7 @@ class ReconstructionSettings(Settings):
         1.0e-10, "weight of the forces; the published 1e-4 leaves up to 0.3 mm", "m^2/N^2"
     )
     tolerance: Positive = setting(1.0e-10, "last change of any position [m]; for lbfgsb, relative change of the loss")
-    max_iterations: Natural = setting(20, "after which a step fails")
+    max_iterations: Natural = setting(20, "iterations after which a step fails")
     modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")
 
 
@@ -193,7 +195,7 @@ class NetworkSettings(Settings):
     )
     blocks: Annotated[int, Field(ge=1, le=100)] = setting(1, "residual blocks")
     layers: Annotated[int, Field(ge=0, le=100)] = setting(3, "hidden layers of a block")
-    width: Size = setting(256, "of a layer")
+    width: Size = setting(256, "width of a layer")
     activation: Literal["normalised_elu", "silu"] = setting(
         "normalised_elu", "layer normalisation and ELU, as published; silu, without, is smoother"
     )
@@ -228,12 +230,12 @@ class TrainerSettings(EpochSettings):
     batch_size: Natural = setting(64, "steps")
     learning_rate: Positive = setting(2.0e-3, "initial")
     schedule: Literal["cosine", "step"] = setting(
-        "cosine", "of the learning rate: to final_learning_rate, or times gamma every step_epochs"
+        "cosine", "schedule of the learning rate: to final_learning_rate, or times gamma every step_epochs"
     )
-    final_learning_rate: Positive = setting(2.0e-6, "of schedule=cosine")
-    gamma: Share = setting(0.83, "of schedule=step")
-    step_epochs: Natural = setting(100, "of schedule=step")
-    weight_decay: NotNegative = setting(0.0, "of Adam")
+    final_learning_rate: Positive = setting(2.0e-6, "last learning rate of schedule=cosine")
+    gamma: Share = setting(0.83, "factor of schedule=step")
+    step_epochs: Natural = setting(100, "epochs between two steps of schedule=step")
+    weight_decay: NotNegative = setting(0.0, "weight decay of Adam")
     noise: NotNegative = setting(1.0e-3, "standard deviation of noise on the standardised inputs")
     linear_noise: Positive | None = setting(
         1.0e-3, "noise of the inputs for which the linear part is fitted; null: no linear part"
@@ -250,7 +252,7 @@ class TrainerSettings(EpochSettings):
 class FullBatchSettings(EpochSettings):
     """L-BFGS through the simulator."""
 
-    memory: Natural = setting(10, "pairs that L-BFGS keeps")
+    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
 
 
 class InTheLoopSettings(FullBatchSettings):
@@ -262,7 +264,7 @@ class InTheLoopSettings(FullBatchSettings):
         True, "without validation trials, choose the number of epochs by holding out each training trial once"
     )
     patience: Natural = setting(3, "epochs without improvement on held-out trials, after which training ends")
-    penalty: NotNegative = setting(1.0e-2, "on the squared weights")
+    penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
 
 
 class RefinementSettings(FullBatchSettings):
@@ -301,7 +303,7 @@ class ActuationSettings(Settings):
     """Inputs of networks beside the state."""
 
     filter_time_constants: Many[Positive] = setting(
-        (), "of exponential means of the inputs, for bodies that creep", "s"
+        (), "time constants of exponential means of the inputs, for bodies that creep", "s"
     )
     sees_payload: bool = setting(False, "whether the payload is an input of the network, for trials with many payloads")
 
@@ -314,7 +316,7 @@ class ReleaseSettings(Settings):
     )
     velocity_modes: Count = setting(0, "vibration modes of a velocity at the release")
     window: Positive = setting(
-        0.13, "after the release, for estimating delay, velocity and sideways displacement: about a period", "s"
+        0.13, "duration after the release for estimating delay, velocity and sideways displacement: about a period", "s"
     )
     noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
     delay: NotNegative = setting(
@@ -332,5 +334,5 @@ class AblationSettings(Settings):
 
     counts: Annotated[Some[Natural], AfterValidator(different)] = setting(description="numbers of markers")
     draws: Natural = setting(10, "random sets of each number")
-    processes: Natural | None = setting(None, "that share the numbers; null: one for each core, and one on a GPU")
+    processes: Natural | None = setting(None, "processes that share the numbers; null: one per core, and one on a GPU")
     modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")

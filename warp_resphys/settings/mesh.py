@@ -47,9 +47,9 @@ class PlaceSettings(_Given):
 class SymmetrySettings(_Given):
     """Symmetry planes: the mesh is one side of them, and its vertices in a plane only move within it."""
 
-    x: float | None = setting(None, "of the plane normal to x; null: none", "m")
-    y: float | None = setting(None, "of the plane normal to y", "m")
-    z: float | None = setting(None, "of the plane normal to z", "m")
+    x: float | None = setting(None, "position of the plane normal to x; null: none", "m")
+    y: float | None = setting(None, "position of the plane normal to y", "m")
+    z: float | None = setting(None, "position of the plane normal to z", "m")
     tolerance: Positive = setting(1e-9, "largest distance of a vertex in a plane", "m")
 
 
@@ -65,7 +65,9 @@ class HexahedralBox(Settings):
     """A box of hexahedra."""
 
     kind: Literal["box_hexahedra"]
-    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(
+        description="lengths of its edges", unit="m"
+    )
     divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
         description="cells along each edge"
     )
@@ -76,7 +78,9 @@ class TetrahedralBox(Settings):
     """A box of tetrahedra, six in each of its cells."""
 
     kind: Literal["box_tetrahedra"]
-    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(description="of its edges", unit="m")
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(
+        description="lengths of its edges", unit="m"
+    )
     divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
         description="cells along each edge"
     )
@@ -96,8 +100,8 @@ class FileMesh(Settings):
     """A tetrahedral or hexahedral mesh from a file that meshio reads."""
 
     kind: Literal["file"]
-    path: Word = setting(description="of the file")
-    units: LengthUnit = setting("m", "of the file")
+    path: Word = setting(description="path of the file")
+    units: LengthUnit = setting("m", "unit of the file")
     order: Order = setting(1, "2 adds edge midpoints to linear tetrahedra")
     drop_unreferenced: bool = setting(False, "leave out vertices that belong to no cell")
 
@@ -106,8 +110,8 @@ class SurfaceMesh(Settings):
     """The interior of a closed surface of triangles, filled with tetrahedra; closed surfaces inside it are cavities."""
 
     kind: Literal["surface"]
-    path: Word = setting(description="of an STL, OBJ or PLY file")
-    units: LengthUnit = setting("mm", "of the file")
+    path: Word = setting(description="path of an STL, OBJ or PLY file")
+    units: LengthUnit = setting("mm", "unit of the file")
     size: Positive = setting(0.01, "length of the edges of tetrahedra", "m")
     order: Order = setting(2, "1: linear tetrahedra, which bend far too stiffly")
 
@@ -135,23 +139,23 @@ class ShippedArm(Settings):
     """One of the arms with six chambers of the package."""
 
     kind: Literal["arm"]
-    name: Word = setting(description="of the arm, such as arm_hexahedra_1400")
+    name: Word = setting(description="name of the arm, such as arm_hexahedra_1400")
 
 
 class GeneratedArm(Settings):
     """A pneumatic arm of given dimensions, by default those of SoPrA."""
 
     kind: Literal["arm_generated"]
-    size: Positive = setting(0.01, "of the cells", "m")
+    size: Positive = setting(0.01, "size of the cells", "m")
     cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
     layers: Positive | None = setting(None, "length of hexahedra along the arm; null: 2.5 times the size", "m")
     order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
-    chamber_lengths: Some[Positive] = setting((0.120, 0.120), "of the chambers of each segment", "m")
+    chamber_lengths: Some[Positive] = setting((0.120, 0.120), "lengths of the chambers, one per segment", "m")
     caps: Some[Positive] = setting((0.010, 0.021, 0.005), "solid parts before, between and after the chambers", "m")
     radii: Some[Positive] = setting(
-        (0.0283923, 0.0212942, 0.0165622), "before the first chambers and after those of each segment", "m"
+        (0.0283923, 0.0212942, 0.0165622), "radii before the first chambers and after those of every segment", "m"
     )
-    chambers: Natural = setting(3, "of each segment")
+    chambers: Natural = setting(3, "chambers per segment")
     profile: Word = setting("half_disc", "half_disc, disc or sector")
     outline: Word = setting("lobed", "lobed, around the chambers, or round")
     wall: Positive = setting(0.004, "thickness of the wall", "m")
@@ -160,7 +164,9 @@ class GeneratedArm(Settings):
         None, "distance of the chambers from the axis, at the base; null: the least for the webs", "m"
     )
     rotations: Many[float] = setting(
-        (), "of the chambers of each segment about the axis; for tetrahedra and a round outline", "degrees"
+        (),
+        "rotations of the chambers about the axis, one per segment; only for tetrahedra and a round outline",
+        "degrees",
     )
 
 

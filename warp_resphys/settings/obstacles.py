@@ -9,7 +9,7 @@ from .mesh import Direction, LengthUnit
 
 
 class _Placed(Settings):
-    position: Vector = setting((0.0, 0.0, 0.0), "of its centre; of a half-space, of a point of its plane", "m")
+    position: Vector = setting((0.0, 0.0, 0.0), "position of its centre; of a half-space, a point of its plane", "m")
     axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
     moves: bool = setting(False, "whether it moves, by `data.obstacle_motion` or by inputs of a robot")
 
@@ -32,7 +32,7 @@ class CapsuleSettings(_Placed):
 
     shape: Literal["capsule"]
     radius: Positive = setting(unit="m")
-    length: Positive = setting(description="along its axis, without the half-spheres", unit="m")
+    length: Positive = setting(description="length along its axis, without the half-spheres", unit="m")
 
 
 class CylinderSettings(_Placed):
@@ -40,7 +40,7 @@ class CylinderSettings(_Placed):
 
     shape: Literal["cylinder"]
     radius: Positive = setting(unit="m")
-    length: Positive = setting(description="along its axis", unit="m")
+    length: Positive = setting(description="length along its axis", unit="m")
 
 
 class CuboidSettings(_Placed):
@@ -56,9 +56,9 @@ class SurfaceSettings(_Placed):
     """The interior of a closed surface, by its distances on a grid."""
 
     shape: Literal["surface"]
-    path: Word = setting(description="of an STL, OBJ or PLY file; its z axis is along `axis`")
-    units: LengthUnit = setting("mm", "of the file")
-    spacing: Positive = setting(1.0e-3, "of the grid, over about which edges are rounded", "m")
+    path: Word = setting(description="path of an STL, OBJ or PLY file; its z axis is along `axis`")
+    units: LengthUnit = setting("mm", "unit of the file")
+    spacing: Positive = setting(1.0e-3, "spacing of the grid, about the radius of rounded edges", "m")
 
 
 ObstacleSettings = Annotated[
@@ -78,10 +78,12 @@ class FrictionPairSettings(Settings):
 class SurfaceContactSettings(Settings):
     """Contact of the body with itself, and of its parts with one another, by `energies.surfaces`."""
 
-    stiffness: Positive = setting(1.0e5, "of the barrier, from which the gap between resting surfaces follows", "Pa")
+    stiffness: Positive = setting(
+        1.0e5, "stiffness of the barrier, which determines the gap between resting surfaces", "Pa"
+    )
     friction: NotNegative = setting(0.0, "coefficient of friction")
-    distance: Positive = setting(1.0e-3, "at which contact begins", "m")
-    slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")
+    distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
+    slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
     pairs: dict[str, FrictionPairSettings] = setting({}, "friction of pairs of regions, by name, the first that fits")
 
 
@@ -89,11 +91,11 @@ class ContactSettings(Settings):
     """Contact of the body with its obstacles, by `energies.contact`."""
 
     stiffness: Positive | dict[str, Positive] = setting(
-        1.0e5, "of the barrier, a number or one by obstacle; the gap of a resting body follows from it", "Pa"
+        1.0e5, "stiffness of the barrier, a number or one per obstacle; it determines the gap of a resting body", "Pa"
     )
     friction: NotNegative | dict[str, NotNegative] = setting(
         0.0, "coefficient of friction, a number or one by obstacle"
     )
-    distance: Positive = setting(1.0e-3, "at which contact begins", "m")
-    slip_speed: Positive = setting(1.0e-3, "at which friction is fully developed", "m/s")
+    distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
+    slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
     friction_factors: dict[str, NotNegative] = setting({}, "factors of the friction of regions of the mesh, by name")

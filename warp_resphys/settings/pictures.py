@@ -30,7 +30,7 @@ class LensSettings(Settings):
     file: Word | None = setting(None, "calibration by OpenCV or ROS, in the folder of the pictures")
     matrix: _Rows | None = setting(None, "K, row by row", "px")
     row_time: float = setting(
-        0.0, "of a rolling shutter, from the exposure of a row to that of the next below; 0: all at once", "s"
+        0.0, "time of a rolling shutter from the exposure of a row to that of the row below; 0: all at once", "s"
     )
 
     @model_validator(mode="after")
@@ -55,20 +55,20 @@ _Lenses = Annotated[
 class CloudSettings(Settings):
     """Scans of the surface of bodies, and depth images."""
 
-    units: LengthUnit = setting("m", "of scans")
+    units: LengthUnit = setting("m", "unit of scans")
     depth_unit: Positive = setting(1e-3, "length that an integer of a depth image stands for", "m")
     noise: Positive = setting(1e-3, "standard deviation of a distance from the surface", "m")
     reach: Positive = setting(0.05, "distance from the body, beyond which a point is of something else", "m")
-    points: Natural = setting(1000, "of each scan or depth image, chosen at random")
+    points: Natural = setting(1000, "points per scan or depth image, chosen at random")
 
 
 class TagSettings(Settings):
     """A square tag on the clamp, from which the camera's place is computed in place of world_to_camera."""
 
-    dictionary: Word = setting("6x6_250", "of OpenCV's ArUco tags, such as 4x4_50 or apriltag_36h11")
-    number: Count = setting(0, "of the tag")
-    size: Positive = setting(description="of its black square", unit="m")
-    centre: Vector = setting((0.0, 0.0, 0.0), "in the axes of the mesh", "m")
+    dictionary: Word = setting("6x6_250", "dictionary of OpenCV's ArUco tags, such as 4x4_50 or apriltag_36h11")
+    number: Count = setting(0, "number of the tag")
+    size: Positive = setting(description="edge of its black square", unit="m")
+    centre: Vector = setting((0.0, 0.0, 0.0), "centre of the tag in the axes of the mesh", "m")
     right: Vector = setting((1.0, 0.0, 0.0), "direction of its upper edge")
     up: Vector = setting((0.0, 1.0, 0.0), "direction of its left edge")
 
@@ -77,8 +77,8 @@ class ReleasedForceSettings(Settings):
     """A force that holds a body at rest and is then released."""
 
     at: PlaceSettings = setting(description="vertices that carry it, in equal shares")
-    force: Vector = setting(description="in the axes of the scene", unit="N")
-    time: float = setting(0.0, "of the release, on the clock of the frames", "s")
+    force: Vector = setting(description="force in the axes of the scene", unit="N")
+    time: float = setting(0.0, "time of the release, on the clock of the frames", "s")
 
 
 class PoseSettings(Settings):
@@ -97,10 +97,10 @@ class PoseSettings(Settings):
         None, "file of a scan of its surface, in its folder: .ply, .xyz, .pcd, .npy, .obj, .off or .stl"
     )
     depth: bool = setting(True, "whether depth images of its frames are compared")
-    gravity: Vector | None = setting(None, "in the axes of the scene; null: as configured", "m/s^2")
+    gravity: Vector | None = setting(None, "gravity in the axes of the scene; null: as configured", "m/s^2")
     clamp_turn: float = setting(0.0, "about which the second clamp is turned against the first", "degrees")
     release: ReleasedForceSettings | None = setting(
-        None, "of a force, after which the body moves, in frames with times; null: it rests"
+        None, "release of a force, after which the body moves, in frames with times; null: it rests"
     )
 
 
@@ -112,13 +112,15 @@ class SimulatedCamera(Settings):
     noise: NotNegative = setting(
         1.0, "standard deviation of an outline, across it, and of each coordinate of a tracked point", "px"
     )
-    frames: Natural = setting(60, "of a body that is released")
-    frame_rate: Positive = setting(60.0, "of these frames", "Hz")
+    frames: Natural = setting(60, "number of frames of a released body")
+    frame_rate: Positive = setting(60.0, "rate of these frames", "Hz")
     row_time: float | None = setting(None, "true time between two rows; null: that of the lens", "s")
-    substeps: Natural = setting(2, "of a time step, in true motions")
-    depth: NotNegative | None = setting(None, "standard deviation of each pixel of depth images; null: no such", "m")
+    substeps: Natural = setting(2, "substeps per time step in true motions")
+    depth: NotNegative | None = setting(
+        None, "standard deviation of each pixel of depth images; null: no depth images", "m"
+    )
     size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
-    place: Vector = setting(description="of the camera", unit="m")
+    place: Vector = setting(description="position of the camera", unit="m")
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
 
     def check_release(self, pose: str, time: float) -> None:
@@ -136,24 +138,24 @@ class PictureData(Settings):
     """Bodies before a camera, at rest or released: outlines and tracked points in pictures."""
 
     kind: Literal["pictures"]
-    folder: Word | None = setting(None, "of the pictures")
+    folder: Word | None = setting(None, "folder of the pictures")
     lens: _Lenses | None = setting(
-        None, "of the camera; of several cameras, by their names: {left: {file: left.yaml}, right: {...}}"
+        None, "lens of the camera; of several cameras, by name: {left: {file: left.yaml}, right: {...}}"
     )
-    tag: TagSettings | None = setting(None, "on the clamp; null: frames have world_to_camera")
+    tag: TagSettings | None = setting(None, "tag on the clamp; null: frames have world_to_camera")
     stands: bool = setting(
         True, "whether the camera stands still during a pose, so that the poses of its frames differ by errors alone"
     )
-    order: Literal[1, 2] = setting(2, "of the elements of meshes in the folders of poses")
-    units: LengthUnit = setting("m", "of these meshes")
+    order: Literal[1, 2] = setting(2, "order of the elements of meshes in the folders of poses")
+    units: LengthUnit = setting("m", "unit of these meshes")
     mask: ColourSettings | None = setting(None, "colours of the bodies, where frames have no masks")
     points: dict[str, Vector] = setting({}, "places of tracked points on the undeformed body, by name", "m")
-    likelihood: _Fraction = setting(0.6, "of a tracked point, below which it counts as not seen")
-    cloud: CloudSettings = setting(CloudSettings(), "of scans and depth images")
+    likelihood: _Fraction = setting(0.6, "likelihood below which a tracked point counts as not seen")
+    cloud: CloudSettings = setting(CloudSettings(), "settings of scans and depth images")
     materials: dict[str, dict[str, float]] = setting(
         {}, "constants of materials by name, where they differ from the group simulation"
     )
-    poses: dict[str, PoseSettings] = setting(description="by name")
+    poses: dict[str, PoseSettings] = setting(description="poses by name")
     train: Some[Word] = setting(description="poses that identify the material")
     test: Many[Word] = setting((), "poses that are predicted with it")
     limit: LimitSettings | None = setting(None, "fewer poses, the first of each split")

@@ -20,13 +20,14 @@ from .run import RunSettings
 
 _HEAD: Final = """# Settings
 
-Every key of a run, from the classes in `warp_resphys/settings`. Units are SI. `warp-resphys --cfg job` shows the
+This page lists every key of a run, for looking up names, units and ranges; [Bring your robot](bring_your_robot.md)
+shows the few that a configuration needs. Units are SI. `warp-resphys --cfg job` shows the
 values of a run, and `key=value` on the command line or in a file of `configs/experiment` sets one. `NAME` stands for
 any name. In `simfree`, keys that are left out are as in the groups `network` and `trainer`.
 
 `python -m warp_resphys.settings.reference configs/settings.schema.json` writes a JSON Schema, with which editors
-complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`. This page is
-made by `python -m warp_resphys.settings.reference docs/settings.md`.
+complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`.
+`python -m warp_resphys.settings.reference docs/settings.md` writes this page.
 """
 
 _TARGETS: Final = {

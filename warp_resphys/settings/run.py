@@ -68,7 +68,7 @@ class ParallelSettings(Settings):
     backend: Literal["local", "ray", "dask"] = setting(
         "local", "processes of this machine, or of a cluster with the same folders"
     )
-    address: Word | None = setting(None, "of the cluster, such as ray://head:10001; null: a cluster on this machine")
+    address: Word | None = setting(None, "address of the cluster, such as ray://head:10001; null: a local cluster")
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
 
 
@@ -77,32 +77,36 @@ class PublishedSettings(Settings):
 
     simulation: MaterialSettings = setting(description="its material")
     physics: PhysicsSettings = setting(description="its masses and volumes")
-    integrator: Integrator = setting(description="its integrator")
+    integrator: Integrator = setting(description="its time integrator")
 
 
 class RunSettings(SimulatorSettings):
     """The configuration of a run."""
 
-    name: Name = setting(description="of the experiment; the folder of its runs")
-    title: Word = setting(description="of the report")
+    name: Name = setting(description="name of the experiment and of the folder of its runs")
+    title: Word = setting(description="title of the report")
     seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
-        0, "of all random numbers"
+        0, "seed of all random numbers"
     )
     tip: PlaceSettings | None = setting(None, "vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
-    target: TargetSettings | None = setting(None, "plays the real body where data are simulated")
+    target: TargetSettings | None = setting(
+        None, "simulation that stands in for the real body where data are simulated"
+    )
     data: DataSettings
     markers: MarkerSettings | None = setting(
         None, "observed markers; null: every vertex is observed, as in simulations"
     )
-    laboratory: LaboratorySettings | None = setting(None, "plays the real body where there are no recordings")
+    laboratory: LaboratorySettings | None = setting(
+        None, "simulation that stands in for the real body where there are no recordings"
+    )
     published: PublishedSettings | None = setting(None, "simulation to compare with")
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
     law: Annotated[LawSettings | None, BeforeValidator(_law_of, json_schema_input_type=LawSettings | str | None)] = (
         setting(None, "law of the material to identify; null: none")
     )
     shapes: dict[str, ShapeSettings] = setting(
-        {}, "other bodies by name, on which the identified material is tested, where a simulation plays the real body"
+        {}, "other bodies by name, on which the identified material is tested, where the real body is simulated"
     )
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     network: NetworkSettings = NetworkSettings()
@@ -164,7 +168,7 @@ class RunSettings(SimulatorSettings):
 
     @property
     def targets(self) -> dict[str, TargetSettings]:
-        """The simulation that plays the real body, by its key; empty where the data are recordings of a real one."""
+        """The simulation that stands in for the real body, by key; empty if the data are recordings of a real body."""
         own = {"target": None if self.recorded is not None else self.target}
         own |= {"laboratory": self.laboratory if self.is_laboratory else None}
         return {key: settings for key, settings in own.items() if settings is not None}
@@ -268,7 +272,9 @@ class RunSettings(SimulatorSettings):
                 f"shapes are bodies with the identified material of a simulated target, but {why}: leave shapes out."
             )
         if self.recorded is None and self.target is None:
-            raise ValueError("target is null: give the simulation that plays the real body, such as its material.")
+            raise ValueError(
+                "target is null: give the simulation that stands in for the real body, such as its material."
+            )
         if self.is_laboratory and self.laboratory is None:
             raise ValueError("data.folder is not set: give the folder of the recordings.")
         if self.mesh_check is not None and self.markers is None:

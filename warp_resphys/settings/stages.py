@@ -45,7 +45,7 @@ class SimulationStage(SimulatorSettings):
 
 
 class SimulateStage(SimulationStage):
-    """Trials of a simulation that plays the real body, with all vertices observed."""
+    """Trials of a simulation that stands in for the real body, with all vertices observed."""
 
     target: TargetSettings
     data: Annotated[SimulatedData, Field(discriminator="kind")]

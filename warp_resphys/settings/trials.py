@@ -43,7 +43,7 @@ class SwingSettings(Settings):
     frequency: Positive = setting(unit="Hz")
     translation: Vector = setting((0.0, 0.0, 0.0), "amplitudes along x, y and z", "m")
     rotation: Vector = setting((0.0, 0.0, 0.0), "amplitudes about x, y and z", "rad")
-    phase: float = setting(0.0, "at time zero", "rad")
+    phase: float = setting(0.0, "phase at time zero", "rad")
 
 
 class MotionSettings(Settings):
@@ -68,10 +68,10 @@ class WaveSettings(Settings):
     """Periodic inputs, `data.actuation.InputWaves`."""
 
     frequency: Positive = setting(unit="Hz")
-    phases: Some[float] = setting(description="at the start, of each chamber, tendon or muscle", unit="rad")
-    mean: float = setting(description="in the unit of the input")
-    amplitude: Positive = setting(description="in the unit of the input")
-    start: NotNegative = setting(0.0, "before which there are no inputs", "s")
+    phases: Some[float] = setting(description="initial phases, one per chamber, tendon or muscle", unit="rad")
+    mean: float = setting(description="mean, in the unit of the input")
+    amplitude: Positive = setting(description="amplitude, in the unit of the input")
+    start: NotNegative = setting(0.0, "time before which there are no inputs", "s")
     ramp: NotNegative = setting(0.0, "duration in which they grow from zero", "s")
 
 
@@ -87,13 +87,13 @@ class TrialSettings(Settings):
     inputs: Some[float] | None = setting(None, "constant inputs, one for each chamber, tendon or muscle")
     onset: NotNegative | None = setting(None, "start of the inputs, by the clock of the recording; null: at once", "s")
     input_delay: float = setting(0.0, "delay of the inputs against their log, as clocks differ", "s")
-    labels: Labels | None = setting(None, "of the markers of its file, in their order; null: those of the file")
-    session: Word | None = setting(None, "in which it was recorded; null: one session")
+    labels: Labels | None = setting(None, "labels of the markers in the order of its file; null: those of the file")
+    session: Word | None = setting(None, "session in which it was recorded; null: one session")
     payload: NotNegative = setting(0.0, "mass that hangs on the body", "kg")
     waves: WaveSettings | None = setting(None, "periodic inputs of a simulated trial, in place of random ones")
     pull: Vector | None = setting(None, "force at the tip that holds a simulated body before its release", "N")
-    base_motion: MotionSettings | None = setting(None, "of this trial, in place of data.base_motion")
-    obstacle_motion: ObstacleMotions = setting({}, "of this trial, in place of data.obstacle_motion, by obstacle")
+    base_motion: MotionSettings | None = setting(None, "motion of the base in this trial, in place of data.base_motion")
+    obstacle_motion: ObstacleMotions = setting({}, "motion by obstacle in this trial, in place of data.obstacle_motion")
 
 
 def _file(value: Any) -> Any:
@@ -194,7 +194,7 @@ class AmountSettings(Settings):
 
 
 class _Simulated(Settings):
-    steps: Natural = setting(description="of each trial")
+    steps: Natural = setting(description="time steps per trial")
     base_motion: MotionSettings | None = setting(None, "motion of the base")
     obstacle_motion: ObstacleMotions = setting({}, "motion of obstacles from their places, by obstacle")
     folds: Literal["leave_one_out"] | None = setting(None, "cross-validation in place of the split")
@@ -211,10 +211,10 @@ class HeldSettings(Settings):
     """How a body is held before its release, in a test trial of its own."""
 
     weight_g: NotNegative = setting(0.0, "weight", unit="g")
-    direction: Direction = setting((0.0, 0.0, -1.0), "in which it pulls")
+    direction: Direction = setting((0.0, 0.0, -1.0), "direction in which it pulls")
     at: PlaceSettings | None = setting(None, "vertices that carry it, in equal shares; null: data.load")
     twist_deg: float = setting(0.0, "angle of the high end of a body that is held in a twist instead", "degrees")
-    twist_axis: Axis = setting("x", "along which the angle grows linearly, from zero at the low end")
+    twist_axis: Axis = setting("x", "axis along which the angle grows linearly, from zero at the low end")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -239,8 +239,8 @@ class ReleaseFromTwist(_Simulated):
     """Bodies that are released from a twist."""
 
     kind: Literal["release_from_twist"]
-    twist_axis: Axis = setting(description="along which the angle grows linearly, from zero at the low end")
-    angles_deg: AmountSettings = setting(description="of the high end", unit="degrees")
+    twist_axis: Axis = setting(description="axis along which the angle grows linearly, from zero at the low end")
+    angles_deg: AmountSettings = setting(description="angle of the high end", unit="degrees")
 
 
 class MovingBase(_Simulated):
@@ -258,7 +258,7 @@ class TableSettings(Settings):
     """Columns of CSV or TSV files without a header, or with another one."""
 
     columns: Many[Word | None] = setting((), "headers such as 'time [s]' or 'tip.x [mm]'; null: not read")
-    names: dict[str, Word] = setting({}, "in place of columns, such headers by those of the file; others are not read")
+    names: dict[str, Word] = setting({}, "in place of columns: such headers by those of the file; others are not read")
     header_lines: Count = setting(0, "lines before the first row of numbers, or with names before the header")
 
     @model_validator(mode="after")
@@ -280,16 +280,16 @@ class BagSettings(Settings):
     inputs: Many[Word] = setting((), "topics of the inputs, with their unit in brackets: '/pressure#1 [mbar]'")
     base: Word | None = setting(None, "topic of the pose of the base")
     rate: Positive | None = setting(
-        None, "of the frames to which messages are brought; null: of the first marker", "Hz"
+        None, "rate of the frames to which messages are resampled; null: rate of the first marker", "Hz"
     )
 
 
 class ReadingSettings(Settings):
     """Reading of recordings and their transformation into the frame of the body."""
 
-    folder: Word | None = setting(None, "of the recordings; null: the group laboratory plays the real body")
-    units: LengthUnit | None = setting(None, "of files that do not name their unit")
-    rate: Positive | None = setting(None, "of files that do not have a frame rate", "Hz")
+    folder: Word | None = setting(None, "folder of the recordings; null: the group laboratory simulates the real body")
+    units: LengthUnit | None = setting(None, "unit of files that do not state one")
+    rate: Positive | None = setting(None, "frame rate of files that do not state one", "Hz")
     table: TableSettings | None = setting(None, "columns of tables without headers")
     bag: BagSettings | None = setting(None, "topics of ROS bags")
     axes: Annotated[Many[SignedAxis], Field(min_length=3, max_length=3), AfterValidator(different)] | None = setting(
@@ -320,26 +320,28 @@ class ReadingSettings(Settings):
         None, "chamber, tendon or muscle, from 1, of each column of inputs; null: in their order"
     )
     input_limit: Positive | None = setting(
-        None, "in the unit of the input: recorded inputs beyond it are refused, simulated ones are clipped"
+        None, "largest input, in its unit: larger recorded inputs are refused, simulated ones are clipped"
     )
     valve: Literal["recorded", "detected"] = setting(
         "recorded", "start of the inputs: of the files, or detected by the motion of the markers"
     )
-    cutoff: Positive | None = setting(None, "of the low-pass filter for reconstruction; errors are not filtered", "Hz")
+    cutoff: Positive | None = setting(
+        None, "cutoff of the low-pass filter for reconstruction; errors are not filtered", "Hz"
+    )
 
 
 class RecordedData(ReadingSettings):
     """Trials that are observed through markers, recorded or played by a simulated laboratory."""
 
     kind: Literal["recorded"]
-    trials: TrialTable = setting({}, "by name; none: all files of the folder")
+    trials: TrialTable = setting({}, "trials by name; none: all files of the folder")
     sequences: Count = setting(0, "trials of the laboratory under random inputs: t000, t001, ...")
     begins: Begins = setting(
         "held",
         "held at rest, for 0.2 s or more, until the release; released with the first frame; rest, until inputs are "
         "applied; driven, at rest under the first inputs; slack, where those do not act; static, a pose",
     )
-    train_fraction: Share = setting(1.0, "of each trial, from its start, that is used for training")
+    train_fraction: Share = setting(1.0, "share of every trial, from its start, that is used for training")
     horizons: Annotated[Many[Positive], AfterValidator(rising)] = setting(
         (), "durations from the start, over which errors are reported as well", "s"
     )
@@ -404,7 +406,7 @@ class BindingSettings(Settings):
     bind: Literal["normal", "frame", "rigid", "patch"] = setting("normal", "how tracked markers follow the body")
     bind_to: PlaceSettings | None = setting(None, "vertices that rigid markers follow")
     patch: Positive = setting(0.02, "radius of the patch of vertices that a patch marker follows", "m")
-    largest_distance: Positive = setting(0.02, "from the surface of the body", "m")
+    largest_distance: Positive = setting(0.02, "largest distance from the surface of the body", "m")
     observation: OwnObservation = setting(
         {}, "observation of tracked markers by another package, in place of bind: its name with its own keys"
     )
@@ -438,11 +440,15 @@ class MarkerSettings(BindingSettings):
         "recorded", "names of the files; assigned: names are assigned by position"
     )
     register_with: Labels | None = setting(None, "markers that register the recordings; null: all of a body at rest")
-    largest_residual: Positive = setting(0.004, "of the registration, due to errors of the nominal positions", "m")
+    largest_residual: Positive = setting(
+        0.004, "largest residual of the registration, due to errors of the nominal positions", "m"
+    )
     largest_distortion: Positive = setting(
         0.001, "largest motion of a reference marker relative to the others between trials", "m"
     )
-    largest_shift: Positive | None = setting(None, "of one in the frame of the recordings; null: any", "m")
+    largest_shift: Positive | None = setting(
+        None, "largest shift of a reference marker in the frame of the recordings; null: any", "m"
+    )
 
     @model_validator(mode="after")
     def _are_bound(self) -> Self:
@@ -473,38 +479,42 @@ class MarkerSettings(BindingSettings):
 class SequenceSettings(Settings):
     """Random inputs of a laboratory, `data.actuation.InputSequences`."""
 
-    mean: float = setting(8e3, "in the unit of the input")
-    deviation: Positive = setting(9e3, "in the unit of the input")
-    correlation_time: Positive = setting(0.4, "of the random process", "s")
-    correlation: float | Many[Many[float]] = setting(0.0, "between parts, or a matrix")
+    mean: float = setting(8e3, "mean, in the unit of the input")
+    deviation: Positive = setting(9e3, "standard deviation, in the unit of the input")
+    correlation_time: Positive = setting(0.4, "correlation time of the random process", "s")
+    correlation: float | Many[Many[float]] = setting(
+        0.0, "correlation of the inputs of different parts: one number or a matrix"
+    )
     rest: NotNegative = setting(0.1, "duration without inputs at the start and at the end", "s")
 
 
 class PlaySettings(TargetSettings):
-    """A simulation that plays the real body, and its cameras."""
+    """A simulation that stands in for the real body, and its cameras."""
 
     model_config = ConfigDict(json_schema_extra={"additionalProperties": False})
 
     sequences: SequenceSettings = setting(SequenceSettings(), "random inputs")
-    rate: Positive | None = setting(None, "of the cameras; null: one frame a time step", "Hz")
-    noise: NotNegative = setting(description="of each coordinate of a marker", unit="m")
-    placement_noise: NotNegative = setting(description="of each coordinate of a marker's place", unit="m")
-    orientation_noise: Annotated[float, Field(ge=0.0, le=45.0)] = setting(
-        0.0, "of each component of a rigid body's rotation", unit="degrees"
+    rate: Positive | None = setting(None, "frame rate of the cameras; null: one frame per time step", "Hz")
+    noise: NotNegative = setting(description="noise of a coordinate of a marker", unit="m")
+    placement_noise: NotNegative = setting(
+        description="noise of a coordinate of a marker's position on the body", unit="m"
     )
-    zero_noise: NotNegative = setting(0.0, "of the zero of a trial's recorded inputs, in the unit of the input")
-    tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "of the body from level", "degrees")
-    held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "before the release", "s")
+    orientation_noise: Annotated[float, Field(ge=0.0, le=45.0)] = setting(
+        0.0, "noise of a component of a rigid body's rotation", unit="degrees"
+    )
+    zero_noise: NotNegative = setting(0.0, "noise of the zero of a trial's recorded inputs, in the unit of the input")
+    tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "tilt of the body from level", "degrees")
+    held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "recorded duration before the release", "s")
     seconds: Positive | None = setting(None, "recorded after the release", "s")
 
 
 class LaboratorySettings(PlaySettings):
-    """The simulation that plays the real body, and its trials."""
+    """The simulation that stands in for the real body, and its trials."""
 
-    trials: TrialTable = setting({}, "by name: payloads and beginnings")
-    train: Trials | None = setting(None, "its own split, in place of that of data")
-    validation: Trials | None = setting(None, "its own split")
-    test: Trials | None = setting(None, "its own split")
+    trials: TrialTable = setting({}, "trials by name: payloads and beginnings")
+    train: Trials | None = setting(None, "training trials, in place of those of data")
+    validation: Trials | None = setting(None, "validation trials")
+    test: Trials | None = setting(None, "test trials")
 
     @model_validator(mode="after")
     def _is_split_whole(self) -> Self:

@@ -239,7 +239,11 @@ class Simulator:
         return state
 
     def step(
-        self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
+        self,
+        state: State,
+        inputs: Inputs | None = None,
+        parameters: Parameters | Constants | None = None,
+        near: torch.Tensor | None = None,
     ) -> tuple[State, SolveReport]:
         """Advances a batch by one time step.
 
@@ -250,6 +254,8 @@ class Simulator:
             state: state at the start.
             inputs: inputs during the step.
             parameters: parameters or prepared constants (`prepare`).
+            near: (B, N, 3) predicted positions at the end of the step, such as those of a motion with similar
+                parameters; they affect the result only within the solver's tolerance [m].
 
         Returns:
             The new state, differentiable, and the solver's report.
@@ -258,18 +264,24 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: the solver failed, if `SolverSettings.on_failure` is ``raise``.
         """
-        new, report, x = self._advance(state, *self._checked(state, inputs, parameters))
+        inputs, constants = self._checked(state, inputs, parameters)
+        if near is not None:
+            check_tensor("near", near, tuple(state.q.shape), "m", "vertex", state.q)
+        new, report, x = self._advance(state, inputs, constants, near)
         check_converged(self.settings, report, x)
         return new, report
 
-    def _advance(self, state: State, inputs: Inputs, constants: Constants) -> tuple[State, SolveReport, torch.Tensor]:
+    def _advance(
+        self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None = None
+    ) -> tuple[State, SolveReport, torch.Tensor]:
         """Returns the next state, and report and solution (B, N, 3) of its solve [m]."""
         stage = self.method.stage(state, self.time_step)
         workspace = self.workspace(state.batch)
         terms = self._terms.of_step(state, stage, inputs, constants, workspace.potential.energies)
         clamped = self._fixed_at(state, stage, inputs)
         follows = workspace.follows(state.q)
-        x, report = equilibrium(workspace, "dynamics", self.settings, terms, stage.target, clamped, follows)
+        start = stage.target if near is None else self.method.solution_for(state, near).detach()
+        x, report = equilibrium(workspace, "dynamics", self.settings, terms, start, clamped, follows)
         x = self._coordinates.expand(x)
         new = self._finish(state, stage, inputs, constants, x)
         workspace.record_positions(new.q)
@@ -454,6 +466,39 @@ class Simulator:
             x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
         else:
             x = find_equilibrium(solve, rest, guess, limited)
+        return self._resting(state, inputs, constants, x)
+
+    def linearise_equilibrium(
+        self, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None, batch: int = 1
+    ) -> Linearisation:
+        """Returns the residual of a static equilibrium and its derivative, as `linearise` does for a step.
+
+        Args:
+            inputs: constant inputs.
+            parameters: parameters or prepared constants (`prepare`).
+            batch: number of environments.
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, or forces that depend on the pose without a potential
+                (`follows_pose`), whose derivative this is not.
+        """
+        if self.follows_pose:
+            raise InputError("forces of this body depend on its pose without a potential: solve its equilibria.")
+        state = self.rest_state(batch)
+        inputs, constants = self._checked(state, inputs, parameters)
+        workspace, stage = self.workspace(batch), self.method.stage(state, self.time_step)
+        terms = self._terms.at_rest(state, inputs, constants, workspace.potential.energies, 1.0)
+        clamp = self._fixed_at(state, replace(stage, end=1.0), inputs)
+        finish = partial(self._resting, state, inputs, constants)
+        return Linearisation(workspace, terms, stage, clamp, self._coordinates, finish, self.settings.linear_solver)
+
+    @property
+    def follows_pose(self) -> bool:
+        """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
+        return self._energies.follow_pose
+
+    def _resting(self, state: State, inputs: Inputs, constants: Constants, x: torch.Tensor) -> State:
+        """Returns the state in an equilibrium (B, N, 3) after a state [m]."""
         terms = self.workspace(state.batch).potential.energies
         return State(x, torch.zeros_like(x), memory=self._energies.end_pose(state, inputs, constants, terms, x))
 

@@ -2,8 +2,9 @@
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -66,16 +67,19 @@ def identify(context: StageContext) -> None:
             identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
             known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
             guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
-            found = search_parameters(wanted, settings.seed, identifier, guess, kept[model], progress, wanted.starts)
+            arguments = wanted, settings.seed, identifier, guess, kept[model], progress, wanted.starts
+            found = search_parameters(*arguments, is_last=lambda loss: not released)
             history = [[*records] for records in found["history"]]
             best = min((records for records in history if records), key=lambda own: min(one["loss"] for one in own))
             for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
                 values, before = found["parameters"], found["loss"]
+                is_last = partial(_ends, before, again == again_of(model)[-1])
                 replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
                 identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
-                found = search_parameters(wanted, settings.seed, identifier, values, kept[again], progress, 1)
+                arguments = wanted, settings.seed, identifier, values, kept[again], progress, 1
+                found = search_parameters(*arguments, is_last=is_last)
                 best.extend(found["history"][0])
-                if not changes(before, found["loss"]):
+                if is_last(found["loss"]):
                     break
             if sessions := (found["placement"] or {}).get("sessions"):
                 like = torch.zeros(len(experiment.dataset.labels), 3, dtype=torch.float64)
@@ -216,6 +220,11 @@ def changes(before: float, after: float) -> bool:
     return not _UNCHANGED < after / max(before, 1e-300) < 1.0 / _UNCHANGED
 
 
+def _ends(before: float, is_last: bool, after: float) -> bool:
+    """Whether no estimation of a release follows, after the last one or where the loss does not change any more."""
+    return is_last or not changes(before, after)
+
+
 class Checkpoint:
     """Checkpoint of the finished work of a part, deleted at the end of the stage; ignored if the settings changed."""
 
@@ -251,6 +260,7 @@ def search_parameters(
     kept: Checkpoint,
     progress: Progress,
     count: int,
+    is_last: Callable[[float], bool] = lambda loss: True,
 ) -> dict[str, Any]:
     """Returns the `Identification` of a search, as plain data; resumes an interrupted one.
 
@@ -262,6 +272,7 @@ def search_parameters(
         kept: finished work.
         progress: advanced by every evaluation.
         count: number of starts.
+        is_last: see `ParameterSearch.run`.
 
     Raises:
         ConvergenceError: the simulation fails at every start.
@@ -280,7 +291,7 @@ def search_parameters(
         kept.keep(attempts=attempts)
 
     starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
-    kept.keep(found=asdict(search.run(starts, most, report, finished, keep, wanted.tolerance)))
+    kept.keep(found=asdict(search.run(starts, most, report, finished, keep, wanted.tolerance, is_last)))
     return dict(kept.content["found"])
 
 

@@ -1,7 +1,7 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
-`linalg.least_squares` minimises the `Misfit` within bounds, from the best of a coarse set of starts, with derivatives
-along the motions (`Replay.varied`).
+A `Descent` minimises the `Misfit` within bounds, from the best of a coarse set of starts, with derivatives along the
+motions (`Replay.varied`).
 """
 
 import math
@@ -15,9 +15,10 @@ import scipy.stats
 import torch
 
 from ..io.errors import ConvergenceError
-from ..linalg.least_squares import UnitBox, minimise
+from ..linalg.least_squares import minimise
 from .bounded_misfit import BoundedMisfit, FloatArray
 from .bounds import Bounds
+from .descent import Descent
 from .misfit import Misfit
 from .placement import Accuracy
 from .replay import Replay, Start
@@ -125,17 +126,20 @@ class ParameterSearch:
         finished: Sequence[Attempt] = (),
         keep: Callable[[list[Attempt]], None] | None = None,
         tolerance: float = 1e-6,
+        is_last: Callable[[float], bool] = lambda loss: True,
     ) -> Identification:
         """Minimises the loss from every start and keeps the best.
 
         Args:
             starts: a value of each parameter, for each start.
             max_evaluations: of the loss and its gradient, for each start.
-            tolerance: relative decrease of the loss below which the search ends.
+            tolerance: relative decrease of the loss below which the search ends; a step from which the linearisation
+                expects less is not evaluated.
             report: called after every evaluation with the start's number, the loss (infinite where the simulation
                 failed) and the parameters.
             finished: results that an interrupted run with the same starts passed to `keep`; these starts are skipped.
             keep: called after every start with the results of all so far, which can be written as JSON.
+            is_last: whether no other search follows one with a loss; if not, placement and uncertainty are left out.
 
         Raises:
             ConvergenceError: the simulation fails at every start.
@@ -150,16 +154,16 @@ class ParameterSearch:
             reason = self._misfit.failure or "motions that are not finite"
             raise ConvergenceError(f"the simulation failed at every start of the identification: {reason}", None, None)
         best, misfit = min(good, key=lambda attempt: attempt["loss"]), self._misfit
-        unit = misfit.to_unit(best["parameters"])
-        misfit.prior_weight = best.get("prior_weight", 0.0)
-        misfit.forget()  # As in a resumed run, in which all attempts are finished.
+        unit = np.array(best["unit"])
+        misfit.prior_weight = best["prior_weight"]
+        last = is_last(best["loss"])
         return Identification(
             parameters=best["parameters"],
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
             at_bounds=tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4),
-            placement=misfit.placement(unit, self._labels),
-            uncertainty=misfit.uncertainty(unit),
+            placement=misfit.placement(unit, self._labels) if last else None,
+            uncertainty=misfit.uncertainty(unit) if last else None,
         )
 
     def _descend(
@@ -168,33 +172,30 @@ class ParameterSearch:
         """Result of one start: the parameters, their loss (None if the simulation fails there) and the history."""
         misfit, history = self._misfit, list[dict[str, float]]()
 
-        def objective(unit: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-            linear, values = misfit.linearise(unit), misfit.from_unit(unit)
-            failed = linear is None or not np.isfinite(linear.gauss_newton).all()
-            loss = math.inf if linear is None or failed else linear.loss
-            if not failed:
+        def evaluated(unit: FloatArray, loss: float) -> None:
+            values = misfit.from_unit(unit)
+            if math.isfinite(loss):
                 history.append({"loss": loss, **values})
             if report is not None:
                 report(number, loss, values)
-            if linear is None or failed:
-                return loss, np.zeros_like(unit), np.zeros((len(unit), len(unit)))
-            return loss, linear.gradient, linear.gauss_newton
 
         first = misfit.to_unit(start)
         misfit.prior_weight = 0.0
         misfit.forget()
         misfit.update_prior_weight(first)
-        problem = UnitBox(objective)
-        point = problem.evaluate(torch.as_tensor(first)[None])
+        descent = Descent(misfit.linearise, tolerance, evaluated)
+        point = descent.evaluate(torch.as_tensor(first)[None])
         simulated = math.isfinite(float(point.value))
         if simulated:
-            point = minimise(problem, point, tolerance, max_evaluations - 1).point
+            point = minimise(descent, point, tolerance, max_evaluations - 1).point
             left = max_evaluations - len(history)
             if left > 1 and not _SIMILAR < misfit.update_prior_weight(point.x[0].numpy()) < 1.0 / _SIMILAR:
-                point = minimise(problem, problem.evaluate(point.x), tolerance, left - 1).point
+                point = minimise(descent, descent.evaluate(point.x), tolerance, left - 1).point
+            simulated = not (descent.is_stuck and len(history) == 1)
         return {
             "parameters": misfit.from_unit(point.x[0].tolist()),
             "loss": float(point.value) if simulated else None,
+            "unit": point.x[0].tolist(),
             "history": history,
             "prior_weight": misfit.prior_weight,
         }

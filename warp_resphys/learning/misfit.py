@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from ..io.errors import ConvergenceError, InputError
 from .bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
 from .bounds import Bounds
 from .left_out import LinearSystem, left_out
+from .nearby import NearbyMotion
 from .nuisance import NuisanceFit
 from .parameters import check_names, split_name
 from .placement import Accuracy, DisplacedMarkers, Placed
@@ -104,8 +106,11 @@ class Misfit(BoundedMisfit):
 
     @override
     def forget(self) -> None:
-        """Forgets the equilibria of earlier parameters, from which the next equilibria are predicted."""
+        """Forgets equilibria and motions with earlier parameters, from which the next ones are predicted."""
         self._equilibria: list[_Equilibria | None] = [None] * len(self._replays)
+        owners = (self.simulator.tensor(self._owners(replay.trials)) for replay, _ in self._replays)
+        self._motions = [*map(NearbyMotion, owners)]
+        self._last: tuple[torch.Tensor, list[torch.Tensor]] | None = None  # of `_followed`
 
     def losses(self, unit: torch.Tensor) -> torch.Tensor:
         """(E,) losses of (E, P) parameters, differentiable."""
@@ -146,12 +151,19 @@ class Misfit(BoundedMisfit):
 
     @override
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
-        """Uncertainty of (P,) parameters, with derivatives of exact solutions if these converge; see `left_out`."""
-        accurate = copy(self)
-        accurate.simulator = exact(self.simulator)
-        accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]
-        accurate.forget()
-        system = accurate._system(unit) or self._system(unit)
+        """Uncertainty of (P,) parameters, see `left_out`; None if a simulation close by fails.
+
+        Equilibria that are solved again with other parameters (`Simulator.follows_pose`) are solved exactly if that
+        converges.
+        """
+        system = None
+        if self.simulator.follows_pose:
+            accurate = copy(self)
+            accurate.simulator = exact(self.simulator)
+            accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]
+            accurate.forget()
+            system = accurate._system(unit)
+        system = system or self._system(unit)
         if system is None:
             return None
         linear = system.misfit()
@@ -166,13 +178,10 @@ class Misfit(BoundedMisfit):
         points = self.simulator.tensor(np.concatenate([unit[None], unit + moved]))
         try:
             with torch.no_grad():
-                if derivatives and not any(self._equilibria):
-                    self._find_equilibria(points[:1])
-                series = self._simulated(points, varied=derivatives)
+                series = self._followed(points)
         except ConvergenceError as error:
             self.failure = str(error)
             return None
-        self._keep_equilibria(points)
         fitted, nuisances = self._fit(series, self.prior_weight)
         rows, columns, counts = list[FloatArray](), list[FloatArray](), list[list[float]]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
@@ -192,13 +201,22 @@ class Misfit(BoundedMisfit):
         self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials
     ) -> FloatArray:
         """(R, D, P) derivatives, from changes (E, R, D) of trials by `_moves_of` parameters, by steps (P,) of these."""
-        slopes, names = np.zeros((*change.shape[1:], len(steps))), [*self.bounds]
-        for own, columns in zip(change, moves, strict=True):
+        slopes, owners = np.zeros((*change.shape[1:], len(steps))), self._owners(trials)
+        for number, (own, columns) in enumerate(zip(change, moves, strict=True)):
             for column in columns:
-                owner = split_name(names[column])[1]
-                mine = [not owner or owner in (trial, trials.session) for trial in trials.names]
+                mine = owners[number, :, column] > 0.0
                 slopes[mine, :, column] = own[mine] / steps[column]
         return slopes
+
+    def _owners(self, trials: Trials) -> FloatArray:
+        """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
+        owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
+        names = [split_name(name)[1] for name in self.bounds]
+        for number, columns in enumerate(self._moves):
+            for column in columns:
+                owner = names[column]
+                owners[number, :, column] = [not owner or owner in (t, trials.session) for t in trials.names]
+        return owners
 
     @property
     @override
@@ -215,9 +233,7 @@ class Misfit(BoundedMisfit):
         if self._accuracy is None:
             return None
         with torch.no_grad():
-            x = self.simulator.tensor(unit)[None]
-            series = self._simulated(x)
-            self._keep_equilibria(x)
+            series = self._followed(self.simulator.tensor(unit)[None])
             return self._fit(series, self.prior_weight)[1].placed
 
     def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
@@ -241,22 +257,41 @@ class Misfit(BoundedMisfit):
         others = {name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None} | self._known
         return {name: torch.full_like(unit[:, 0], value) for name, value in others.items()} | values
 
-    def _simulated(self, unit: torch.Tensor, varied: bool = False) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m], alike if they are `varied`."""
+    def _simulated(self, unit: torch.Tensor) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m]."""
         values, simulated = self._values(unit), []
         for (replay, start), equilibria in zip(self._replays, self._equilibria, strict=True):
             begin = start if equilibria is None else start.near(equilibria.predicted(unit.detach()))
-            alike = varied and not replay.is_static
-            simulated.append(replay.varied(begin, values) if alike else replay(begin, values))
+            simulated.append(replay(begin, values))
         return simulated
 
-    def _find_equilibria(self, unit: torch.Tensor) -> None:
-        """Solves the equilibria for (1, P) parameters, from which those of nearby parameters are predicted."""
-        for replay, start in self._replays:
-            if start.at_rest:
-                constants, _, resting = replay.prepare(self._values(unit))
-                replay.initial_state(start, constants, resting)
-        self._keep_equilibria(unit)
+    def _followed(self, points: torch.Tensor) -> list[torch.Tensor]:
+        """(E, R, T, M, 3) simulated points of each replay [m], predicted from those with earlier parameters.
+
+        The first motion is not simulated again where the last one had its parameters.
+
+        Args:
+            points: (1, P) parameters, or further rows that change them along each direction of the derivatives.
+        """
+        if self._last is not None and torch.equal(self._last[0], points):
+            return self._last[1]
+        unit, values, simulated = points[0], self._values(points), []
+        first = {name: value[:1] for name, value in values.items()}
+        rows = zip(self._replays, self._equilibria, self._motions, strict=True)
+        for (replay, start), equilibria, motion in rows:
+            begin = start if equilibria is None else start.near(equilibria.predicted(points[:1]))
+            states = motion.states(unit)
+            if states is None:
+                states = replay.states(begin, first, partial(motion.predict, unit))
+                motion.keep(unit, states)
+            if len(points) == 1:
+                simulated.append(replay.seen(begin, states))
+            else:
+                motion.differentiate(points)
+                simulated.append(replay.varied(begin, values, states, motion.record))
+        self._last = points, simulated
+        self._keep_equilibria(points)
+        return simulated
 
     def _keep_equilibria(self, unit: torch.Tensor) -> None:
         """Keeps the equilibria of the last simulation.
@@ -266,7 +301,7 @@ class Misfit(BoundedMisfit):
                 of other rows that were simulated are ignored.
         """
         unit, before = unit.detach(), self._equilibria
-        self.forget()
+        self._equilibria = [None] * len(self._replays)
         for number, (replay, start) in enumerate(self._replays):
             if not start.at_rest or replay.settled is None:
                 continue

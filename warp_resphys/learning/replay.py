@@ -5,15 +5,17 @@ at once, and interpolates the observation at the times of the frames. All of it 
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import torch
 
 from ..data.input_response import InputResponse, response_of
 from ..data.observation import Observation
 from ..data.trials import Trials
+from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
@@ -23,7 +25,10 @@ from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiab
 
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
+Near = Callable[[int], torch.Tensor | None]
+Record = Callable[[torch.Tensor, torch.Tensor], None]
 
+_FIRST, _OTHERS = slice(0, 1), slice(1, None)  # sets of parameters
 _EXACT = 1e-12  # relative tolerance of a solver, small enough for differences of solutions
 
 
@@ -223,51 +228,99 @@ class Replay:
             series.append(self.observe(state.q))
         return torch.stack(series, 1)
 
-    def varied(self, start: Start, parameters: Parameters) -> torch.Tensor:
-        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first."""
-        series = self.varied_series(start, parameters)
-        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
-
     @torch.no_grad()
-    def varied_series(self, start: Start, parameters: Parameters) -> torch.Tensor:
-        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first.
-
-        The first set is simulated. In each of its steps, with the solution x, the residual g(x) and its derivative H,
-        the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from there: differences
-        to the first set are exact to first order, for one factor and one residual each.
+    def states(self, start: Start, parameters: Parameters, near: Near | None = None) -> list[State]:
+        """K + 1 states of R trials at the steps, from the release on, with one set of parameters.
 
         Args:
             start: of the R trials.
-            parameters: (E,) values, by any of `parameter_names`; E is two or more.
+            parameters: (1,) values, by any of `parameter_names`.
+            near: predicts the positions (R, N, 3) at the end of a step [m], see `Simulator.step`.
 
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        sets, count = _count(parameters), len(self.trials.names)
-        constants, _, resting = self.prepare(parameters)
-        whole = self.initial_state(start, constants, resting, sets)
-        state, varied = whole.map(lambda t: t[:count]), whole.map(lambda t: t[count:])
-        own, inputs, _ = self.prepare({name: value[:1] for name, value in parameters.items()})
-        their, their_inputs, _ = self.prepare({name: value[1:] for name, value in parameters.items()})
-        series = [self.observe(whole.q)]
+        constants, inputs, resting = self.prepare(parameters)
+        states = [self.initial_state(start, constants, resting)]
         for k in range(self.steps(start)):
-            now = inputs.at(k)
-            solved, _ = self.simulator.step(state, now, own)
-            x = self.simulator.method.solution_for(state, solved.q)
-            here = self._beside[0].linearise(state, now, own)
-            here.factorise(x)
-            residual = here.residual(x)
+            predicted = None if near is None else near(k)
+            states.append(self.simulator.step(states[-1], inputs.at(k), constants, predicted)[0])
+        return states
+
+    def seen(self, start: Start, states: Sequence[State]) -> torch.Tensor:
+        """(1, R, T, M, 3) points at the times of the frames [m], from `states`."""
+        self.settled = states[0].q if start.at_rest else None
+        return self.at_frames(torch.stack([self.observe(state.q) for state in states], 1), start)[None]
+
+    def varied(
+        self,
+        start: Start,
+        parameters: Parameters,
+        states: Sequence[State] | None = None,
+        record: Record | None = None,
+    ) -> torch.Tensor:
+        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first."""
+        series = self.varied_series(start, parameters, states, record)
+        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
+
+    @torch.no_grad()
+    def varied_series(
+        self,
+        start: Start,
+        parameters: Parameters,
+        states: Sequence[State] | None = None,
+        record: Record | None = None,
+    ) -> torch.Tensor:
+        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first.
+
+        The first set is simulated. In its equilibrium and each of its steps, with the solution x, the residual g(x) and
+        its derivative H, the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from
+        there: differences to the first set are exact to first order, for one factor and one residual each.
+
+        Args:
+            start: of the R trials.
+            parameters: (E,) values, by any of `parameter_names`; E is two or more.
+            states: `states` of the first set; simulated if omitted.
+            record: called after each step with the positions (R, N, 3) of the first set and those of the others [m].
+
+        Raises:
+            ConvergenceError: see `Simulator.step`.
+        """
+        first, others = ({name: value[own] for name, value in parameters.items()} for own in (_FIRST, _OTHERS))
+        states = self.states(start, first) if states is None else states
+        (own, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
+        sets, state = _count(others), states[0]
+        if not start.at_rest:
+            varied = state.map(lambda t: t.repeat(sets, *[1] * (t.ndim - 1)))
+        elif self.simulator.follows_pose:
+            varied = self.initial_state(start.near(state.q), their, their_resting, sets)
+        else:
+            here = self._beside[0].linearise_equilibrium(resting, own, state.batch)
+            there = self._beside[1].linearise_equilibrium(their_resting, their, sets * state.batch)
+            varied = self._varied(state.q, here, there)
+        self.settled = torch.cat([state.q, varied.q]) if start.at_rest else None
+        series = [self.observe(torch.cat([state.q, varied.q]))]
+        for k, (state, solved) in enumerate(pairwise(states)):
+            here = self._beside[0].linearise(state, inputs.at(k), own)
             try:
                 there = self._beside[1].linearise(varied, their_inputs.at(k), their)
             except InputError as error:
                 message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
                 raise ConvergenceError(message, None, None) from error
-            at = x.repeat(sets - 1, 1, 1)
-            forces = (there.residual(at) - residual.repeat(sets - 1, 1, 1)).unflatten(0, (sets - 1, count))
-            moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
-            state, varied = solved, there.finish(at - moved.permute(3, 0, 1, 2).flatten(0, 1))
-            series.append(self.observe(torch.cat([state.q, varied.q])))
+            varied = self._varied(self.simulator.method.solution_for(state, solved.q), here, there)
+            series.append(self.observe(torch.cat([solved.q, varied.q])))
+            if record is not None:
+                record(solved.q, varied.q)
         return torch.stack(series, 1)
+
+    def _varied(self, x: torch.Tensor, here: Linearisation, there: Linearisation) -> State:
+        """Returns the states of the other sets of parameters, from the solution (R, N, 3) x of the first [m]."""
+        here.factorise(x)
+        sets = len(there.start) // len(x)
+        at = x.repeat(sets, 1, 1)
+        forces = (there.residual(at) - here.residual(x).repeat(sets, 1, 1)).unflatten(0, (sets, -1))
+        moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
+        return there.finish(at - moved.permute(3, 0, 1, 2).flatten(0, 1))
 
     @cached_property
     def _beside(self) -> tuple[Simulator, Simulator]:

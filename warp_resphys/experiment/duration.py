@@ -223,7 +223,7 @@ class _Pace:
             short = Replay(simulator, replay.observe, replay.trials.first((_CALLS + 0.5) * simulator.time_step))
             if short.is_static:
                 start = Start.resting(simulator.rest_positions.expand(len(short.trials.names), -1, -1))
-                return lambda: short(start, parameters)
+                return lambda: short.varied(start, parameters)
             state = _moving(simulator, len(short.trials.names))
             start = Start(state, state.q.new_zeros(state.batch))
             steps = max(short.steps(start), 1)

@@ -1,0 +1,127 @@
+"""Motions predicted from those with similar parameters, and what a search simulates of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Simulator, Tendons
+from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.data.trials import Trials
+from warp_resphys.learning.bounds import Bounds
+from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.stepping.inputs import Inputs
+
+MESH = box_hexahedra(divisions=(4, 1, 1))
+CLAMP = select_vertices(MESH, x=0.0)
+SOFT = Corotated(8e4, 0.49)
+RANGES = {"youngs_modulus": Bounds(5e4, 5e5, logarithmic=True), "poissons_ratio": Bounds(0.4, 0.499)}
+VALUES = {"youngs_modulus": 2e5, "poissons_ratio": 0.47}
+
+
+class Watched(Simulator):
+    """A simulator that counts its steps and their iterations."""
+
+    steps, iterations = 0, 0
+
+    def step(self, *arguments):
+        new, report = super().step(*arguments)
+        Watched.steps, Watched.iterations = Watched.steps + 1, Watched.iterations + int(report.iterations.sum())
+        return new, report
+
+
+def counted(function, *arguments):
+    """The result of a function, and the numbers of steps and of iterations."""
+    Watched.steps = Watched.iterations = 0
+    return function(*arguments), Watched.steps, Watched.iterations
+
+
+def replayed(frames, kind=Simulator, energies=(), static=False, **options):
+    """Two trials from rest under different forces at the tip, observed at all vertices."""
+    sim = kind(Body(MESH, CLAMP, energies=energies), SOFT, time_step=0.01, integrator="bdf2", **options)
+    times = torch.zeros(2, 1).double() if static else 0.01 * torch.arange(frames).double().expand(2, -1)
+    held = sim.rest_positions.expand(2, -1, -1)
+    force = torch.zeros(2, *held.shape[1:]).double()
+    force[:, select_vertices(MESH, x=0.1), 1] = torch.tensor([[0.002], [-0.004]]).double()
+    at = Inputs(external_force=force)
+    blank = Trials(("a", "b"), times, held[:, None].repeat(1, frames, 1, 1), held, at, at if static else Inputs())
+    replay = Replay(sim, WHOLE_STATE, blank)
+    start = Start.resting(held.clone())
+    with torch.no_grad():
+        seen = replay(start, {name: torch.tensor([value]).double() for name, value in VALUES.items()})[0]
+    seen = seen + 1e-4 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0)).double()
+    return Replay(sim, replay.observe, replace(blank, observed=seen)), start
+
+
+@pytest.mark.parametrize("energies", [(), (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),)])
+@pytest.mark.parametrize("static", [True, False])
+def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(static, energies):
+    replay, start = replayed(1 if static else 8, energies=energies, static=static, relative_tolerance=1e-12)
+    step = 1e-4
+    sets = {
+        "youngs_modulus": torch.tensor([2e5, 2e5 * (1.0 + step), 2e5]).double(),
+        "poissons_ratio": torch.tensor([0.47, 0.47, 0.47 + step]).double(),
+    }
+    with torch.no_grad():
+        alone = replay(start, sets)
+    varied = replay.varied(start, sets)
+    wanted = alone[1:] - alone[0]
+    torch.testing.assert_close(varied[0], alone[0], rtol=0.0, atol=1e-10)
+    torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))
+
+
+def test_the_error_of_a_prediction_is_of_second_order():
+    misfit = Misfit([replayed(10)], RANGES)
+    unit, direction = np.array([0.5, 0.5]), np.array([0.7, -0.7])
+    misfit.linearise(unit)
+    motion, tensor = misfit._motions[0], misfit.simulator.tensor
+    predicted = [motion.predict(tensor(unit + size * direction), 8) for size in (0.0, 0.05, 0.025)]
+    errors = []
+    for size, guess in zip((0.0, 0.05, 0.025), predicted, strict=True):
+        other = Misfit([replayed(10)], RANGES)
+        other.linearise(unit + size * direction, derivatives=False)
+        errors.append(float((other._motions[0].states(tensor(unit + size * direction))[-1].q - guess).norm()))
+    assert errors[0] < 1e-9
+    assert 3.0 < errors[1] / errors[2] < 5.0
+    assert errors[1] < 0.2 * float((predicted[1] - predicted[0]).norm())
+    assert motion.predict(tensor(unit), 9) is None
+
+
+def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives():
+    replay, start = replayed(20, Watched)
+    misfit, unit = Misfit([(replay, start)], RANGES), np.array([0.5, 0.5])
+    _, steps, cold = counted(misfit.linearise, unit)
+    assert steps == 19
+    near, _, warm = counted(misfit.linearise, unit + 0.002)
+    misfit.forget()
+    again, _, without = counted(misfit.linearise, unit + 0.002)
+    assert warm < 0.6 * min(cold, without)
+    np.testing.assert_allclose(near.gradient, again.gradient, rtol=1e-5, atol=1e-5 * np.abs(again.gradient).max())
+    np.testing.assert_allclose(near.gauss_newton, again.gauss_newton, rtol=1e-5)
+
+
+def test_a_motion_is_simulated_once_for_its_loss_and_its_derivatives():
+    misfit, unit = Misfit([replayed(12, Watched)], RANGES), np.array([0.4, 0.6])
+    loss, steps, _ = counted(lambda: misfit.linearise(unit, derivatives=False).loss)
+    assert steps == 11
+    linear, steps, _ = counted(misfit.linearise, unit)
+    assert steps == 0
+    assert linear.loss == pytest.approx(loss, rel=1e-12)
+    _, steps, _ = counted(misfit.linearise, unit + 0.1)
+    assert steps == 11
+
+
+def test_placement_and_uncertainty_are_those_of_the_last_search():
+    identifier = Identifier([replayed(10)], RANGES)
+    first = {"youngs_modulus": 1e5, "poissons_ratio": 0.45}
+    result = identifier.run([first], 20, is_last=lambda loss: False)
+    assert result.uncertainty is None
+    last = identifier.run([result.parameters], 20)
+    assert last.uncertainty is not None
+    for name, value in VALUES.items():
+        assert abs(last.parameters[name] - value) < 4.0 * last.uncertainty.deviation[name], name
+        assert abs(last.parameters[name] - result.parameters[name]) < 0.1 * last.uncertainty.deviation[name], name

@@ -60,9 +60,11 @@ class BoundedMisfit(ABC):
         bounds: see above.
         prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
         failure: message of the last simulation that failed.
+        differentiates_later: whether derivatives at parameters whose loss is known need no further simulation.
     """
 
     failure = ""
+    differentiates_later = False
 
     def __init__(self, bounds: Mapping[str, Bounds]) -> None:
         self.bounds, self.prior_weight = dict(bounds), 0.0

@@ -19,6 +19,21 @@ Linearise = Callable[[Array, bool], LinearMisfit | None]
 Evaluated = Callable[[Array, float], None]
 
 
+class AtOnce:
+    """Residuals that come with their derivatives, of which the last ones are kept; see the argument of `Descent`."""
+
+    def __init__(self, linearise: Linearise) -> None:
+        self._linearise = linearise
+        self._last: tuple[Array, LinearMisfit | None] | None = None
+
+    def __call__(self, x: Array, derivatives: bool) -> LinearMisfit | None:
+        """Returns the misfit at unknowns (P,), with derivatives in any case."""
+        del derivatives
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self._last = x.copy(), self._linearise(x, True)
+        return self._last[1]
+
+
 class Descent(UnitBox):
     """Objective of a search, with derivatives at points from which a step is taken.
 

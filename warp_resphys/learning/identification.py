@@ -6,7 +6,7 @@ motions (`Replay.varied`).
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -15,10 +15,10 @@ import scipy.stats
 import torch
 
 from ..io.errors import ConvergenceError
-from ..linalg.least_squares import minimise
+from ..linalg.least_squares import Point, minimise
 from .bounded_misfit import BoundedMisfit, FloatArray
 from .bounds import Bounds
-from .descent import Descent
+from .descent import AtOnce, Descent, Evaluated
 from .misfit import Misfit
 from .placement import Accuracy
 from .replay import Replay, Start
@@ -183,22 +183,29 @@ class ParameterSearch:
         misfit.prior_weight = 0.0
         misfit.forget()
         misfit.update_prior_weight(first)
-        descent = Descent(misfit.linearise, tolerance, evaluated)
-        point = descent.evaluate(torch.as_tensor(first)[None])
-        simulated = math.isfinite(float(point.value))
-        if simulated:
-            point = minimise(descent, point, tolerance, max_evaluations - 1).point
-            left = max_evaluations - len(history)
-            if left > 1 and not _SIMILAR < misfit.update_prior_weight(point.x[0].numpy()) < 1.0 / _SIMILAR:
-                point = minimise(descent, descent.evaluate(point.x), tolerance, left - 1).point
-            simulated = not (descent.is_stuck and len(history) == 1)
+        point = self._minimum(torch.as_tensor(first)[None], max_evaluations, tolerance, evaluated)
+        left = max_evaluations - len(history)
+        refines = left > 1 and math.isfinite(float(point.value))
+        if refines and not _SIMILAR < misfit.update_prior_weight(point.x[0].numpy()) < 1.0 / _SIMILAR:
+            point = self._minimum(point.x, left, tolerance, evaluated)
         return {
             "parameters": misfit.from_unit(point.x[0].tolist()),
-            "loss": float(point.value) if simulated else None,
+            "loss": float(point.value) if math.isfinite(float(point.value)) else None,
             "unit": point.x[0].tolist(),
             "history": history,
             "prior_weight": misfit.prior_weight,
         }
+
+    def _minimum(self, x: torch.Tensor, max_evaluations: int, tolerance: float, evaluated: Evaluated) -> Point:
+        """Returns the minimum reached from parameters (1, P); its loss is infinite if there are no derivatives."""
+        linearise = self._misfit.linearise if self._misfit.differentiates_later else AtOnce(self._misfit.linearise)
+        descent = Descent(linearise, tolerance, evaluated)
+        start = descent.evaluate(x)
+        if not math.isfinite(float(start.value)):
+            return start
+        end = minimise(descent, start, tolerance, max_evaluations - 1).point
+        is_stuck = descent.is_stuck and torch.equal(end.x, x)
+        return replace(end, value=torch.full_like(end.value, torch.inf)) if is_stuck else end
 
 
 class Identifier(ParameterSearch):

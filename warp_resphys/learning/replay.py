@@ -233,7 +233,7 @@ class Replay:
         """K + 1 states of R trials at the steps, from the release on, with one set of parameters.
 
         Args:
-            start: of the R trials.
+            start: of the R trials, or of these for several sets of parameters, of which the first are taken.
             parameters: (1,) values, by any of `parameter_names`.
             near: predicts the positions (R, N, 3) at the end of a step [m], see `Simulator.step`.
 
@@ -241,7 +241,8 @@ class Replay:
             ConvergenceError: see `Simulator.step`.
         """
         constants, inputs, resting = self.prepare(parameters)
-        states = [self.initial_state(start, constants, resting)]
+        first = replace(start, state=start.state.map(lambda t: t[: len(self.trials.names)]))
+        states = [self.initial_state(first, constants, resting)]
         for k in range(self.steps(start)):
             predicted = None if near is None else near(k)
             states.append(self.simulator.step(states[-1], inputs.at(k), constants, predicted)[0])
@@ -278,7 +279,7 @@ class Replay:
         there: differences to the first set are exact to first order, for one factor and one residual each.
 
         Args:
-            start: of the R trials.
+            start: of the R trials, or of these for each set of parameters.
             parameters: (E,) values, by any of `parameter_names`; E is two or more.
             states: `states` of the first set; simulated if omitted.
             record: called after each step with the positions (R, N, 3) of the first set and those of the others [m].
@@ -291,7 +292,8 @@ class Replay:
         (own, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
         sets, state = _count(others), states[0]
         if not start.at_rest:
-            varied = state.map(lambda t: t.repeat(sets, *[1] * (t.ndim - 1)))
+            whole = self.initial_state(start, own, resting, 1 + sets)
+            varied = whole.map(lambda t: t[state.batch :])
         elif self.simulator.follows_pose:
             varied = self.initial_state(start.near(state.q), their, their_resting, sets)
         else:

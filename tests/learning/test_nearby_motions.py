@@ -9,6 +9,8 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, Tendons
 from warp_resphys.data.observation import WHOLE_STATE
 from warp_resphys.data.trials import Trials
+from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.bounds import Bounds
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.misfit import Misfit
@@ -125,3 +127,15 @@ def test_placement_and_uncertainty_are_those_of_the_last_search():
     for name, value in VALUES.items():
         assert abs(last.parameters[name] - value) < 4.0 * last.uncertainty.deviation[name], name
         assert abs(last.parameters[name] - result.parameters[name]) < 0.1 * last.uncertainty.deviation[name], name
+
+
+def test_a_step_that_fails_from_its_prediction_is_solved_without():
+    replay, start = replayed(6)
+    values = {name: torch.tensor([value]).double() for name, value in VALUES.items()}
+    wanted = replay.states(start, values)
+    turned = wanted[0].q.flip(1)  # inside out, from where the solver does not come back in few iterations
+    replay = Replay(replace(replay.simulator, solver=SolverSettings(max_iterations=20)), WHOLE_STATE, replay.trials)
+    with pytest.raises(ConvergenceError):
+        replay.simulator.step(wanted[0], replay.trials.inputs.at(0), replay.prepare(values)[0], near=turned)
+    again = replay.states(start, values, lambda step: turned if step == 0 else None)
+    torch.testing.assert_close(again[-1].q, wanted[-1].q, rtol=0.0, atol=1e-6)

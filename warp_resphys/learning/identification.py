@@ -138,6 +138,7 @@ class ParameterSearch:
             report: called after every evaluation with the start's number, the loss (infinite where the simulation
                 failed) and the parameters.
             finished: results that an interrupted run with the same starts passed to `keep`; these starts are skipped.
+                Placement and uncertainty are those of the uninterrupted run to within the solver's tolerance.
             keep: called after every start with the results of all so far, which can be written as JSON.
             is_last: whether no other search follows one with a loss; if not, placement and uncertainty are left out.
 

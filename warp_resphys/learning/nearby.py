@@ -42,7 +42,8 @@ class NearbyMotion:
             return None
         slopes = self._slopes[step]
         change = (self._owners @ (unit - self._unit)).to(slopes)
-        return self._states[step + 1].q + torch.einsum("sr,srni->rni", change, slopes)
+        q = self._states[step + 1].q + torch.einsum("sr,srni->rni", change, slopes)
+        return q if bool(q.isfinite().all()) else None
 
     def differentiate(self, points: torch.Tensor) -> None:
         """Begins derivatives by parameters (1 + S, P): those of the motion, and those changed along each direction."""

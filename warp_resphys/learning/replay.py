@@ -4,6 +4,7 @@ A replay simulates every trial from its own start, under its own inputs, for one
 at once, and interpolates the observation at the times of the frames. All of it is differentiable.
 """
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,8 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .feedback_equilibrium import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
+
+log = logging.getLogger(__name__)
 
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
@@ -244,9 +247,17 @@ class Replay:
         first = replace(start, state=start.state.map(lambda t: t[: len(self.trials.names)]))
         states = [self.initial_state(first, constants, resting)]
         for k in range(self.steps(start)):
-            predicted = None if near is None else near(k)
-            states.append(self.simulator.step(states[-1], inputs.at(k), constants, predicted)[0])
+            states.append(self._step(states[-1], inputs.at(k), constants, None if near is None else near(k)))
         return states
+
+    def _step(self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None) -> State:
+        """Returns the next state, without the prediction if the solver fails from there."""
+        if near is not None:
+            try:
+                return self.simulator.step(state, inputs, constants, near)[0]
+            except ConvergenceError as error:
+                log.debug("the step is solved again without a prediction: %s", error)
+        return self.simulator.step(state, inputs, constants)[0]
 
     def seen(self, start: Start, states: Sequence[State]) -> torch.Tensor:
         """(1, R, T, M, 3) points at the times of the frames [m], from `states`."""

@@ -39,8 +39,8 @@ class Descent(UnitBox):
 
     Args:
         linearise: returns the misfit at unknowns (P,), with derivatives or without; None if it fails.
-        tolerance: relative decrease; a step from which less is expected is taken without an evaluation.
-        evaluated: called with unknowns and the objective after each evaluation, infinite if it failed.
+        tolerance: relative decrease; a step from which less is expected is taken without an evaluation, as the last.
+        evaluated: called with unknowns and the objective after each step, infinite if the evaluation failed.
 
     Attributes:
         is_stuck: whether the search ended at a point where there are no derivatives.
@@ -56,6 +56,7 @@ class Descent(UnitBox):
     def evaluate(self, x: torch.Tensor) -> Point:
         end, self._end = self._end, None
         if end is not None and torch.equal(x, end.x):
+            self._evaluated(x[0].numpy(), float(end.value))
             return end
         linear = self._linearise(x[0].numpy(), False)
         value = math.inf if linear is None or not math.isfinite(linear.loss) else linear.loss

@@ -36,7 +36,8 @@ class Identification:
 
     parameters: dict[str, float]  # the values of the smallest loss
     loss: float  # that loss, relative to the motions' amplitudes
-    # for every start the records ``loss`` and the parameters, one an evaluation that did not fail
+    # for every start the records ``loss`` and the parameters, one a step that did not fail; the loss of the last step
+    # may be that of the linearisation
     history: list[list[dict[str, float]]] = field(default_factory=list)
     at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
     placement: dict[str, Any] | None = None  # of the markers, as `placement.Placed.plain` has it
@@ -155,8 +156,8 @@ class ParameterSearch:
             reason = self._misfit.failure or "motions that are not finite"
             raise ConvergenceError(f"the simulation failed at every start of the identification: {reason}", None, None)
         best, misfit = min(good, key=lambda attempt: attempt["loss"]), self._misfit
-        unit = np.array(best["unit"])
-        misfit.prior_weight = best["prior_weight"]
+        unit = np.array(best.get("unit", misfit.to_unit(best["parameters"])))
+        misfit.prior_weight = best.get("prior_weight", 0.0)
         last = is_last(best["loss"])
         return Identification(
             parameters=best["parameters"],

@@ -189,7 +189,8 @@ class ParameterSearch:
         left = max_evaluations - len(history)
         refines = left > 1 and math.isfinite(float(point.value))
         if refines and not _SIMILAR < misfit.update_prior_weight(point.x[0].numpy()) < 1.0 / _SIMILAR:
-            point = self._minimum(point.x, left, tolerance, evaluated)
+            refined = self._minimum(point.x, left, tolerance, evaluated)
+            point = refined if math.isfinite(float(refined.value)) else point
         return {
             "parameters": misfit.from_unit(point.x[0].tolist()),
             "loss": float(point.value) if math.isfinite(float(point.value)) else None,

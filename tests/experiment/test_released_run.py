@@ -335,7 +335,7 @@ def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, 
     monkeypatch.setattr(identify, "_AT_ONCE", 2)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)
-    once = ["starts", "descent", "descent", "uncertainty", "starts", "descent", "uncertainty"] * 2
+    once = ["starts", "descent", "descent", "starts", "descent", "uncertainty"] * 2  # of the last search alone
     assert calls == once
     assert "identify: landscape: 6/10 points" in capsys.readouterr().err
     run_stages([stage], tmp_path)

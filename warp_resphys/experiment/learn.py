@@ -26,12 +26,13 @@ from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSett
 from ..settings.stages import NetworkStage, RefineStage, TrainStage
 from .build import choose_device
 from .experiment import LAW, Experiment
-from .files import STATIC, reconstruction_file, training_file, weights_file
+from .files import DATASET, STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, load, rollout_error
 from .reconstruct import reconstructing_simulator
 
 log = logging.getLogger(__name__)
 _CHECKPOINT_SECONDS = 10.0
+_LEAST_SAMPLES = 100_000  # over all epochs, which take a few seconds
 
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
@@ -253,6 +254,15 @@ def _in_the_loop(
     trainer.begin()
     range_ = _range_of(experiment, model, trainer.model, samples)
     return Prepared(trainer, Learned(trainer.model, range_, experiment.settings.force_frame))
+
+
+def takes_long(context: StageContext) -> bool:
+    """Whether training on single steps takes longer than a process takes to start."""
+    settings: TrainStage = context.settings
+    with read_hdf5(context.run_dir / settings.shared / DATASET, "dataset") as file:
+        frames = file["observed"].shape[1]
+    samples = settings.training.trainer.epochs * len(settings.split.train) * frames
+    return settings.training.in_the_loop is None and samples > _LEAST_SAMPLES
 
 
 def train(context: StageContext) -> None:

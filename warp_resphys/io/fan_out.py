@@ -143,7 +143,7 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
     """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
     warnings.simplefilter("ignore", ResphysWarning)  # The parent has shown them.
-    _start_warp()
+    start_warp()
     torch.set_num_threads(1)
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
@@ -161,7 +161,7 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
         raise WorkerFaultError(f"a worker process failed:\n{traceback.format_exc()}") from None
 
 
-def _start_warp() -> None:
+def start_warp() -> None:
     """Starts Warp without its greeting, and without its warnings, which the parent process has shown."""
     wp.config.log_level = wp.LOG_WARNING
     shown = os.dup(2)
@@ -232,17 +232,18 @@ def _followed(folder: Path, reported: dict[str, _Status], advance: Advance) -> I
 
 @contextmanager
 def _local(workers: Workers) -> Iterator[None]:
-    ends = {"initializer": _end_with, "initargs": (os.getpid(),)}
+    ends = {"initializer": end_with, "initargs": (os.getpid(),)}
     with warnings.catch_warnings(), parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
         # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
-        with _interrupts_blocked():  # Workers started here leave Ctrl-C to this process.
+        with interrupts_blocked():  # Workers started here leave Ctrl-C to this process.
             Parallel(n_jobs=max(workers.count, 2))(delayed(int)() for _ in range(2))
         yield
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
+def interrupts_blocked() -> Iterator[None]:
+    """Blocks Ctrl-C in processes that start meanwhile."""
     if not hasattr(signal, "pthread_sigmask"):  # On Windows, Ctrl-C reaches the workers as well.
         yield
         return
@@ -253,7 +254,7 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """Ends this process as soon as its parent has ended, whatever it is doing."""
 
     def watch() -> None:
@@ -273,7 +274,7 @@ def _dask(workers: Workers) -> Iterator[None]:
         raise InputError(_missing("dask")) from None
     own = {"n_workers": workers.count, "threads_per_worker": 1, "dashboard_address": None}
     try:
-        with _interrupts_blocked():
+        with interrupts_blocked():
             client = Client(**own) if workers.address is None else Client(workers.address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:
         raise InputError(_unreachable(workers)) from error
@@ -298,7 +299,7 @@ def _ray(workers: Workers) -> Iterator[None]:
             if workers.address not in (None, "auto"):  # Ray itself would wait for minutes.
                 host, _, port = str(workers.address).removeprefix("ray://").rpartition(":")
                 socket.create_connection((host, int(port)), _ANSWER_SECONDS).close()
-            with _interrupts_blocked():
+            with interrupts_blocked():
                 ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(_unreachable(workers)) from error

@@ -70,6 +70,9 @@ class ParallelSettings(Settings):
     )
     address: Word | None = setting(None, "address of the cluster, such as ray://head:10001; null: a local cluster")
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
+    background: bool = setting(
+        True, "whether a network is trained in a second process beside other stages, where a core is free"
+    )
 
 
 class PublishedSettings(Settings):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import re
 import sys
 import warnings
 from collections.abc import Container, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module, resources
 from itertools import pairwise
 from pathlib import Path
@@ -67,7 +69,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
             with ends_where_nobody_reads():
-                run = getattr(import_module(f"{__package__}.{module}"), name)
+                with _never_collected():
+                    run = getattr(import_module(f"{__package__}.{module}"), name)
                 settings, *_ = get_type_hints(run).values()
                 return run(parse(settings, values), folder)
         except Exception as error:
@@ -115,6 +118,17 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+@contextmanager
+def _never_collected() -> Iterator[None]:
+    """Spares the garbage collector the objects of imported modules, whose search takes a fifth of the imports."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def _sentence_of_warning(

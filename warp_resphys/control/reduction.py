@@ -10,7 +10,6 @@ import numpy as np
 import scipy.linalg
 import torch
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from ..io.errors import ConvergenceError
 from ..io.files import to_plain
@@ -125,6 +124,8 @@ def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> 
     Raises:
         ConvergenceError: the robot has an equilibrium under too few of the inputs.
     """
+    from scipy.stats import qmc
+
     asked = sampling.equilibria
     unit = qmc.Sobol(source.parts, seed=sampling.seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
     commands = source.commands(unit)

@@ -11,7 +11,6 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import find_peaks
 
 from ..io.errors import InputError
 
@@ -78,6 +77,8 @@ def measure_oscillation(
 
 def turning_points(signal: FloatArray, threshold: float = 0.05) -> NDArray[np.int64]:
     """Sorted indices of the extremes of (T,) with a prominence above a share of its range, unlike noise."""
+    from scipy.signal import find_peaks
+
     prominence = threshold * np.ptp(signal)
     if prominence == 0.0:
         return np.empty(0, dtype=np.int64)

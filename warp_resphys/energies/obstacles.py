@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.ndimage
 import torch
-import trimesh
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
@@ -223,6 +222,8 @@ class DistanceGrid(Obstacle):
         Raises:
             InputError: a surface that is not closed, or whose triangles are seen from inside.
         """
+        import trimesh
+
         surface = trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles))
         if not surface.is_watertight:
             raise InputError("the surface of the obstacle is not closed, so that it has no inside: repair it.")

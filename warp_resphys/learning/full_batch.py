@@ -33,7 +33,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
         settings: FullBatchSettings,
     ) -> None:
         self._weights = [w for w in model.network.parameters() if w.requires_grad]
-        optimiser = torch.optim.LBFGS(
+        self._lbfgs = torch.optim.LBFGS(
             self._weights,
             max_iter=1,
             max_eval=_EVALUATIONS,
@@ -42,7 +42,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
             tolerance_grad=0.0,
             tolerance_change=0.0,
         )
-        super().__init__(model, optimiser, rollout_error, settings)
+        super().__init__(model, self._lbfgs, rollout_error, settings)
         self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     @abstractmethod
@@ -51,13 +51,13 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
 
     def _iterate(self) -> float:
         """Makes one iteration; returns the loss after it."""
-        self._optimiser.step(self._evaluate)  # type: ignore[arg-type]
+        self._lbfgs.step(self._evaluate)  # type: ignore[arg-type]
         return float(self._evaluate())
 
     def _evaluate(self) -> torch.Tensor:
         """Returns the loss and sets its gradient; cached, as L-BFGS evaluates the weights that it accepts twice."""
         if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
-            self._optimiser.zero_grad()
+            self._lbfgs.zero_grad()
             loss = self._backward()
             gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
             self._last = (

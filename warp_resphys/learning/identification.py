@@ -11,7 +11,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import scipy.stats
 import torch
 
 from ..io.errors import ConvergenceError
@@ -112,7 +111,9 @@ class ParameterSearch:
         """
         units = [self._misfit.to_unit(first)]
         if count > 1:
-            sampler = scipy.stats.qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
+            from scipy.stats import qmc
+
+            sampler = qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
             points = sampler.random(max(candidates, count - 1))
             parts = [self._misfit.losses_or_infinite(points[i : i + 8]) for i in range(0, len(points), 8)]
             losses = np.concatenate(parts)

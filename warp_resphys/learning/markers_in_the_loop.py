@@ -139,7 +139,7 @@ class MarkersInTheLoop(FullBatchTrainer):
             loss = self._train(self.model) + self._penalty()
             loss.backward()
         except ConvergenceError:
-            self._optimiser.zero_grad()
+            self._lbfgs.zero_grad()
             return _FAILURE
         return float(loss.detach())
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypedDict
 
 import numpy as np
-import scipy.stats
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr, stdtrit
 
 from ..io.errors import InputError
 
@@ -58,7 +58,7 @@ def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
     count, means = pairs.shape[1], pairs.mean(axis=1)
     tail = 0.5
     if count > 1:
-        tail = float(scipy.stats.norm.cdf(math.sqrt(count / (count - 1)) * scipy.stats.t.ppf(_TAIL, count - 1)))
+        tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, _TAIL)))
     lower, upper = np.quantile(1.0 - drawn[1] / drawn[0], [tail, 1.0 - tail])
     return Gain(float(1.0 - means[1] / means[0]), float(lower), float(upper), count)
 

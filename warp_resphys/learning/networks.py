@@ -4,6 +4,7 @@ A model is a multi-layer perceptron between coders (`coders`): these turn (q, v)
 standardised outputs into forces. Their constants come from the training split and are saved with the weights.
 """
 
+import copy
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -321,7 +322,7 @@ def build_next_state(
 ) -> NextState:
     """Returns an untrained next-state network with the same coders for inputs and outputs; see `build_model`."""
     position, velocity = _state_coders(settings, q - rest, v)
-    outputs = dict(zip(NextState.fields, _state_coders(settings, q - rest, v), strict=True))
+    outputs = dict(zip(NextState.fields, copy.deepcopy((position, velocity)), strict=True))
     actuated = None if actuation is None else actuation_coder(actuation)
     return NextState(rest, position, velocity, outputs, settings, actuated)
 

@@ -16,7 +16,6 @@ import numpy as np
 import scipy.ndimage
 import shapely
 import torch
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -134,6 +133,8 @@ class ClosedSurface:
         Raises:
             InputError: it is not closed.
         """
+        import trimesh
+
         beside, edges = trimesh.graph.face_adjacency(triangles, return_edges=True)
         if 2 * len(edges) != 3 * len(triangles):
             raise InputError("the surface of the body is not closed: every edge must belong to two triangles.")

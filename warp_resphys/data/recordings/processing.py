@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from ...io.errors import DataFileError, InputError, listed
 from ..base_motion import at_times
@@ -94,6 +93,8 @@ def smooth(recording: Recording, cutoff: float) -> Recording:
         InputError: the cut-off [Hz] is not below half of the frame rate.
         DataFileError: too few frames.
     """
+    from scipy.signal import butter, sosfiltfilt
+
     if not 0.0 < cutoff < 0.5 * recording.rate:
         raise InputError(
             f"the cut-off is {cutoff:g} Hz: it must lie between 0 and {0.5 * recording.rate:g} Hz, half of the rate."

@@ -21,13 +21,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from .errors import ResphysError
-from .fan_out import WorkerError, WorkerFaultError, end_with, interrupts_blocked, start_warp
+from .fan_out import WorkerError, WorkerFaultError, begin_work, end_with, interrupts_blocked
 from .memory import peak_memory_gib
 from .progress import print_line, print_to
 from .stages import Stage, StageContext, run_stage
@@ -164,8 +163,7 @@ def _work(stage: Stage, context: StageContext, folder: Path) -> float | None:
     lines = _Lines(folder / _LINES)
     logging.basicConfig(level=logging.INFO, handlers=[lines], force=True)
     print_to(lines.progress)
-    start_warp()
-    torch.set_num_threads(1)
+    begin_work()
     try:
         with threadpool_limits(1), _interrupted_by(folder / _STOP):
             return run_stage(stage, context)

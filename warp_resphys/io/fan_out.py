@@ -142,9 +142,7 @@ def fan_out(
 def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
     """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
-    warnings.simplefilter("ignore", ResphysWarning)  # The parent has shown them.
-    start_warp()
-    torch.set_num_threads(1)
+    begin_work()
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
     if not progress.parent.is_dir():
@@ -161,8 +159,10 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
         raise WorkerFaultError(f"a worker process failed:\n{traceback.format_exc()}") from None
 
 
-def start_warp() -> None:
-    """Starts Warp without its greeting, and without its warnings, which the parent process has shown."""
+def begin_work() -> None:
+    """Prepares a worker process: one thread of torch, and no warnings that the parent process has shown."""
+    warnings.simplefilter("ignore", ResphysWarning)
+    torch.set_num_threads(1)
     wp.config.log_level = wp.LOG_WARNING
     shown = os.dup(2)
     try:

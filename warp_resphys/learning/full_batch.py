@@ -51,7 +51,7 @@ class FullBatchTrainer(EpochTrainer[ResidualForce]):
 
     def _iterate(self) -> float:
         """Makes one iteration; returns the loss after it."""
-        self._lbfgs.step(self._evaluate)  # type: ignore[arg-type]
+        self._lbfgs.step(self._evaluate)
         return float(self._evaluate())
 
     def _evaluate(self) -> torch.Tensor:

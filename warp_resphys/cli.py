@@ -13,9 +13,9 @@ from .io.pipes import ends_where_nobody_reads
 def main() -> None:
     """Runs the command of the command line.
 
-    The exit code is 2, with one sentence on stderr, for an error that the user can fix; 130 after Ctrl-C; 141 when the
-    reader of its output has closed the pipe, as `head` does; and 1, with a traceback, for any other error. With
-    HYDRA_FULL_ERROR=1 in the environment, every error has its traceback.
+    The exit code is 2, with one sentence on stderr, for an error that the user can fix; 130 after Ctrl-C or SIGTERM;
+    141 when the reader of its output has closed the pipe, as `head` does; and 1, with a traceback, for any other error.
+    With HYDRA_FULL_ERROR=1 in the environment, every error has its traceback.
     """
     with ends_where_nobody_reads():
         if "--version" in sys.argv[1:]:  # Hydra would print its own version.

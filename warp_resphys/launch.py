@@ -6,7 +6,9 @@ import gc
 import logging
 import os
 import re
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
@@ -101,7 +103,10 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         else:
             rest = freed(rest, typed=False)
         sys.argv = [before[0], *rest]
-        hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(job)()
+        with _ends_as_after_ctrl_c():
+            hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(
+                job
+            )()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
         raise SystemExit(INTERRUPTED) from None
@@ -118,6 +123,19 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+@contextmanager
+def _ends_as_after_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM, by which clusters and containers end a process, act as Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

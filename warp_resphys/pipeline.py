@@ -364,7 +364,8 @@ def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: fl
     left = unfinished(stages, folder)
     if not left or not may_be_long(left, folder):
         return
-    if sentence := estimate(left, folder).sentence(remedies(left, run.budget == "quick"), times):
+    expected = estimate(left, folder, background_of(run) is not None)
+    if sentence := expected.sentence(remedies(left, run.budget == "quick"), times):
         log.info("%s", sentence)
 
 

@@ -8,7 +8,7 @@ from support.configured import settings
 from warp_resphys.experiment import duration
 from warp_resphys.experiment.duration import ExpectedDuration, estimate, may_be_long, remedies
 from warp_resphys.experiment.trials import split_of
-from warp_resphys.io.stages import run_stages, unfinished
+from warp_resphys.io.stages import Stage, run_stages, unfinished
 from warp_resphys.pipeline import acquire, learning_stages, run_experiment
 
 TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "timing=false", "trainer.epochs=2")
@@ -43,6 +43,17 @@ def test_a_sentence_says_how_long_and_what_helps():
     assert text.startswith("about 1 min 50 s more for 1,234 vertices, without plan_resphys")
     assert "identify 1 min 40 s" in text
     assert text.endswith("shorter with a coarser mesh, fewer trials.")
+
+
+def test_a_training_in_a_second_process_counts_where_the_others_wait_for_it():
+    """It begins with the reconstruction, which is shorter or longer than the training."""
+    before = [Stage("reconstruct", print, (), {}), Stage("train_a", print, (), {}, ("reconstruct",), bool)]
+    stages = [*before, Stage("train_b", print, (), {}, (), bool), Stage("evaluate", print, (), {}, ("train_b",))]
+    seconds = {"reconstruct": 5.0, "train_a": 3.0, "evaluate": 1.0}
+    for own, expected in ((2.0, 9.0), (20.0, 21.0)):
+        assert duration._elapsed(stages, {**seconds, "train_b": own}) == expected
+    part = ExpectedDuration({"train": 50.0, "train_simfree": 45.0}, at_once=45.0)
+    assert part.sentence([]) == ""
 
 
 def test_remedies_name_the_parameters_and_the_quick_budget():

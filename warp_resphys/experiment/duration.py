@@ -64,16 +64,18 @@ class ExpectedDuration:
         seconds: by stage [s].
         without: names of stages that have no estimate.
         vertices: of the simulated body.
+        at_once: time during which two stages run [s].
     """
 
     seconds: Mapping[str, float]
     without: Sequence[str] = ()
     vertices: int = 0
+    at_once: float = 0.0
 
     @property
     def total(self) -> float:
-        """Sum over all stages with an estimate [s]."""
-        return sum(self.seconds.values())
+        """From the first stage with an estimate to the last [s]."""
+        return sum(self.seconds.values()) - self.at_once
 
     def sentence(self, remedies: Sequence[str], times: float = 1.0) -> str:
         """Returns the estimate in words; empty for less than a minute.
@@ -110,12 +112,13 @@ def may_be_long(stages: Sequence[Stage], folder: Path) -> bool:
     return work > _SHORT
 
 
-def estimate(stages: Sequence[Stage], folder: Path) -> ExpectedDuration:
+def estimate(stages: Sequence[Stage], folder: Path, background: bool = False) -> ExpectedDuration:
     """Measures a few steps and returns the expected duration of stages of one split.
 
     Args:
         stages: to estimate.
         folder: of the split; its dataset exists.
+        background: whether a second process trains networks.
     """
     seconds, without, vertices = dict[str, float](), list[str](), 0
     known = dict[tuple[Any, ...], float]()
@@ -133,7 +136,23 @@ def estimate(stages: Sequence[Stage], folder: Path) -> ExpectedDuration:
             seconds[stage.name] = own
         elif not isinstance(settings, ReportStage):
             without.append(stage.name)
-    return ExpectedDuration(seconds, without, vertices)
+    at_once = sum(seconds.values()) - _elapsed(stages, seconds) if background else 0.0
+    return ExpectedDuration(seconds, without, vertices, at_once)
+
+
+def _elapsed(stages: Sequence[Stage], seconds: Mapping[str, float]) -> float:
+    """Time that stages take [s] if a second process runs some of them, in the order of `io.stages.run_stages`."""
+    left, now, ends = {stage.name for stage in stages}, 0.0, dict[str, float]()
+    for number, stage in enumerate(stages):
+        if stage.name in ends:
+            now = max(now, ends[stage.name])
+        else:
+            for other in stages[number + 1 :]:
+                if other.background is not None and not left & {*ends, *other.upstream}:
+                    ends[other.name] = now + seconds.get(other.name, 0.0)
+            now += seconds.get(stage.name, 0.0)
+        left.remove(stage.name)
+    return now
 
 
 def remedies(stages: Sequence[Stage], quick: bool) -> list[str]:

@@ -57,10 +57,18 @@ def training(context):
             os.kill(os.getpid(), signal.SIGKILL)
         case "is long" if not (context.run_dir / "checkpoint").exists():
             try:
+                Destroyed()
                 wait_until(lambda: False)
             finally:
                 (context.run_dir / "checkpoint").touch()
     work(context)
+
+
+class Destroyed:
+    """An object into whose destructor the first interruption falls, where it is lost."""
+
+    def __del__(self):
+        wait_until(lambda: False)
 
 
 def is_worth_it(context):

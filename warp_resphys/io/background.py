@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Iterator
@@ -181,15 +182,26 @@ def _work(stage: Stage, context: StageContext, folder: Path) -> float | None:
 
 @contextmanager
 def _interrupted_by(path: Path) -> Iterator[None]:
-    """Raises KeyboardInterrupt in the main thread, once, when a file appears; Ctrl-C itself is left to the parent."""
-    ended = threading.Event()
+    """Raises KeyboardInterrupt in the main thread when a file appears; Ctrl-C itself is left to the parent.
+
+    It is raised again only where it was lost, in a destructor or in the callback of a weak reference.
+    """
+    ended, due = threading.Event(), threading.Event()
+    due.set()
 
     def watch() -> None:
         while not ended.wait(_LOOK_SECONDS):
-            if path.exists():
+            if due.is_set() and path.exists():
+                due.clear()
                 _thread.interrupt_main(signal.SIGTERM)
-                return
 
+    def unraisable(lost: sys.UnraisableHookArgs) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            due.set()
+        else:
+            sys.__unraisablehook__(lost)
+
+    sys.unraisablehook = unraisable
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     watcher = threading.Thread(target=watch, name="interruption", daemon=True)

@@ -279,7 +279,8 @@ def runs_section(reproduction: Reproduction, results: Sequence[Run]) -> Part:
             rows.append(Row(head, [Cell("failed"), _NONE]))
             failures.append(Text(f"Failed: {head}: {run.failure}"))
     note = (
-        "Time: sum over the last run of each stage, on a machine with other load. Memory: including worker processes."
+        "Time: sum over the last run of each stage, also of those that ran at once, on a machine with other load. "
+        "Memory: including worker processes."
     )
     table = PageTable("Run", ["All stages", "Peak memory [GiB]"], rows, note)
     commands = Items([shlex.join(["warp-resphys", *run.arguments]) for run in results], code=True)

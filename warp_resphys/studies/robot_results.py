@@ -192,7 +192,7 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
         f"if there are {LEAST_TRIALS} or more. Coverage: share of the "
         "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: sum "
-        "over all stages, also of folds that ran in parallel, on a machine with other load."
+        "over all stages, also of stages and folds that ran in parallel, on a machine with other load."
     )
     if with_law:
         note += " Where there is a law of the material, it is compared with SysID, and ResPhys with the law."

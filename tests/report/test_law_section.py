@@ -153,7 +153,7 @@ def test_errors_by_load_and_multiples():
         data=released().data.changed(others={"up": {"weight_g": 50.0}, "twist": {"twist_deg": 90.0}}),
     )
     said, few = conclusions(metrics, config)
-    assert "leaves 99 % less error than the law on 2 trials (1 and 3 to 0.01 and 0.03 mm)." in said
+    assert "has 99 % less error than the law on 2 trials (1 and 3 to 0.01 and 0.03 mm)." in said
     assert said.endswith(
         " On 2 trials outside of the training loads it has 50 times the error of the law (2 and 2 to 80 and 120 mm)."
     )

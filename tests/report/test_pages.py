@@ -95,7 +95,7 @@ class TestArms:
         settings = arm_settings("sopra_overpressure", data=data(input_scales=[1.25, 1.75]))
         write_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
         text, scales = report(tmp_path, settings).text, errors_of(tmp_path)["scales"]
-        assert f"At 1.75 times the inputs of the training the error is {scales['1.75']['resphys']['mean']:.3f}" in text
+        assert f"At 1.75 times the training inputs the error is {scales['1.75']['resphys']['mean']:.3f}" in text
         assert all(f"{scales[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
         assert "none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
         assert "error_over_scale" in figures_in(tmp_path)
@@ -278,7 +278,7 @@ class TestBeams:
         head = page.text[: page.text.index("Error of the markers")]
         mean = f"{errors['errors_mm']['sysid']['mean']:.3f}"
         assert re.search(f"{mean} mm from the measured ones over the first [0-9.]+ s with SysID;", head)
-        for said in ("ResPhys) adds nothing to SysID", "Identification (SysID) leaves", "upper bound, 2e+06: widen"):
+        for said in ("ResPhys) adds nothing to SysID", "Identification (SysID) has", "upper bound, 2e+06: widen"):
             assert said in head
         assert "no force: no epoch of its training was kept" in page.text
         assert re.findall(r'class="answer"><th scope="row">([^<]+)<', page.source) == ["SysID"]

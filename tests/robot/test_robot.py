@@ -328,10 +328,10 @@ class TestBadInput:
     def test_a_motion_says_when_it_left_the_training(self, robot):
         motion = played(robot, 3)
         left = torch.zeros_like(motion.left)
-        assert "left the states" not in repr(replace(motion, left=left))
+        assert "left the training" not in repr(replace(motion, left=left))
         left[2:] = True
         assert repr(replace(motion, left=left)).endswith(
-            f"1 left the states of the training, the first at {2 * robot.time_step:.3g} s"
+            f"1 left the training range, the first at {2 * robot.time_step:.3g} s"
         )
 
     def test_a_simulator_can_be_loaded_before_the_run_is_evaluated(self, arm, tmp_path):

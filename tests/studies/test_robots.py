@@ -146,7 +146,7 @@ def test_a_force_helps_where_the_whole_interval_of_several_trials_does():
     assert [row.is_helped for row in rows.values()] == [True, False, False, False]
     said = verdict(robots, rows)
     assert f"identification on 1 of 4 robots ({robots[names[0]].title})." in said
-    assert "everything else (uncorrected, a network alone, without physics) on 0 of 0 robots for which" in said
+    assert "all other models (uncorrected, a network alone, without physics) on 0 of 0 robots for which" in said
     (table,) = summary(robots, rows, failed=[names[1]]).blocks
     assert [row.head for row in table.rows] == [robots[name].title for name in names]
     texts = ["50 % (20 to 70)", "50 % (\N{MINUS SIGN}10 to 70)", "50 %", NONE]

@@ -91,7 +91,7 @@ def compared(gain: Gain, base: str) -> str:
     if gain.share < -MOST_PERCENT:
         mean, low, high = (f"{float(f'{1.0 - x:.2g}'):,.0f}" for x in (gain.share, gain.upper, gain.lower))
         return f"has {mean} times{f' (90 %: {low} to {high})' if interval else ''} the error of {base}"
-    return f"leaves {_percent(gain, interval)} {'less' if gain.share >= 0.0 else 'more'} error than {base}"
+    return f"has {_percent(gain, interval)} {'less' if gain.share >= 0.0 else 'more'} error than {base}"
 
 
 def _percent(gain: Gain, interval: bool) -> str:

@@ -51,7 +51,7 @@ def unbroken(text: str) -> str:
 
 
 def left_text(metrics: Mapping[str, Any], trial: str | None = None) -> Markup | None:
-    """Return a bold sentence on test trials in which the body left the states of the training; None if it did not.
+    """Return a bold sentence on test trials in which the body left the training range; None if it did not.
 
     Args:
         metrics: With `range`, as for `range_texts`; of folds, each has its own.
@@ -66,9 +66,7 @@ def left_text(metrics: Mapping[str, Any], trial: str | None = None) -> Markup | 
     if not left:
         return None
     where = f"In the test trial {trial}" if trial is not None else f"In {number_of(len(left), 'test trial')}"
-    said = unbroken(
-        f"{where} the body left the states of the training{when_text(left)}: what the network adds is a guess there."
-    )
+    said = unbroken(f"{where} the body left the training range{when_text(left)}: there, the network extrapolates.")
     return Markup("<strong>{}</strong>").format(said)
 
 
@@ -238,4 +236,4 @@ def scale_text(errors: Mapping[str, Mapping[str, Any]]) -> str:
     shown = [m for m in models_in_figures(errors[largest]) if m not in ("published", "simulation", "sysid_elastic")]
     means = {m: errors[largest][m]["mean"] for m in reversed(shown)}
     parts = ", ".join(f"{mm_text(mean)} {_with(model)}" for model, mean in means.items())
-    return f"At {float(largest):g} times the inputs of the training the error is {parts}." if parts else ""
+    return f"At {float(largest):g} times the training inputs the error is {parts}." if parts else ""

@@ -53,14 +53,14 @@ class Motion:
     obstacles: tuple[ObstacleMotion, ...] = ()
 
     def __repr__(self) -> str:
-        """Robot, numbers of steps and environments, and when the first of these left the states of the training."""
+        """Robot, numbers of steps and environments, and when the first of these left the training range."""
         steps, batch = len(self.times) - 1, self.q.shape[1]
         text = f"Motion of {self.robot.name}, {self.robot.model}: {number_of(steps, 'step')}, "
         text += f"{number_of(batch, 'environment')}"
         left, lost = self.left.cpu().numpy(), self.lost.cpu().numpy()
         if left.any():
             first = self.times[left.any(axis=1).argmax()]
-            text += f"; {left.any(axis=0).sum()} left the states of the training, the first at {first:.3g} s"
+            text += f"; {left.any(axis=0).sum()} left the training range, the first at {first:.3g} s"
         return text + (f"; {lost[-1].sum()} diverged" if lost.any() else "")
 
     def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:

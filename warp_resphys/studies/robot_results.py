@@ -49,7 +49,7 @@ class Share(Settings):
 
 
 class Beside(Settings):
-    """The best corrected model and the best of all others, at rest and without physics included."""
+    """The best corrected model and the best of all other models, including predictions without physics."""
 
     corrected: Word
     other: Word
@@ -190,12 +190,12 @@ def summary(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
         "deviation over trials. Without physics: the best of a body at rest, interpolation and kernel regression "
         "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
         "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
-        f"if there are {LEAST_TRIALS} or more. Coverage: share of the "
-        "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: sum "
-        "over all stages, also of stages and folds that ran in parallel, on a machine with other load."
+        f"if there are {LEAST_TRIALS} or more. Coverage: the share of the "
+        "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: the "
+        "sum over all stages and folds, including those that ran in parallel, on a machine with other load."
     )
     if with_law:
-        note += " Where there is a law of the material, it is compared with SysID, and ResPhys with the law."
+        note += " With a law of the material, the law is compared with SysID, and ResPhys with the law."
     columns = [f"{words} [mm]" for words in ("Without physics", *(_COLUMNS[model] for model in models))]
     columns += [*(f"Less error by {_COLUMNS[model]}" for model in gained), "Coverage", "Time"]
     return Part("All robots", [PageTable("Robot", columns, rows, note)] if rows else [])
@@ -216,14 +216,14 @@ def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -
     if result.beside is not None:
         own, other = (result.errors_mm[model] for model in (result.beside.corrected, result.beside.other))
         text.append(
-            f"The best corrected model, {model_name(result.beside.corrected)}, leaves {number_text(own['mean'])} mm; "
-            f"the best of all others, {model_name(result.beside.other)}, {number_text(other['mean'])} mm."
+            f"The best corrected model, {model_name(result.beside.corrected)}, has an error of "
+            f"{number_text(own['mean'])} mm; the best of all others, {model_name(result.beside.other)}, {number_text(other['mean'])} mm."
         )
     if result.moved_mm is not None:
         moved = number_text(result.moved_mm)
         text.append(f"A finer mesh moves the markers of the identified simulator by {moved} mm.")
     blocks: list[Block] = [
-        *([drawn_file(path, alt, "The body as it is simulated.")] if path.is_file() else []),
+        *([drawn_file(path, alt, "The simulated body.")] if path.is_file() else []),
         Text(f"{robot.actuation[:1].upper()}{robot.actuation[1:]}. {robot.source}"),
         Text(" ".join(text)),
     ]
@@ -260,7 +260,7 @@ def verdict(robots: Mapping[str, RecordedRobot], measured: Mapping[str, Measured
     ]
     few = [robots[name].title for name, result in measured.items() if len(result.tested) < LEAST_TRIALS]
     text = (
-        "By its 90 % interval over the held-out trials, a corrected simulator leaves less error than everything else "
+        "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
         f"(uncorrected, a network alone, without physics) on {which[0]} for which all of these were measured, and the "
         f"learned force reduces the error of identification on {which[1]}."
     )

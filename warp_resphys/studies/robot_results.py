@@ -217,7 +217,8 @@ def details(name: str, robot: RecordedRobot, result: Measured, pictures: Path) -
         own, other = (result.errors_mm[model] for model in (result.beside.corrected, result.beside.other))
         text.append(
             f"The best corrected model, {model_name(result.beside.corrected)}, has an error of "
-            f"{number_text(own['mean'])} mm; the best of all others, {model_name(result.beside.other)}, {number_text(other['mean'])} mm."
+            f"{number_text(own['mean'])} mm; "
+            f"the best of all others, {model_name(result.beside.other)}, {number_text(other['mean'])} mm."
         )
     if result.moved_mm is not None:
         moved = number_text(result.moved_mm)

@@ -31,7 +31,7 @@ def annul(p: wp.float64, q: wp.float64, pq: wp.float64, rp: wp.float64, rq: wp.f
     Returns the entries pp, qq, rp and rq, with r the third axis, and the vectors of the two axes.
     """
     t = ZERO
-    if pq != ZERO:
+    if pq * pq > ZERO:
         half = HALF * (q - p)
         t = pq / (half + wp.where(half < ZERO, -ONE, ONE) * wp.sqrt(half * half + pq * pq))
     c = ONE / wp.sqrt(ONE + t * t)

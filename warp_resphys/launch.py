@@ -135,12 +135,13 @@ def _ends_as_after_ctrl_c() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 @contextmanager
 def _never_collected() -> Iterator[None]:
     """Spares the garbage collector the objects of imported modules, whose search takes a fifth of the imports."""
+    gc.collect()  # What an earlier job of a sweep has left would be kept for good.
     gc.disable()
     try:
         yield

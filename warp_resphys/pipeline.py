@@ -4,6 +4,7 @@ The configuration determines the stages. The settings of a stage are exactly wha
 """
 
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -185,9 +186,12 @@ def workers_of(run: RunSettings) -> Workers:
 
 
 def background_of(run: RunSettings) -> BackgroundProcess | None:
-    """Returns the second process of a run; None if it is not wanted, no core is free, or networks are on a GPU."""
+    """Returns the second process of a run; None if it is not wanted, no core is free, or networks are on a GPU.
+
+    On Windows there is none, as it would outlive a run that is killed.
+    """
     free = available_cores() - workers_of(run).count
-    wanted = run.parallel.background and run.parallel.backend == "local"
+    wanted = run.parallel.background and run.parallel.backend == "local" and sys.platform != "win32"
     return BackgroundProcess() if wanted and free > 0 and choose_device(run.device).type == "cpu" else None
 
 

@@ -225,6 +225,6 @@ def test_a_cluster_computes_what_one_process_computes(backend, tmp_path, monkeyp
 
 
 def test_workers_repeat_no_warning_of_warp():
-    code = "import os; from warp_resphys.io.fan_out import _start_warp; _start_warp(); os.write(2, b'own message')"
+    code = "import os; from warp_resphys.io.fan_out import begin_work; begin_work(); os.write(2, b'own message')"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (ended.stdout, ended.stderr) == ("", "own message")

@@ -93,7 +93,7 @@ def test_files_are_written_where_folders_cannot_be_synchronised(tmp_path, monkey
 
 def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
-    with fan_out._interrupts_blocked():
+    with fan_out.interrupts_blocked():
         pass
 
 

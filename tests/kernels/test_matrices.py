@@ -72,6 +72,7 @@ def test_eigenvectors_of_symmetric_matrices():
     turns = [np.linalg.qr(RANDOM.normal(size=(3, 3)))[0] for _ in range(6)]
     spectra = [(3.0, 1.0, -2.0), (1.0, 1.0 + 1e-9, 1.0 - 1e-7), (2.0, 2.0, 0.0), (1e9, 1.0, 1e-9), (0.0, 0.0, 0.0)]
     a = np.array([q * e @ q.T for q in turns for e in spectra] + [np.diag(e) for e in spectra])
+    a = np.concatenate([a, [[[1.0, 1e-170, 0.0], [1e-170, 1.0, 0.1], [0.0, 0.1, 1.0]]]])
     a = (a + a.transpose(0, 2, 1)) / 2.0
     v, e = (wp.zeros(len(a), dtype=kind, device="cpu") for kind in (wp.mat33d, wp.vec3d))
     wp.launch(eigenpairs, len(a), [wp.array(a, dtype=wp.mat33d, device="cpu"), v, e], device="cpu")

@@ -76,8 +76,9 @@ def test_a_curved_valley_ends_at_the_same_minimum_with_derivatives_at_fewer_poin
 def test_a_search_ends_where_there_are_no_derivatives():
     function = Function(rosenbrock, lambda x: None if x[0] > 0.5 else rosenbrock_slopes(x))
     descent, point = function.search([0.1, 0.9])
-    assert descent.is_stuck
+    assert descent.stuck_at is not None
+    assert torch.equal(descent.stuck_at, point.x)
     assert float(point.x[0, 0]) > 0.5
     assert np.isfinite(float(point.value))
     descent, _ = Function(rosenbrock, rosenbrock_slopes).search([0.1, 0.9])
-    assert not descent.is_stuck
+    assert descent.stuck_at is None

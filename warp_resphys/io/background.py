@@ -11,6 +11,7 @@ import _thread
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -32,9 +33,11 @@ from .memory import peak_memory_gib
 from .progress import print_line, print_to
 from .stages import Stage, StageContext, run_stage
 
+log = logging.getLogger(__name__)
 _LOOK_SECONDS = 0.05  # interval of looking for new lines, and for the interruption
 _PATIENCE = 30.0  # s that an interrupted stage gets to write its checkpoint
 _LINES, _STOP = "lines", "stop"  # files
+_FOLDER = ".background_"  # first part of the name of a temporary folder in the run folder
 _PROGRESS = ""  # name of the logger of lines of progress
 
 
@@ -50,15 +53,18 @@ class BackgroundProcess:
         return None if self._running is None else self._running.stage
 
     def start(self, stage: Stage, context: StageContext) -> None:
-        """Starts a stage, whose record counts the memory of both processes."""
+        """Starts a stage, whose record has the memory of the larger of both processes."""
         context.memory.count([peak_memory_gib()])
-        folder = TemporaryDirectory(prefix=".background_", dir=context.run_dir, ignore_cleanup_errors=True)
+        for left in Path(context.run_dir).glob(f"{_FOLDER}*"):  # of a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        folder = TemporaryDirectory(prefix=_FOLDER, dir=context.run_dir, ignore_cleanup_errors=True)
         ends: Any = {"initializer": end_with, "initargs": (os.getpid(),)}
         executor = ProcessPoolExecutor(1, **ends)
         with interrupts_blocked():  # The process leaves Ctrl-C to this one.
             future = executor.submit(_work, stage, context, Path(folder.name))
-        self._running = _Running(stage.name, folder, executor, future)
-        self._running.thread.start()
+            self._running = _Running(stage.name, folder, executor, future)
+            self._running.thread.start()
+        future.add_done_callback(lambda done: _say_failure(stage.name, done))
 
     def check(self) -> None:
         """Raises the error of the stage, if it has failed.
@@ -109,6 +115,12 @@ class BackgroundProcess:
         running.folder.cleanup()
 
 
+def _say_failure(name: str, future: Future[float | None]) -> None:
+    """Logs at once that a stage failed, as its error is raised only after the stage that runs here."""
+    if not future.cancelled() and future.exception() is not None:
+        log.error("%s failed: the run ends after the stage that is running", name)
+
+
 class _Running:
     """A stage in its process, and a thread that repeats its lines."""
 
@@ -139,8 +151,8 @@ class _Lines(logging.Handler):
     """Writes records of the log to a file, and lines of progress."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__()
         self._file = path.open("a", encoding="utf-8", buffering=1)
+        super().__init__()
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
@@ -189,10 +201,14 @@ def _interrupted_by(path: Path) -> Iterator[None]:
     ended, due = threading.Event(), threading.Event()
     due.set()
 
+    def interrupt(*_: object) -> None:
+        if due.is_set():  # The signal may reach this process itself as well.
+            due.clear()
+            raise KeyboardInterrupt
+
     def watch() -> None:
         while not ended.wait(_LOOK_SECONDS):
             if due.is_set() and path.exists():
-                due.clear()
                 _thread.interrupt_main(signal.SIGTERM)
 
     def unraisable(lost: sys.UnraisableHookArgs) -> None:
@@ -203,7 +219,7 @@ def _interrupted_by(path: Path) -> Iterator[None]:
 
     sys.unraisablehook = unraisable
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, interrupt)
     watcher = threading.Thread(target=watch, name="interruption", daemon=True)
     watcher.start()
     try:

@@ -107,7 +107,7 @@ def run_stages(
     """Runs the stages whose outputs are missing, damaged or of other settings.
 
     A stage that may run in the background starts there as soon as its upstream stages are finished and another stage
-    runs here. The next stage that reads its outputs waits for it.
+    runs here. It is waited for at its place in the order.
 
     Args:
         stages: in the order in which they run; a stage comes after its upstream stages.

@@ -43,13 +43,13 @@ class Descent(UnitBox):
         evaluated: called with unknowns and the objective after each step, infinite if the evaluation failed.
 
     Attributes:
-        is_stuck: whether the search ended at a point where there are no derivatives.
+        stuck_at: the last point (1, P) without derivatives; None if all had some.
     """
 
     def __init__(self, linearise: Linearise, tolerance: float, evaluated: Evaluated) -> None:
         super().__init__(self._differentiated)
         self._linearise, self._tolerance, self._evaluated = linearise, tolerance, evaluated
-        self.is_stuck = False
+        self.stuck_at: torch.Tensor | None = None
         self._end: Point | None = None  # of the last step, if it needs no evaluation
 
     @override
@@ -66,7 +66,8 @@ class Descent(UnitBox):
     @override
     def linearise(self, point: Point) -> Move:
         whole = super().evaluate(point.x)
-        self.is_stuck = not math.isfinite(float(whole.value))
+        if not math.isfinite(float(whole.value)):
+            self.stuck_at = point.x
         step, (gradient,), (matrix,) = super().linearise(whole), *whole.kept
 
         def move(damping: torch.Tensor) -> torch.Tensor:

@@ -160,7 +160,7 @@ class ParameterSearch:
         unit = np.array(best.get("unit", misfit.to_unit(best["parameters"])))
         misfit.prior_weight = best.get("prior_weight", 0.0)
         last = is_last(best["loss"])
-        return Identification(
+        found = Identification(
             parameters=best["parameters"],
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
@@ -168,6 +168,8 @@ class ParameterSearch:
             placement=misfit.placement(unit, self._labels) if last else None,
             uncertainty=misfit.uncertainty(unit) if last else None,
         )
+        misfit.forget()
+        return found
 
     def _descend(
         self, number: int, start: Mapping[str, float], max_evaluations: int, tolerance: float, report: Report | None
@@ -208,7 +210,8 @@ class ParameterSearch:
         if not math.isfinite(float(start.value)):
             return start
         end = minimise(descent, start, tolerance, max_evaluations - 1).point
-        is_stuck = descent.is_stuck and torch.equal(end.x, x)
+        stuck_at = descent.stuck_at
+        is_stuck = stuck_at is not None and torch.equal(stuck_at, end.x) and torch.equal(end.x, x)
         return replace(end, value=torch.full_like(end.value, torch.inf)) if is_stuck else end
 
 

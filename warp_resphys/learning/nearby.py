@@ -11,7 +11,7 @@ import torch
 
 from ..stepping.state import State
 
-_MOST_BYTES = 2**30  # of the derivatives that are kept
+_MOST_BYTES = 2**30  # of the states, and of the derivatives, that are kept
 
 
 class NearbyMotion:
@@ -29,12 +29,13 @@ class NearbyMotion:
         self._steps = owners.new_zeros(())
 
     def keep(self, unit: torch.Tensor, states: Sequence[State]) -> None:
-        """Keeps the states of the motion with parameters (P,), as fractions of their ranges."""
-        self._unit, self._states = unit, states
+        """Keeps states of the motion with parameters (P,), as fractions of their ranges, unless they are large."""
+        small = sum(state.q.nbytes + state.v.nbytes for state in states) <= _MOST_BYTES
+        self._unit, self._states = unit, states if small else ()
 
     def states(self, unit: torch.Tensor) -> Sequence[State] | None:
-        """Returns the states with parameters (P,), if the last motion had these."""
-        return self._states if self._unit is not None and torch.equal(unit, self._unit) else None
+        """Returns the states with parameters (P,), if the last motion had these and they are kept."""
+        return self._states if self._states and self._unit is not None and torch.equal(unit, self._unit) else None
 
     def predict(self, unit: torch.Tensor, step: int) -> torch.Tensor | None:
         """Returns positions (R, N, 3) after a step with parameters (P,) [m]; None where nothing predicts them."""

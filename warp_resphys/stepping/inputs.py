@@ -167,7 +167,8 @@ class Inputs:
 
     def by_step(self, steps: int) -> Iterator["Inputs"]:
         """Yields the inputs of steps in turn, whose gradients are joined once and not step by step as those of `at`."""
-        times = {name: values.unbind() for name, values in self.fields.items() if self._has_time_axis()[name]}
+        has_time = self._has_time_axis()
+        times = {name: values.unbind() for name, values in self.fields.items() if has_time[name]}
         for t in range(steps):
             now = {name: values[min(t, len(values) - 1)] for name, values in times.items()}
             yield self._derived(self.fields | now) if times else self

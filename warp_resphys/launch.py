@@ -103,10 +103,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         else:
             rest = freed(rest, typed=False)
         sys.argv = [before[0], *rest]
+        place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
         with _ends_as_after_ctrl_c():
-            hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_PACKAGE}", config_name=configuration(command))(
-                job
-            )()
+            hydra.main(version_base="1.3", **place)(job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
         raise SystemExit(INTERRUPTED) from None

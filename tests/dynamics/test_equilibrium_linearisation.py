@@ -78,9 +78,9 @@ def test_the_residual_of_an_equilibrium_is_zero_there():
     step = simulator.linearise_equilibrium(batch=2)
     weight = float(step.residual(simulator.rest_state(2).q).norm())
     assert float(step.residual(state.q).norm()) < 1e-9 * weight
-    found = step.finish(state.q)
-    assert bool((found.v == 0.0).all())
-    torch.testing.assert_close(found.q, state.q)
+    resting = step.finish(state.q)
+    assert bool((resting.v == 0.0).all())
+    torch.testing.assert_close(resting.q, state.q)
 
 
 def test_forces_that_follow_the_pose_are_refused():

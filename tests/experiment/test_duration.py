@@ -46,7 +46,7 @@ def test_a_sentence_says_how_long_and_what_helps():
 
 
 def test_a_training_in_a_second_process_counts_where_the_others_wait_for_it():
-    """It begins with the reconstruction, which is shorter or longer than the training."""
+    """The second training begins with the reconstruction, and takes less or more time than the stages before it."""
     before = [Stage("reconstruct", print, (), {}), Stage("train_a", print, (), {}, ("reconstruct",), bool)]
     stages = [*before, Stage("train_b", print, (), {}, (), bool), Stage("evaluate", print, (), {}, ("train_b",))]
     seconds = {"reconstruct": 5.0, "train_a": 3.0, "evaluate": 1.0}

@@ -68,7 +68,7 @@ def eigenpairs(a: wp.array[wp.mat33d], v_out: wp.array[wp.mat33d], e_out: wp.arr
 
 
 def test_eigenvectors_of_symmetric_matrices():
-    """Those with nearly and exactly equal eigenvalues, of any size, and zero."""
+    """Matrices with distinct, nearly equal and equal eigenvalues, of any size, and zero."""
     turns = [np.linalg.qr(RANDOM.normal(size=(3, 3)))[0] for _ in range(6)]
     spectra = [(3.0, 1.0, -2.0), (1.0, 1.0 + 1e-9, 1.0 - 1e-7), (2.0, 2.0, 0.0), (1e9, 1.0, 1e-9), (0.0, 0.0, 0.0)]
     a = np.array([q * e @ q.T for q in turns for e in spectra] + [np.diag(e) for e in spectra])

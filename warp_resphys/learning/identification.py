@@ -160,7 +160,7 @@ class ParameterSearch:
         unit = np.array(best.get("unit", misfit.to_unit(best["parameters"])))
         misfit.prior_weight = best.get("prior_weight", 0.0)
         last = is_last(best["loss"])
-        found = Identification(
+        identified = Identification(
             parameters=best["parameters"],
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
@@ -169,7 +169,7 @@ class ParameterSearch:
             uncertainty=misfit.uncertainty(unit) if last else None,
         )
         misfit.forget()
-        return found
+        return identified
 
     def _descend(
         self, number: int, start: Mapping[str, float], max_evaluations: int, tolerance: float, report: Report | None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.support.chambered import chambered
+from support.chambered import chambered
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, Tendons, select_vertices
 from warp_resphys.energies.materials import Gent, StableNeoHookean
 from warp_resphys.io.errors import InputError

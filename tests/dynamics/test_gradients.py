@@ -21,13 +21,8 @@ from warp_resphys.dynamics import equilibrium
 from warp_resphys.dynamics.hessian import ExactHessian
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS
-from warp_resphys.studies.gradient_check import (
-    POSES,
-    GradientRow,
-    central_difference,
-    check_gradients,
-    pose,
-)
+from warp_resphys.stepping.quantity import Quantity
+from warp_resphys.studies.gradient_check import POSES, GradientRow, central_difference, check_gradients, pose
 
 SIZE = (0.06, 0.02, 0.02)
 MESHES = {
@@ -126,6 +121,25 @@ def test_every_parameter_with_every_integrator(integrator, start):
 )
 def test_every_parameter_with_other_options(options):
     assert_equal(check_gradients(simulator(**options), "bent", steps=2))
+
+
+def test_parameters_that_change_together_have_the_rows_of_those_that_change_alone():
+    both = [check_gradients(simulator(), "bent", steps=2, together=together) for together in (False, True)]
+    for alone, together in zip(*both, strict=True):
+        assert together.parameter == alone.parameter
+        assert together.difference == pytest.approx(alone.difference, rel=1e-6)
+
+
+def test_a_wrong_derivative_shows_in_all_rows_of_its_shape(monkeypatch):
+    """Here that by density, a thousandth too large."""
+    varied = Quantity.varied
+
+    def wrong(self, value, x):
+        return varied(self, value, x + (1e-3 * (x - x.detach()) if self.name == "density" else 0.0))
+
+    monkeypatch.setattr(Quantity, "varied", wrong)
+    for row in check_gradients(simulator(), "bent", steps=2):
+        assert row.relative_error > 9e-4, row.parameter
 
 
 def test_full_integration_and_per_vertex_mass():

@@ -1,7 +1,7 @@
 """Adjoint gradients of a short roll-out against central differences, for every kind of parameter."""
 
 import math
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,15 +17,14 @@ from ..io.settings import Count, Natural, Positive, Settings, Some, setting
 from ..mesh.poses import twisted
 from ..settings.body import SimulationSettings
 from ..stepping.inputs import Inputs
-from ..stepping.quantity import Quantity
 from ..stepping.state import State
 from .tables import Sheet, show
 
-Loss = Callable[[torch.Tensor], torch.Tensor]
 Pose = Literal["rest", "bent", "twisted"]
 POSES: tuple[Pose, ...] = get_args(Pose)
 _HALVINGS = 6  # of the step of a difference
 _ACCURACY = 1e-8  # relative, at which a difference is good enough
+_LEAST = 1e-3  # of the largest derivative, below which one is compared alone
 
 
 class GradientSettings(Settings):
@@ -122,6 +121,7 @@ def check_gradients(
     seed: int = 0,
     change: float = 1.0,
     names: Container[str] | None = None,
+    together: bool = True,
 ) -> list[GradientRow]:
     """Compares the directional derivatives of a random linear functional of all positions and velocities.
 
@@ -136,17 +136,40 @@ def check_gradients(
         seed: of the random directions and functional.
         change: factor of the largest changes; less than one where second derivatives jump, as those of sliders do.
         names: of the inputs and parameters that are compared, with `q` and `v` of the start; None for all.
+        together: whether inputs and parameters of one shape change at the same time, by amounts that contribute the
+            same, which takes a fraction of the time. The difference of a row is then that of all less the adjoints of
+            the others: a wrong derivative shows in all rows of its shape. Derivatives below a thousandth of the
+            largest are compared alone.
 
     Returns:
         A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
         value, as one for each environment, and as one for each element or part.
     """
     problem = _Problem(simulator, pose_name, steps, batch, seed, change)
-    return [problem.compare(*case) for case in problem.cases() if names is None or case[0].partition(",")[0] in names]
+    cases = [case for case in problem.cases() if names is None or case.name in names]
+    groups: dict[str, list[_Case]] = {}
+    for case in cases:
+        groups.setdefault(case.kind if together else case.title, []).append(case)
+    rows = {row.parameter: row for group in groups.values() for row in problem.compare(group)}
+    return [rows[case.title] for case in cases]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A start, an input or a parameter in one of its shapes, by a change that is zero at first."""
+
+    name: str
+    kind: str  # what has a value of its own, as in "environment"; "one" for one value of all
+    change: torch.Tensor
+    value: Callable[[torch.Tensor], torch.Tensor]  # of the change
+
+    @property
+    def title(self) -> str:
+        return self.name if self.kind == "one" else f"{self.name}, each {self.kind}"
 
 
 class _Problem:
-    """The loss of a roll-out as a function of one parameter at a time."""
+    """The loss of a roll-out as a function of the start, inputs and parameters."""
 
     def __init__(self, simulator: Simulator, pose_name: str, steps: int, batch: int, seed: int, change: float) -> None:
         self.simulator, self.steps, self.batch, self.change = simulator, steps, batch, change
@@ -168,20 +191,16 @@ class _Problem:
     def noise(self, *shape: int) -> torch.Tensor:
         return self.simulator.tensor(torch.randn(*shape, generator=self.random, dtype=torch.float64))
 
-    def loss(self, name: str, value: torch.Tensor) -> torch.Tensor:
-        """Loss of the roll-out with another value of `q` or `v` of the start, an input or a parameter."""
-        state, inputs, parameters = self.state, self.inputs, {}
-        if name in ("q", "v"):
-            state = State(value, state.v) if name == "q" else State(state.q, value)
-        elif name in inputs.fields:
-            inputs = inputs.replace(**{name: value})
-        else:
-            parameters = {name: value}
-        trajectory = self.simulator.rollout(state, self.steps, inputs, parameters)
+    def loss(self, cases: Sequence[_Case], changes: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Loss of the roll-out with changes of the start, of inputs and of parameters."""
+        values = {case.name: case.value(change) for case, change in zip(cases, changes, strict=True)}
+        state = State(values.pop("q", self.state.q), values.pop("v", self.state.v))
+        inputs = self.inputs.replace(**{name: values.pop(name) for name in [*values] if name in self.inputs.fields})
+        trajectory = self.simulator.rollout(state, self.steps, inputs, values)
         return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
 
-    def cases(self) -> Iterator[tuple[str, Loss, torch.Tensor, float]]:
-        """Yields name, loss, value and typical size of a change of the start and of every input and parameter."""
+    def cases(self) -> Iterator[_Case]:
+        """Yields the start and every input and parameter in its shapes, with random changes of typical size."""
         simulator = self.simulator
         length = float((self.state.q[0].max(0).values - self.state.q[0].min(0).values).max())
         sizes = {"q": 3e-4 * length, "v": 0.3 * length}
@@ -189,7 +208,7 @@ class _Problem:
         sizes |= {name: 0.1 * quantity.typical for name, quantity in simulator.inputs.items()}
         for name, value in {"q": self.state.q, "v": self.state.v, **self.inputs.fields}.items():
             if value.numel():
-                yield name, partial(self.loss, name), value, sizes[name]
+                yield _Case(name, "one", self.direction(sizes[name], *value.shape), partial(torch.add, value))
         for name, quantity in simulator.parameters.items():
             base = simulator.tensor(simulator.constants[name])
             shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, *(quantity.shape or (3,)))}
@@ -198,23 +217,37 @@ class _Problem:
                 if quantity.per:
                     shapes = {"one": (1,), quantity.per: (simulator.counts[name],), **shapes}
             for kind, shape in shapes.items():
-                vary = partial(self._varied, quantity, base)
-                title = f"{name}, each {kind}" if kind != "one" else name
                 size = 0.01 if quantity.shape else 0.7
-                yield title, vary, torch.zeros(shape, device=base.device, dtype=base.dtype), size
+                yield _Case(name, kind, self.direction(size, *shape), partial(quantity.varied, base))
 
-    def _varied(self, quantity: Quantity, base: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        """Loss with a parameter varied within its bounds by x."""
-        return self.loss(quantity.name, quantity.varied(base, x))
+    def direction(self, size: float, *shape: int) -> torch.Tensor:
+        """A random change whose largest entry is the size times the factor of all changes."""
+        noise = self.noise(*shape)
+        return noise * (self.change * size / noise.abs().max())
 
-    def compare(self, name: str, loss: Loss, value: torch.Tensor, size: float) -> GradientRow:
-        direction = self.noise(*value.shape)
-        direction *= self.change * size / direction.abs().max()
-        variable = value.detach().clone().requires_grad_(True)
-        (gradient,) = torch.autograd.grad(loss(variable), variable)
+    def compare(self, cases: Sequence[_Case]) -> list[GradientRow]:
+        """Rows of cases that change together, or alone where they contribute little."""
+        zeros = [torch.zeros_like(case.change, requires_grad=True) for case in cases]
+        gradients = torch.autograd.grad(self.loss(cases, zeros), zeros)
+        adjoints = [float((g * case.change).sum()) for g, case in zip(gradients, cases, strict=True)]
+        largest = max(map(abs, adjoints))
+        alone = [k for k, adjoint in enumerate(adjoints) if not abs(adjoint) >= _LEAST * largest]
+        groups = [[k for k in range(len(cases)) if k not in alone], *([k] for k in alone)]
+        return [row for group in groups if group for row in self._rows(cases, adjoints, group)]
+
+    def _rows(self, cases: Sequence[_Case], adjoints: Sequence[float], group: Sequence[int]) -> Iterator[GradientRow]:
+        """Rows of the cases of a group, which change together by amounts that contribute the same."""
+        least = min(abs(adjoints[k]) for k in group)
+        shares = {k: least / adjoints[k] if adjoints[k] else 1.0 for k in group}
+
+        def loss(step: float) -> float:
+            return float(self.loss(cases, [step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)]))
+
         with torch.no_grad():
-            difference = central_difference(lambda step: float(loss(value + step * direction)))
-        return GradientRow(name, float((gradient * direction).sum()), *difference)
+            total, uncertainty = central_difference(loss)
+        error = total - sum(share * adjoints[k] for k, share in shares.items())
+        for k, share in shares.items():
+            yield GradientRow(cases[k].title, adjoints[k], adjoints[k] + error / share, abs(uncertainty / share))
 
 
 def gradcheck(settings: GradientCheck, folder: Path) -> None:
@@ -237,7 +270,7 @@ def gradcheck(settings: GradientCheck, folder: Path) -> None:
         materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
         checked = replace(simulator, material=materials.get("", materials))
         for name in check.poses:
-            rows = check_gradients(checked, name, check.steps, check.batch, check.seed, check.change)
+            rows = check_gradients(checked, name, check.steps, check.batch, check.seed, check.change, together=False)
             show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {name}", check.tolerance))
             largest = max([largest, *(row.relative_error for row in rows)])
     show(f"Largest relative error: {largest:.1e}, {check.tolerance:.0e} allowed.")

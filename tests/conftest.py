@@ -1,5 +1,8 @@
 import contextlib
 import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
+
 import shutil
 from pathlib import Path
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from . import __version__
@@ -29,6 +30,8 @@ def main() -> None:
         except InputError as error:
             print(f"error: {error}", file=sys.stderr, flush=True)
             raise SystemExit(USER_ERROR) from None
+        # Read when NumPy is imported. Its threads cost more than they save where others use the cores as well.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         from .launch import launch
 
         launch(command, COMMANDS[command].function, arguments)

@@ -4,15 +4,17 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 import warp as wp
+from matplotlib.figure import Figure
 
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report import bodies, render
+from warp_resphys.report import bodies, figures, render
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -61,6 +63,33 @@ def can_draw() -> None:
         render.draw(bodies.distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices))
     except render.DrawingError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_pictures():
+    """Small pictures and figures without a layout, but for tests that look at them (`whole_pictures`)."""
+    packed = render.packed
+
+    def coarse(scene: render.RenderScene) -> bytes:
+        return packed(replace(scene, size=[side // 8 * 2 for side in scene.size]))
+
+    def unsettled(figure: Figure) -> None:
+        figure.set_layout_engine("none")
+
+    def coarse_png(figure: Figure, path: Path) -> None:
+        figure.savefig(path, format="png", dpi=20)
+
+    with pytest.MonkeyPatch.context() as patch:
+        before = {place: getattr(*place) for place in ((render, "packed"), (figures, "settle"), (figures, "save_png"))}
+        for (module, name), function in zip(before, (coarse, unsettled, coarse_png), strict=True):
+            patch.setattr(module, name, function)
+        yield before
+
+
+@pytest.fixture
+def whole_pictures(_coarse_pictures, monkeypatch):
+    for (module, name), function in _coarse_pictures.items():
+        monkeypatch.setattr(module, name, function)
 
 
 @pytest.fixture

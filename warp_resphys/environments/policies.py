@@ -18,6 +18,7 @@ from .vector import Observation, RobotVectorEnv
 
 Policy = Callable[[Observation], NDArray[np.float32]]
 
+_UPDATE: Final = 2048  # actions of all robots between updates of the policy, at most
 _NETWORK: Final = 128  # width of the policy's layers
 _ORDER: Final = 2  # of the polynomial from actions to equilibria
 _EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
@@ -132,12 +133,13 @@ def learn(
             on_progress(environment.num_envs)
             return True
 
+    count = max(min(steps, _UPDATE) // environment.num_envs, 8)
     with threads_for(_NETWORK):
         model = PPO(
             "MlpPolicy",
             Robots(environment),
-            n_steps=max(2048 // environment.num_envs, 8),
-            batch_size=512,
+            n_steps=count,
+            batch_size=min(512, count * environment.num_envs),
             n_epochs=6,
             gamma=0.95,
             learning_rate=5e-4,

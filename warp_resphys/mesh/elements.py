@@ -69,7 +69,8 @@ class Shape:
 
 def _monomials(points: Array, exponents: IntArray) -> Array:
     """Returns x^a y^b z^c, (Q, K)."""
-    return np.asarray(np.prod(points[:, None, :] ** exponents, axis=-1), dtype=np.float64)
+    powers = np.cumprod([np.ones_like(points), *[points] * int(exponents.max())], axis=0)  # (E, Q, d)
+    return np.asarray(np.prod([powers[own, :, axis] for axis, own in enumerate(exponents.T)], axis=0).T)
 
 
 @dataclass(frozen=True, eq=False)

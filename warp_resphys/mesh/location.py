@@ -10,6 +10,7 @@ from .mesh import FloatArray, IntArray, Mesh
 
 _ITERATIONS = 20
 _CANDIDATES = 12  # smallest number of cells searched for a point
+_TOGETHER = 256  # points
 
 
 @dataclass(frozen=True)
@@ -38,38 +39,53 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise InputError("a point to locate in a mesh is not finite.")
-    element, nodes = mesh.element, mesh.vertices[mesh.cells]  # (M, K, 3)
+    nodes = mesh.vertices[mesh.cells]  # (M, K, 3)
     low, high = nodes.min(axis=1), nodes.max(axis=1)
-    cells, weights, gradients, outside, away = [], [], [], [], []
-    for point in points:
-        distance = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
-        limit = np.partition(distance, min(_CANDIDATES, len(distance)) - 1)[min(_CANDIDATES, len(distance)) - 1]
-        near = np.flatnonzero(distance <= limit)
-        place = _reference_coordinates(element, nodes[near], point)
-        clipped = _clip_to_cell(element, place)
-        distances = np.linalg.norm(np.einsum("ck,cki->ci", element.shape(clipped)[0], nodes[near]) - point, axis=1)
-        best = int(np.argmin(distances))
-        cells.append(near[best])
-        (values,), (slopes,) = element.shape(place[best : best + 1])
-        weights.append(values)
-        gradients.append(slopes @ np.linalg.pinv(nodes[near[best]].T @ slopes))
-        error = float(np.linalg.norm(weights[-1] @ nodes[near[best]] - point))
-        size = float(np.linalg.norm(high[near[best]] - low[near[best]]))
-        away.append(distances[best])
-        outside.append(np.inf if error > 1e-6 * size else distances[best] if distances[best] > 1e-9 * size else 0.0)
-    return Location(*map(np.array, (cells, weights, gradients, outside, away)))
+    parts = [
+        _located(mesh.element, nodes, low, high, points[k : k + _TOGETHER]) for k in range(0, len(points), _TOGETHER)
+    ]
+    return Location(*map(np.concatenate, zip(*parts, strict=True))) if parts else Location(*np.zeros((5, 0)))
 
 
-def _reference_coordinates(element: Element, nodes: Array, point: Array) -> Array:
-    """Returns the reference coordinates (C, 3) of a point in cells (C, K, 3), which need not contain it."""
+def _located(
+    element: Element, nodes: FloatArray, low: FloatArray, high: FloatArray, points: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The fields of the `Location` of points (P, 3) in cells (M, K, 3) with the corners (M, 3) of their boxes."""
+    near = [_nearby(low, high, point) for point in points]
+    cells, ends = np.concatenate(near), np.cumsum([len(own) for own in near])
+    targets = np.repeat(points, np.diff(ends, prepend=0), axis=0)
+    place = _reference_coordinates(element, nodes[cells], targets)
+    values, _ = element.shape(_clip_to_cell(element, place))
+    distances = np.linalg.norm(np.einsum("ck,cki->ci", values, nodes[cells]) - targets, axis=1)
+    best = [own[np.argmin(distances[own])] for own in np.split(np.arange(ends[-1]), ends[:-1])]
+    cells, distances = cells[best], distances[best]
+    weights, slopes = element.shape(place[best])
+    gradients = slopes @ np.linalg.pinv(np.einsum("pki,pkj->pij", nodes[cells], slopes))
+    error = np.linalg.norm(np.einsum("pk,pki->pi", weights, nodes[cells]) - points, axis=1)
+    size = np.linalg.norm(high[cells] - low[cells], axis=1)
+    outside = np.where(distances > 1e-9 * size, distances, 0.0)
+    return cells, weights, gradients, np.where(error > 1e-6 * size, np.inf, outside), distances
+
+
+def _nearby(low: FloatArray, high: FloatArray, point: FloatArray) -> IntArray:
+    """The cells whose boxes are nearest to a point."""
+    distance = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
+    last = min(_CANDIDATES, len(distance)) - 1
+    return np.flatnonzero(distance <= np.partition(distance, last)[last])
+
+
+def _reference_coordinates(element: Element, nodes: Array, points: Array) -> Array:
+    """Returns reference coordinates (C, 3) of a point (C, 3) in each cell (C, K, 3), which need not contain it."""
     place = np.full((len(nodes), 3), 0.25 if element.is_simplex else 0.0)
+    left = np.arange(len(nodes))
     for _ in range(_ITERATIONS):
-        values, slopes = element.shape(place)
-        error = point - np.einsum("ck,cki->ci", values, nodes)
-        jacobian = np.einsum("cki,ckj->cij", nodes, slopes)
+        values, slopes = element.shape(place[left])
+        error = points[left] - np.einsum("ck,cki->ci", values, nodes[left])
+        jacobian = np.einsum("cki,ckj->cij", nodes[left], slopes)
         step = np.einsum("cij,cj->ci", np.linalg.pinv(jacobian), error)
-        place = np.clip(place + step, -3.0, 3.0)  # The map may fold farther outside.
-        if np.abs(step).max() < 1e-12:
+        place[left] = np.clip(place[left] + step, -3.0, 3.0)  # The map may fold farther outside.
+        left = left[np.abs(step).max(axis=1) >= 1e-12]
+        if not len(left):
             break
     return place
 

@@ -12,6 +12,7 @@ takes pixels with a depth back to the scene, and without a lens the points of a 
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import torch
@@ -72,9 +73,12 @@ class PlacedCamera:
 
     def pixels(self, points: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns pixels (..., 2) of points (..., 3) [m], with corrections (9,) or (..., 9); NaN behind the camera."""
+        return self._pixels_seen(self.seen_from(points, corrections), corrections)
+
+    def _pixels_seen(self, seen: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
+        """Returns pixels (..., 2) of points (..., 3) in the axes of the camera [m]."""
         lens, middle = self._seen_through()
-        seen = projected(self.seen_from(points, corrections), lens)
-        return middle + corrections[..., 7:] + corrections[..., 6:7] * (seen - middle)
+        return middle + corrections[..., 7:] + corrections[..., 6:7] * (projected(seen, lens) - middle)
 
     def located(self, measured: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns points (..., 3) in the axes of the scene [m], with corrections (9,) or (..., 9).
@@ -104,8 +108,17 @@ class PlacedCamera:
             corrections: (9,).
             tangents: (K, P, 3) motions of the points by K parameters [m].
         """
-        by_points, by_corrections = jacobians(self.pixels, points, corrections.expand(len(points), -1))
-        return torch.cat([torch.einsum("pij,kpj->kpi", by_points, tangents), by_corrections.permute(2, 0, 1)])
+        turn = rotations(corrections[3:6])
+        seen = self.seen_from(points, corrections)
+        (by_seen,) = jacobians(partial(self._pixels_seen, corrections=corrections), seen)
+        by_place = by_seen @ self.pose[:3, :3]
+        turned = torch.autograd.functional.jacobian(rotations, corrections[3:6])  # (3, 3, 3)
+        by_turn = torch.einsum("ijk,pj->pik", turned, points - self.centre)
+        lens, middle = self._seen_through()
+        by_scale = (projected(seen, lens) - middle)[..., None]
+        by_shift = torch.eye(2, dtype=points.dtype).expand(len(points), 2, 2)
+        by_corrections = torch.cat([by_place, by_place @ by_turn, by_scale, by_shift], -1)
+        return torch.cat([torch.einsum("pij,kpj->kpi", by_place @ turn, tangents), by_corrections.permute(2, 0, 1)])
 
     def located_by(self, measured: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
         """Returns derivatives (9, P, 3) of located points (P, 3) by the corrections (9,) [m]."""

@@ -144,16 +144,18 @@ class PictureMisfit(BoundedMisfit):
 
     def _shapes_by(
         self, number: int, unit: FloatArray, own: Mapping[str, float], derivatives: bool
-    ) -> tuple[torch.Tensor, list[int]]:
+    ) -> tuple[torch.Tensor, list[int] | None]:
         """A pose's shape and its derivatives by K of the physical parameters, (1 + K, ...), and their K columns.
 
-        Derivatives are differences into the range.
+        Derivatives are differences into the range. Without any the columns are None.
         """
+        if not derivatives:
+            return self.shape(number, own)[None], None
         pose, moved, columns, steps = self.poses[number], list[dict[str, float]](), list[int](), list[float]()
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter = split_name(name)[0]
             fixed = parameter in (*CORRECTIONS, RELEASE_DELAY) or not pose.deforms
-            if not derivatives or fixed or not self._acts(name, pose):
+            if fixed or not self._acts(name, pose):
                 continue
             step = (1.0 if unit[column] < 0.5 else -1.0) * (_DIFFERENCE_OF_MOTION if pose.moves else _DIFFERENCE)
             value = range_.from_unit(torch.tensor(unit[column] + step, dtype=torch.float64))
@@ -174,7 +176,7 @@ class PictureMisfit(BoundedMisfit):
         photo: Photo,
         own: Mapping[str, float],
         shapes: torch.Tensor,
-        columns: Sequence[int],
+        columns: Sequence[int] | None,
         share: float,
     ) -> tuple[list[Linearised], list[Linearised]]:
         """Weighted residuals of a picture, and their derivatives: outlines both ways and a cloud, and tracked points.
@@ -209,9 +211,11 @@ class PictureMisfit(BoundedMisfit):
                 points.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
         if photo.cloud is not None:
             cloud, closest = photo.cloud, pose.cloud_distances(photo, q, corrections)
-            placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
-            by = np.concatenate([closest.moved(moved), np.einsum("cpi,pi->cp", placed, closest.directions)])
-            slopes = self._slopes(pose, photo, by, columns) * (np.abs(closest.distances) < cloud.reach)
+            slopes = np.zeros((len(self.bounds), len(closest.distances)))
+            if columns is not None:
+                placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
+                by = np.concatenate([closest.moved(moved), np.einsum("cpi,pi->cp", placed, closest.directions)])
+                slopes = self._slopes(pose, photo, by, columns) * (np.abs(closest.distances) < cloud.reach)
             distance = closest.distances.clip(-cloud.reach, cloud.reach)[:, None] / cloud.noise
             parts.append(_weighted(share, np.ones(len(distance)), distance, slopes.T[:, None] / cloud.noise, copies))
         return parts, points
@@ -223,9 +227,11 @@ class PictureMisfit(BoundedMisfit):
         points: torch.Tensor,
         moved: torch.Tensor,
         corrections: torch.Tensor,
-        columns: Sequence[int],
+        columns: Sequence[int] | None,
     ) -> FloatArray:
         """Derivatives (P, Q, 2) of the pixels of points (Q, 3), which move (K + 1, Q, 3) as `_slopes` has it."""
+        if columns is None:
+            return np.zeros((len(self.bounds), len(points), 2))
         by = photo.camera.derivative(points, corrections, moved).numpy()
         by = derivatives_at_own_times(by, by[len(columns)], photo.row_time)
         return self._slopes(pose, photo, by, columns)

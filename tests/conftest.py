@@ -4,12 +4,15 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
 
 import shutil
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 import warp as wp
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from matplotlib.figure import Figure
 
 from support.main_job import IN_RUN, TINY, files, run, without_reports
@@ -63,6 +66,21 @@ def can_draw() -> None:
         render.draw(bodies.distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices))
     except render.DrawingError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _configurations_are_read_once():
+    """The files of the package's own configuration, which every command reads anew."""
+    load, kept = ImportlibResourcesConfigSource.load_config, {}
+
+    def read(self: ImportlibResourcesConfigSource, config_path: str) -> Any:
+        if (place := (self.path, config_path)) not in kept:
+            kept[place] = load(self, config_path)
+        return deepcopy(kept[place])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ImportlibResourcesConfigSource, "load_config", read)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -55,7 +55,6 @@ from .experiment.laboratory import run_laboratory
 from .experiment.learn import refine, takes_long, train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
-from .experiment.pictures import check_pictures, picture_stages, print_pictures
 from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.reconstruct import reconstruct
 from .experiment.report import collect_metrics, make_folds_report, make_report
@@ -313,7 +312,12 @@ def prepare(run: RunSettings) -> None:
     wp.config.log_level = wp.LOG_WARNING
     if run.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are too small for several threads (linalg/threads.py).
-    (check_run if run.pictures is None else check_pictures)(run)
+    if run.pictures is None:
+        check_run(run)
+    else:
+        from .experiment.pictures import check_pictures
+
+        check_pictures(run)
 
 
 def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
@@ -332,6 +336,8 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     """
     prepare(run)
     if run.pictures is not None:
+        from .experiment.pictures import picture_stages, print_pictures
+
         run_stages(picture_stages(run, files_read(run, run)), folder)
         print_pictures(run, folder)
         return

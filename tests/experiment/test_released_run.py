@@ -15,7 +15,7 @@ import pytest
 
 from support.configured import settings
 from support.main_job import run
-from warp_resphys.experiment import identify, report
+from warp_resphys.experiment import identify
 from warp_resphys.experiment.experiment import LAW, LEARNED
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.folds import Fold, run_folds
@@ -28,6 +28,7 @@ from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.pipeline import learning_stages
+from warp_resphys.report import run_page
 
 PLAIN = ("rest", "interpolation", "linear")  # two training trials are too few for a regression
 MODELS = [model for model in ALL_MODELS if model != LAW]
@@ -99,7 +100,7 @@ def pages():
         path.write_text("-")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "write_report", write)
+        patch.setattr(run_page, "write_report", write)
         yield shown
 
 

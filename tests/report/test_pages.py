@@ -20,6 +20,7 @@ from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
+from warp_resphys.report import run_page
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.marker_section import paths_section
 from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
@@ -199,7 +200,7 @@ class TestArms:
     def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):
         settings, shown = arm_settings(), []
         write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
-        monkeypatch.setattr(stage, "write_report", lambda _, data: shown.append(data))
+        monkeypatch.setattr(run_page, "write_report", lambda _, data: shown.append(data))
         stage.make_report(StageContext("report", tmp_path, "", ReportStage(config=settings)))
         (page_data,) = shown
         sagged = page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..io.errors import DataFileError
@@ -149,6 +148,8 @@ def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
 
 def at_times(poses: FloatArray, times: NDArray[Any], new: NDArray[Any]) -> FloatArray:
     """Poses (T', 6) at new times, by cubic splines; before and after the frames, the first and the last pose."""
+    from scipy.interpolate import CubicSpline
+
     if len(poses) < 2:
         return np.repeat(poses, len(new), axis=0)
     kept = np.clip(new, times[0], times[-1])
@@ -173,6 +174,8 @@ def check_steps(poses: FloatArray, points: FloatArray, source: str | Path, what:
 
 
 def _smoothed(poses: FloatArray) -> FloatArray:
+    from scipy.interpolate import make_smoothing_spline
+
     if len(poses) < 5:
         return poses
     frames = np.arange(len(poses), dtype=np.float64)

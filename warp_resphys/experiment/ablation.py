@@ -23,7 +23,6 @@ from ..io.resumable import Field
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
-from ..report.ablation_page import write_ablation_report
 from ..report.page import number_text
 from ..settings.run import RunSettings
 from ..settings.stages import AblationStage, DrawSettings, MotionStage, ReportStage
@@ -200,6 +199,8 @@ def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDAr
 def report_ablation(context: StageContext) -> None:
     """Writes report.html and its figure."""
     run: RunSettings = context.settings.config
+    from ..report.ablation_page import write_ablation_report
+
     body = build_body(run)
     mesh, fixed = body.mesh, body.fixed_vertices
     surface = surface_vertices(mesh)

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ..data.input_response import InputResponse, with_means
 from ..data.marker_view import ViewedMarkers
@@ -365,6 +364,8 @@ def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> 
         step: time step h [s].
         delay: (R,) delay of the release after time zero of the frames [s]; zero by default.
     """
+    from scipy.interpolate import CubicSpline
+
     since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
     times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
     steps = step * np.arange(int(times.max() / step + 1e-6) + 1)

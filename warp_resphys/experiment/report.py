@@ -36,7 +36,6 @@ from ..report.data import (
 )
 from ..report.notes import error_notes, kept_note, material_note, network_note, published_note, target_note
 from ..report.obstacles import ObstacleSurface
-from ..report.run_page import write_report
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
@@ -77,6 +76,8 @@ def make_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
+    from ..report import run_page  # matplotlib
+
     folder, run = context.run_dir, context.settings.config
     metrics, truth = collect_metrics(folder, run), read_if_there(common_folder(folder) / TRUTH)
     body = build_body(run, run.payload_at)
@@ -113,7 +114,7 @@ def make_report(context: StageContext) -> None:
         simulator=material_note(run.simulation),
         target=target_note(run),
     )
-    write_report(folder / REPORT, data)
+    run_page.write_report(folder / REPORT, data)
 
 
 def make_folds_report(context: StageContext) -> None:
@@ -122,6 +123,8 @@ def make_folds_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
+    from ..report import run_page  # matplotlib
+
     folder, run = context.run_dir, context.settings.config
     metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
     sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
@@ -132,7 +135,7 @@ def make_folds_report(context: StageContext) -> None:
         recordings=read_recordings(folder, run, body.mesh, {}),
         notes=error_notes(sideways, {}, {}),
     )
-    write_report(folder / REPORT, data)
+    run_page.write_report(folder / REPORT, data)
 
 
 def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from ..learning.metrics import PublishedError
 from .render import DrawingError
 
 if TYPE_CHECKING:
+    import jinja2
     from matplotlib.figure import Figure as Drawing
 
 _LOG = logging.getLogger(__name__)
@@ -261,7 +261,9 @@ def experiment_kicker(name: str) -> Markup:
     return Markup("experiment <code>{}</code>").format(name)
 
 
-def _template(name: str) -> jinja2.Template:
+def _template(name: str) -> "jinja2.Template":
+    import jinja2
+
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ...io.errors import DataFileError, InputError, listed
@@ -228,6 +227,8 @@ def bridged(recording: Recording, column: int, frames: ArrayLike) -> FloatArray:
 
     Positions before the first and after the last of these are constant.
     """
+    from scipy.interpolate import CubicSpline
+
     known = np.flatnonzero(recording.seen[:, column])
     spline = CubicSpline(known, recording.positions[known, column])
     return np.asarray(spline(np.clip(frames, known[0], known[-1])))

@@ -159,6 +159,21 @@ def test_a_worker_reports_the_memory_of_its_own_work(tmp_path):
     assert gib[0] - gib[1] == pytest.approx(0.5, abs=0.1)
 
 
+HELD = []
+
+
+def keeps_memory(number, advance):
+    """Holds 200 MB until loky looks at the memory, once a second."""
+    HELD[:] = [b"x" * 200_000_000]
+    time.sleep(1.1)
+    return os.getpid()
+
+
+def test_workers_with_all_imports_go_on(tmp_path):
+    """loky ends workers whose memory grows by 300 MB after their first call."""
+    assert len({*done(keeps_memory, range(6), Workers(2), tmp_path)[0]}) <= 2
+
+
 def works_or_waits(task, advance):
     folder, waits = task
     (folder / f"process_{os.getpid()}").touch()

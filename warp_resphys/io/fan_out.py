@@ -237,7 +237,8 @@ def _local(workers: Workers) -> Iterator[None]:
         # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
         with interrupts_blocked():  # Workers started here leave Ctrl-C to this process.
-            Parallel(n_jobs=max(workers.count, 2))(delayed(int)() for _ in range(2))
+            # loky ends a worker whose memory grows by 300 MB after its first call, which hence has all imports.
+            Parallel(n_jobs=max(workers.count, 2))(delayed(begin_work)() for _ in range(workers.count))
         yield
 
 

@@ -141,8 +141,15 @@ def test_one_process_draws_scene_after_scene():
     small = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
     wide = distance_scene(mesh, {"box": mesh.vertices, "other": mesh.vertices}, mesh.vertices)
     with render.Renderer() as renderer:
-        (first,), (both,), (again,) = (list(renderer.frames(scene)) for scene in (small, wide, small))
+        (first,), (both,) = render.draw(small, wide, renderer=renderer)
+        process = renderer._process
+        ((again,),) = render.draw(small, renderer=renderer)
+        assert renderer._process is process
+        renderer.close()
+        ((restarted,),) = render.draw(small, renderer=renderer)
+    assert process.poll() is not None
     np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, restarted)
     assert both.shape[1] == 2 * first.shape[1]
 
 

@@ -1,8 +1,8 @@
 """The expected duration of a run: a few steps of its simulators on its trials, times the steps of its stages.
 
 The bodies move as fast as if they had fallen a tenth of their length. Forces are reconstructed that support a fifth of
-their weight, and networks are trained for an epoch on random samples. Reports, laws of materials, other bodies and
-control have no estimate.
+their weight, from rest, as bodies that start fast need far more iterations in the first step. Networks are trained for
+an epoch on random samples. Reports, laws of materials, other bodies and control have no estimate.
 """
 
 import logging
@@ -369,7 +369,7 @@ class _Pace:
             simulator, inputs = replace(simulator, time_step=1e6, integrator="implicit_euler"), resting
         method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
         method = method.with_constants(constants)
-        state = _moving(simulator, len(replay.trials.names), at_rest=replay.is_static)
+        state = simulator.rest_state(len(replay.trials.names))
         support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None]
         acting = inputs if replay.is_static else inputs.at(0)
 
@@ -382,11 +382,9 @@ class _Pace:
         return step
 
 
-def _moving(simulator: Simulator, batch: int, at_rest: bool = False) -> State:
+def _moving(simulator: Simulator, batch: int) -> State:
     """Undeformed bodies that swing sideways, the faster the farther from where they are fixed."""
     state = simulator.rest_state(batch)
-    if at_rest:
-        return state
     q = simulator.rest_positions
     size = q.amax(0) - q.amin(0)
     held = q[simulator.fixed].mean(0) if len(simulator.fixed) else q.mean(0)

@@ -19,7 +19,21 @@ from .bodies import face_edges, obstacle_layers, sharp_edges
 from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
 from .obstacles import ObstacleSurface
-from .render import BODY, CLAMPED, INK, MEASURED, FloatArray, IntArray, Layer, RenderScene, View, chain, draw, view_axes
+from .render import (
+    BODY,
+    CLAMPED,
+    INK,
+    MEASURED,
+    FloatArray,
+    IntArray,
+    Layer,
+    Renderer,
+    RenderScene,
+    View,
+    chain,
+    draw,
+    view_axes,
+)
 
 TOWARDS_VIEWER: Final = (0.32, -1.0, 0.28)
 _CUT: Final = "#d3dde7"
@@ -59,13 +73,16 @@ class MeshSummary:
 
 
 @in_style()
-def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = None) -> None:
+def draw_mesh(
+    path: Path, summary: MeshSummary, markers: FloatArray | None = None, renderer: Renderer | None = None
+) -> None:
     """Draw a body from outside and cut open; and translucent, with chambers and tendons in colours, if it has any.
 
     Args:
         path: The PNG file to write.
         summary: The body.
         markers: (M, 3) [m], drawn as dots in the uncut views.
+        renderer: Process that draws, in place of a new one.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
@@ -81,7 +98,7 @@ def draw_mesh(path: Path, summary: MeshSummary, markers: FloatArray | None = Non
     half = np.maximum(half, _NARROWEST * half.max())
     size = picture_size(half, _LONGER_SIDE)
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True))
+    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
     labels = [
         f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
         for chamber in summary.chambers

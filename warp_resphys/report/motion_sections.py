@@ -26,7 +26,7 @@ from .data import (
 )
 from .obstacles import ObstacleSurface
 from .page import Block, Canvas, Drawn, Part, Text, data_address, drawn_file, largest_text
-from .render import Pixels, draw, write_film
+from .render import Pixels, Renderer, draw, write_film
 from .verdict import left_text, unbroken
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
@@ -35,24 +35,25 @@ _SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
-    """Start processes that draw the motion: instants, coloured bodies where vertices are observed, and the film."""
+    """Start a process that draws the motion: instants, coloured bodies where vertices are observed, and the film."""
     motion = motion_of(data)
     if motion is None:
         return {}
-    started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion)}
+    renderer = Renderer()
+    started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion, renderer)}
     # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
     if data.sees_markers and len(motion.times) > 1:
-        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film())
+        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film(), renderer)
     return started
 
 
-def _draw_pictures(data: RunReport, motion: ComparedMotion) -> list[Pixels]:
+def _draw_pictures(data: RunReport, motion: ComparedMotion, renderer: Renderer) -> list[Pixels]:
     shape = (
         None
         if data.trials is None or data.sees_markers
         else distance_scene(data.mesh, *_bodies(data.trials), _worst_obstacles(data, data.trials))
     )
-    return draw(motion.scene(), *([] if shape is None else [shape]))
+    return draw(motion.scene(), *([] if shape is None else [shape]), renderer=renderer)
 
 
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
@@ -250,7 +251,7 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         density = fmean(value for name, value in constants.items() if name.endswith("density"))
         coloured = f"{quantity.per}s".capitalize()
         summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
-        draw_mesh(path, summary, trials.bound if trials.labels else None)
+        draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
         return drawn_file(path, alt, caption)
 
     blocks = canvas.attempt("body.png", body)

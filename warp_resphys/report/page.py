@@ -20,7 +20,7 @@ from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError
 from ..io.files import write_text
 from ..learning.metrics import PublishedError
-from .render import DrawingError
+from .render import DrawingError, Renderer
 
 if TYPE_CHECKING:
     import jinja2
@@ -151,6 +151,7 @@ class Canvas:
     folder: Path  # Of their files.
     started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # Pictures drawn by other processes, by name.
     missing: set[str] = field(default_factory=set)  # Reasons why pictures cannot be drawn on this machine.
+    renderer: Renderer = field(default_factory=Renderer)  # Of the pictures that are drawn here.
 
     def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
         """Draw a figure in two widths, for a wide and for a narrow page, and save the wide one as a PNG file.

@@ -27,6 +27,7 @@ from .render import (
     IntArray,
     Layer,
     Pixels,
+    Renderer,
     RenderScene,
     View,
     draw,
@@ -79,13 +80,14 @@ class Panel:
         return RenderScene([View(layers, self.axes, self.focus, self.half[1])], size, background="white", sorts=True)
 
 
-def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> None:
+def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, renderer: Renderer | None = None) -> None:
     """Draw the body, the measured markers and their feet from two sides, with names and residuals.
 
     Args:
         path: The PNG file to write.
         recordings: With the markers; those that were not seen are not drawn.
         fixed: Vertices of the clamped region.
+        renderer: Process that draws, in place of a new one.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
@@ -95,7 +97,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray) -> No
     panels = panels_of(np.concatenate([recordings.mesh.vertices, recordings.positions[seen], recordings.nominal]))
     radius = _RADIUS * float(np.ptp(recordings.mesh.vertices, axis=0).max())
     layers = registration_layers(recordings.mesh, fixed, recordings.positions[seen], recordings.feet[seen], radius)
-    pictures = [frames[0] for frames in draw(*(panel.scene(layers) for panel in panels))]
+    pictures = [frames[0] for frames in draw(*(panel.scene(layers) for panel in panels), renderer=renderer)]
     with mpl.rc_context({"font.size": 9, "text.color": INK}):
         figure = _compose(panels, pictures, recordings, radius, bool(len(fixed)))
         with atomic_path(path) as partial:

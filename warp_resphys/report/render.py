@@ -15,8 +15,8 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -104,13 +104,24 @@ def chain(count: int) -> IntArray:
 
 
 class Renderer:
-    """A process that draws scenes one after the other; a context manager.
-
-    Raises:
-        DrawingError: The process cannot be started.
-    """
+    """A process that draws scenes one after the other, which the first scene starts; a context manager."""
 
     def __init__(self) -> None:
+        self._end: Callable[[], object] | None = None  # Ends the process, if there is one.
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process, as does garbage collection of the renderer; a further scene starts another."""
+        if self._end is not None:
+            self._end()
+            self._end = None
+
+    def _start(self) -> None:
         environment = dict(os.environ)
         if sys.platform == "linux":  # Skips the search for X and OSMesa.
             environment.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
@@ -122,22 +133,16 @@ class Renderer:
             raise _failure(error.strerror or str(error)) from error
         self._end = weakref.finalize(self, _end, self._process, self._messages)
 
-    def __enter__(self) -> "Renderer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the process, as does garbage collection of the renderer."""
-        self._end()
-
     def frames(self, scene: RenderScene) -> Iterator[Pixels]:
         """Yield frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
+
+        All of them are to be taken before those of another scene.
 
         Raises:
             DrawingError: There is no pyvista, no OpenGL driver that works off screen, or drawing takes too long.
         """
+        if self._end is None:
+            self._start()
         end = time.monotonic() + TIME_OUT
         timer = threading.Timer(TIME_OUT, self._process.kill)
         timer.start()
@@ -148,7 +153,9 @@ class Renderer:
             while any(shape := struct.unpack("<3I", self._read(12))):
                 yield np.frombuffer(self._read(int(np.prod(shape))), np.uint8).reshape(shape)
         except (BrokenPipeError, EOFError):
-            raise _failure(self._reason(late=time.monotonic() >= end)) from None
+            reason = self._reason(late=time.monotonic() >= end)
+            self.close()
+            raise _failure(reason) from None
         finally:
             timer.cancel()
 
@@ -180,8 +187,12 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
                 pipe.close()
 
 
-def draw(*scenes: RenderScene) -> list[Pixels]:
+def draw(*scenes: RenderScene, renderer: Renderer | None = None) -> list[Pixels]:
     """Draw scenes in one process, as its start takes longer than most pictures.
+
+    Args:
+        scenes: In this order.
+        renderer: Process that draws further scenes later, in place of a new one that ends with these.
 
     Returns:
         Frames (F, H, V * W, 3 | 4) of each scene, as from `Renderer.frames`.
@@ -189,12 +200,17 @@ def draw(*scenes: RenderScene) -> list[Pixels]:
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    with Renderer() as renderer:
-        return [np.stack(list(renderer.frames(scene))) for scene in scenes]
+    with Renderer() if renderer is None else nullcontext(renderer) as used:
+        return [np.stack(list(used.frames(scene))) for scene in scenes]
 
 
-def write_film(path: Path, scene: RenderScene) -> None:
+def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None) -> None:
     """Write a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
+
+    Args:
+        path: Of the file.
+        scene: With a background and a text for every frame.
+        renderer: Process that draws it, in place of a new one; it ends with the film.
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
@@ -202,8 +218,9 @@ def write_film(path: Path, scene: RenderScene) -> None:
     """
     size = (scene.size[0] * len(scene.views), scene.size[1])
     options: dict[str, Any] = {"codec": "libx264", "quality": None, "ffmpeg_log_level": "error"}
-    with atomic_path(path) as target, Progress("video", len(scene.texts), "frames") as progress, Renderer() as renderer:
-        frames = renderer.frames(scene)
+    progress = Progress("video", len(scene.texts), "frames")
+    with atomic_path(path) as target, progress, renderer or Renderer() as used:
+        frames = used.frames(scene)
         first = next(frames)
         target.touch()  # Raises an error where the folder cannot be written.
         try:

@@ -149,7 +149,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     def picture(path: Path) -> Drawn:
         from .registration_picture import draw_registration
 
-        draw_registration(path, recordings, data.fixed)
+        draw_registration(path, recordings, data.fixed, canvas.renderer)
         caption = f"{shown}, which fits worst. Rings are nominal positions of the markers."
         return drawn_file(path, f"{shown}, from two sides.", caption)
 

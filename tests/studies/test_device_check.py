@@ -69,8 +69,9 @@ def test_an_error_in_the_place_of_a_figure_fails():
     assert bounded("step", lambda: 2e-3, 1e-3, "m")[1:] == ("2.0e-03 m", "1e-03 m", False)
 
 
-def test_an_experiment_that_fails_is_a_failed_check(folder):
-    overrides = ("check.experiments=[beam_oscillation]", "check.overrides=['trainer.epochs=0']")
+@pytest.mark.parametrize("key", ["check.overrides", "check.smaller.beam_oscillation"])
+def test_an_experiment_that_fails_is_a_failed_check(key, folder):
+    overrides = ("check.experiments=[beam_oscillation]", f"{key}=['trainer.epochs=0']")
     settings = settings_of(DeviceCheck, "verify_device", *overrides)
     (check,) = experiment_checks(settings.check, "cpu", folder)
     assert not check.passed

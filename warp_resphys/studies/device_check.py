@@ -53,6 +53,7 @@ class CheckSettings(Settings):
     steps: Natural
     experiments: Many[Word]
     overrides: Many[Word]
+    smaller: dict[Word, Many[Word]]
     minutes: Positive
     results: Word | None
 
@@ -111,6 +112,8 @@ def check_device(settings: DeviceCheck, folder: Path) -> None:
     """
     wp.config.log_level = wp.LOG_WARNING
     device, check = choose_device(settings.device), settings.check
+    if device.type == "cpu":
+        torch.set_num_threads(1)  # As in runs.
     work = {
         "Trajectories beside the CPU's": lambda: trajectory_checks(device, check.steps),
         "Gradients beside differences": lambda: gradient_checks(device),
@@ -245,11 +248,10 @@ def memory_checks(device: torch.device, steps: int) -> Iterator[Check]:
 
 def experiment_checks(settings: CheckSettings, device: str, folder: Path) -> Iterator[Check]:
     """Checks that experiments finish, by the command ``run``, in folders below that of the check."""
-    overrides = (*settings.overrides, f"device={device}")
-    runs = [
-        Run(name, "", (f"experiment={name}", *overrides), folder / "runs" / name, settings.minutes)
-        for name in settings.experiments
-    ]
+    runs = []
+    for name in settings.experiments:
+        overrides = (*settings.overrides, *settings.smaller.get(name, ()), f"device={device}")
+        runs.append(Run(name, "", (f"experiment={name}", *overrides), folder / "runs" / name, settings.minutes))
     for run in run_all(runs, folder / "logs"):
         finished = run.failure is None and (run.folder / METRICS).is_file()
         yield Check(run.experiment, run.failure or "finished", "finished", finished)

@@ -332,6 +332,9 @@ def _adjoint_solution(
         ConvergenceError: the Hessian is singular, for example if a body can turn about its only fixed vertex.
     """
     right = potential.restrict(gradient)
+    iterate = hessians[0].iterate(right)
+    if iterate is not None:
+        return iterate, potential.stiffness_product(iterate)
     size = right.flatten(1).norm(dim=1)
 
     def solved(hessian: ExactHessian, rest: torch.Tensor) -> torch.Tensor:

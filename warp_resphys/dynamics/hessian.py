@@ -14,11 +14,16 @@ from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..io.errors import InputError
 from ..kernels.assembly import sum_blocks
+from ..linalg.conjugate_gradients import conjugate_gradients
 from ..linalg.coupling import Coupling, CouplingSolver, VertexCouplings, coordinates
 from ..linalg.linear_solver import Factor, LinearSolver, numbered
 from .assembly import BlockPattern, HessianAssembly
+from .corotation import Corotation
 
 _MOST_VALUES = 2**31 - 1  # Warp's offsets here are 32-bit.
+_EXACT = 1e-12  # relative accuracy of solutions by the factor of an earlier state
+_MOST_ITERATIONS = 20  # of such a solution
+_FACTOR = 25  # iterations that take as long as a new factor
 _ROUNDED = 8  # Numbers of vertices with couplings are rounded up to multiples of it.
 
 
@@ -46,6 +51,9 @@ class HessianApproximation(ABC):
             clamp: (B,) environments with eigenvalues clamped; None: no environment.
             active: (B,) environments that get a new factor; the others keep theirs, if any. None: all.
         """
+
+    def follow(self) -> None:
+        """Rotates kept factors with the body to the potential's positions, if that pays."""
 
     @abstractmethod
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
@@ -79,7 +87,12 @@ class ExactHessian(HessianApproximation):
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
         self.vertex_at = pattern.free[linear.order]
+        self._order = torch.as_tensor(self.vertex_at, device=potential.device)
         self._coupled: CouplingSolver | None = None
+        turns = linear.patience > 1 and not potential.has_pairs
+        self._corotation = Corotation(potential, self.vertex_at) if turns else None
+        self._kept: Factor | None = None  # positive definite factor of `iterate`
+        self._solutions, self._iterations = 0, 0  # with that factor, which counts as `_FACTOR` iterations
         # Numbers of the free and, behind them, the dependent vertices; -1 for fixed ones.
         free, depends = torch.as_tensor(pattern.free, device=potential.device), potential.coordinates
         self._vertices = torch.cat([free, depends.dependent])
@@ -113,33 +126,88 @@ class ExactHessian(HessianApproximation):
 
     def _factorise(self, active: torch.Tensor | None) -> None:
         self._potential.update_tangent(self.clamped, active)
-        self._factor = self._factor_of(self.assembly(), active=active)
+        values, columns = self.assembly(), self._columns()
+        factor = self.linear.factor if self._potential.has_pairs else self.linear.direction_factor
+        self._factor = factor(
+            values, columns=columns, idle=None if active is None else ~active, before=self._factor
+        )
+        if self._corotation is not None:
+            self._corotation.begin(active)
         if self._coupled is not None:
             self._coupled.forget(active)
 
-    def _factor_of(self, values: torch.Tensor, definite: bool = True, active: torch.Tensor | None = None) -> Factor:
-        """Factorises assembled values, with the low-rank correction of the potential."""
+    def _columns(self) -> torch.Tensor | None:
+        """Returns the low-rank correction of the potential at the unknowns."""
         columns = self._potential.low_rank
-        columns = None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
-        return self.linear.factor(values, definite, columns, None if active is None else ~active, self._factor)
+        return None if columns is None else columns[:, self._dofs].to(self.linear.dtype)
 
     def refactor_exact(self) -> None:
-        """Factorises the Hessian without clamping, for adjoints."""
+        """Factorises the Hessian without clamping, for `solve`."""
         self.clamped.zero_()
         self._potential.update_tangent()
-        many = self._potential.low_rank is not None or self._potential.has_pairs  # right-hand sides
-        values = self.assembly()
-        self._factor = (None if many else self.linear.near(values)) or self._factor_of(values)
+        self._factor = self.linear.factor(self.assembly(), columns=self._columns(), before=self._factor)
         if self._factor.failed.any():
-            self._factor = self._factor_of(self.assembly(), definite=False)
+            self._factor = self.linear.factor(self.assembly(), False, self._columns(), before=self._factor)
         if self._coupled is not None:
             self._coupled.forget()
+
+    def iterate(self, right: torch.Tensor) -> torch.Tensor | None:
+        """Returns solutions (B, N, 3) for right-hand sides by conjugate gradients with the factor of an earlier state.
+
+        A new factor is made if there is none, if there are too many iterations, or after a solution with more of them
+        than all solutions with that factor had on average, the time for the factor included: the rule for the
+        replacement of what wears that minimises the mean cost.
+
+        Returns:
+            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if the linear
+            solver's factors are not worth keeping.
+        """
+        p, corotation = self._potential, self._corotation
+        if corotation is None or p.couples_cells:
+            return None
+
+        def product(x: torch.Tensor) -> torch.Tensor:
+            return p.restrict(p.stiffness_product(x) + p.inertia[..., None] * x)
+
+        def precondition(x: torch.Tensor) -> torch.Tensor:
+            own = x[:, self._order]
+            self.solve_in_place(own, self.clamped)
+            return torch.zeros_like(x).index_copy_(1, self._order, own)
+
+        p.update_tangent()
+        corotation.follow()
+        for renew in (self._kept is None, True):
+            if renew:
+                self._kept = self.linear.direction_factor(self.assembly())
+                if self._kept.failed.any():
+                    break
+                corotation.begin()
+                self._solutions, self._iterations = 0, _FACTOR
+            self._factor = self._kept
+            iterate = conjugate_gradients(product, precondition, right, _EXACT, _MOST_ITERATIONS)
+            if bool(iterate.converged.all()):
+                self._solutions += 1
+                self._iterations += iterate.iterations
+                if iterate.iterations * self._solutions > self._iterations:
+                    self._kept = None
+                return iterate.x
+        self._kept = None
+        return None
+
+    @override
+    def follow(self) -> None:
+        if self._corotation is not None:
+            self._corotation.follow()
 
     @override
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
         if self._factor is None:
             raise RuntimeError("refactor before solve")
+        if self._corotation is not None:
+            self._corotation.turn_back(right)
         self._factor.solve_in_place(right.flatten(1))
+        if self._corotation is not None:
+            self._corotation.turn(right)
         if self._potential.has_pairs:
             self._correct(self._potential.pair_tangents(True, needed), right.flatten(1)[:, :, None], self.linear.dofs)
 

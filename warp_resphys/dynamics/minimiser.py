@@ -207,6 +207,8 @@ class Minimiser:
             self._progress["factored"].zero_()
         try:
             state = self.begin(start)
+            if state.directions > state.factors:
+                self._hessian.follow()
             while state.active:
                 if state.factors:
                     self.refactor(state)

@@ -138,7 +138,7 @@ class NonlinearSolver:
         self._minimiser = Minimiser(
             potential,
             self.hessian,
-            factors,
+            torch.float32 if linear.patience > 1 else factors,
             memory=0 if after[settings.name] == 0 else settings.memory,
             relative_tolerance=settings.relative_tolerance,
             absolute_tolerance=settings.absolute_tolerance,

@@ -66,10 +66,11 @@ class Launcher:
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
 
-        With ``by_cells`` there are two launches, so that the threads of a cell read its stress once for all nodes.
+        With ``by_cells``, or several points in a cell, there are two launches: the stress of a cell is read once for all
+        its nodes.
         """
         outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
-        if not self.by_cells:
+        if not self.by_cells and s.points_per_cell == 1:
             inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
             return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, outputs)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]

@@ -182,7 +182,8 @@ class LinearSolver(ABC):
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
         iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
-        patience: number of iterations for which a factor is worth keeping, relative to a banded one.
+        patience: number of iterations for which a factor is worth keeping, relative to a banded one. Above 1 it also
+            serves the adjoints of other states, and rotates with the body.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
@@ -246,10 +247,15 @@ class LinearSolver(ABC):
         factor = self._factorise(values, definite, idle, kept)
         return factor if columns is None else CorrectedFactor(factor, columns, self.dofs)
 
-    def near(self, values: torch.Tensor) -> Factor | None:
-        """Returns a factor for a few solutions near the last matrices, without a factor of its own, or None."""
-        del values
-        return None
+    def direction_factor(
+        self,
+        values: torch.Tensor,
+        columns: torch.Tensor | None = None,
+        idle: torch.Tensor | None = None,
+        before: Factor | None = None,
+    ) -> Factor:
+        """Returns a factor like `factor`, for directions and preconditioning: in float32 where that is faster."""
+        return self.factor(values, True, columns, idle, before)
 
     @abstractmethod
     def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:

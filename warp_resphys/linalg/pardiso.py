@@ -8,21 +8,16 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-import scipy.sparse
 import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from .conjugate_gradients import conjugate_gradients
 from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
 
 _ANALYSIS, _FACTOR, _SOLVE, _RELEASE = 11, 22, 33, -1  # phases
 _NO_MEMORY = -2  # error
 _PERTURBED = 13  # place of the number of pivots that were made larger
 _KINDS: Final = {True: 2, False: -2}  # of symmetric matrices: positive definite or not
-_EXACT = 1e-12  # relative accuracy of solutions by an earlier factor
-_MOST_ITERATIONS = 20  # after which a factor is cheaper
-_MOST_COLUMNS = 4  # right-hand sides above which a factor is cheaper
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -31,8 +26,7 @@ class PardisoSolver(LinearSolver):
     """Pardiso (Schenk and Gaertner 2004) of Intel's oneMKL, in an order by nested dissection.
 
     A factor costs as much as some fifty solutions, and the analysis of the pattern, made once, a third of it: factors
-    are kept for long, and `near` solves by conjugate gradients with an earlier one, so that the last digits of its
-    solutions depend on which one that is.
+    are kept for long. Solutions take as long as reading the factor, in single precision half as long.
     """
 
     patience = 3
@@ -48,23 +42,40 @@ class PardisoSolver(LinearSolver):
         self.n_values = len(order)
         starts = np.searchsorted(row[order], np.arange(self.n + 1))
         self._pattern = (starts.astype(np.int32), column[order].astype(np.int32))  # CSR of the upper triangle
-        self._rooms: dict[tuple[int, int], _Room] = {}
+        self._rooms: dict[tuple[object, ...], _Room] = {}
 
     @override
     def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
         def factorise(number: int, own: torch.Tensor) -> _System | None:
-            system = self._system(values, number, own)
-            return system if system.factorise(definite) else None
+            return self._system((len(values), number), own, definite)
 
         return _Systems(self, values, factorise, idle, before)
 
     @override
-    def near(self, values: torch.Tensor) -> Factor:
-        return _Systems(self, values, lambda number, own: self._system(values, number, own), None, None)
+    def direction_factor(
+        self,
+        values: torch.Tensor,
+        columns: torch.Tensor | None = None,
+        idle: torch.Tensor | None = None,
+        before: Factor | None = None,
+    ) -> Factor:
+        if columns is not None:  # Rounding errors along C would be amplified.
+            return self.factor(values, True, columns, idle, before)
 
-    def _system(self, values: torch.Tensor, number: int, own: torch.Tensor) -> "_System":
-        room = self._rooms.setdefault((len(values), number), _Room(self._pattern))
-        return _System(room, own.detach().numpy().copy())
+        def factorise(number: int, own: torch.Tensor) -> _System | None:
+            room = (len(values), number)
+            return self._system(room, own.float(), True) or self._system(room, own, True)
+
+        return _Systems(self, values, factorise, idle, before)
+
+    def _system(self, environment: tuple[int, int], own: torch.Tensor, definite: bool) -> "_System | None":
+        """Returns the factorised matrix of an environment's values, or None if it has no factor."""
+        values = own.detach().numpy().copy()
+        key = (*environment, definite, own.dtype)
+        if key not in self._rooms:
+            self._rooms[key] = _Room(self._pattern, values, definite)
+        system = _System(self._rooms[key], values)
+        return system if system.factorise() else None
 
 
 class _Systems(SeparateFactors):
@@ -73,82 +84,43 @@ class _Systems(SeparateFactors):
         factor.solve(rows.detach())
 
 
-class _Room:
-    """An environment's factor.
-
-    Args:
-        pattern: starts (n + 1,) and columns (n_values,) of the upper triangle's rows.
-
-    Attributes:
-        owner: the system whose factor it is, if there is one.
-    """
-
-    def __init__(self, pattern: tuple[NDArray[np.int32], ...]) -> None:
-        self.pattern = pattern
-        self.owner: _System | None = None
-        self._memories: dict[bool, _Memory] = {}
-
-    def factorise(self, system: "_System", definite: bool) -> bool:
-        """Replaces the factor by that of a system, and returns whether it has one."""
-        if definite not in self._memories:
-            self._memories[definite] = _Memory(self.pattern, system.values, definite)
-        self._memory = self._memories[definite]
-        self.owner = system if self._memory.factorise(system.values) else None
-        return self.owner is system
-
-    def solve(self, rows: torch.Tensor) -> torch.Tensor:
-        """Overwrites right-hand sides (m, n) with the solutions, and returns them."""
-        assert self.owner is not None
-        self._memory.call(_SOLVE, self.owner.values, rows.numpy())
-        return rows
-
-
 class _System:
-    """A matrix of values (n_values,), whose factor the next one of its environment replaces."""
+    """A matrix of values (n_values,), and the room of its factor until the next matrix takes it."""
 
-    def __init__(self, room: _Room, values: FloatArray) -> None:
-        self._room, self.values = room, values
+    def __init__(self, room: "_Room", values: FloatArray) -> None:
+        self._room, self._values = room, values
+        self._stamp = 0
 
-    def factorise(self, definite: bool) -> bool:
+    def factorise(self) -> bool:
         """Returns whether there is a factor."""
-        return self._room.factorise(self, definite)
+        succeeds = self._room.factorise(self._values)
+        self._stamp = self._room.stamp
+        return succeeds
 
     def solve(self, rows: torch.Tensor) -> None:
-        """Overwrites right-hand sides (m, n) with the solutions, NaN for a singular matrix."""
-        room = self._room
-        if room.owner not in (None, self) and len(rows) <= _MOST_COLUMNS:
-
-            def precondition(residual: torch.Tensor) -> torch.Tensor:
-                return room.solve(residual.clone())
-
-            iterate = conjugate_gradients(self._times, precondition, rows, _EXACT, _MOST_ITERATIONS)
-            if bool(iterate.converged.all()):
-                rows.copy_(iterate.x)
-                return
-        if room.owner is self or self.factorise(True) or self.factorise(False):
-            room.solve(rows)
-        else:
-            rows.fill_(torch.nan)
-
-    def _times(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns the products (m, n) of the matrix with vectors (m, n)."""
-        starts, columns = self._room.pattern
-        upper = scipy.sparse.csr_array((self.values, columns, starts), shape=(len(starts) - 1,) * 2)
-        right = x.numpy().T
-        return torch.from_numpy((upper @ right + upper.T @ right - self.values[starts[:-1], None] * right).T)
+        """Overwrites right-hand sides (m, n) with the solutions."""
+        if self._stamp != self._room.stamp:
+            self.factorise()
+        right = rows.numpy().astype(self._values.dtype, copy=False)
+        self._room.call(_SOLVE, self._values, right)
+        if right.dtype != rows.numpy().dtype:
+            rows.copy_(torch.from_numpy(right))
 
 
-class _Memory:
+class _Room:
     """Pardiso's analysis of a pattern and room for one factor.
 
     Args:
         pattern: starts (n + 1,) and columns (n_values,) of the upper triangle's rows.
         values: (n_values,) of a matrix, for scaling and matching of indefinite ones.
         definite: whether it is for Cholesky.
+
+    Attributes:
+        stamp: number of factorisations.
     """
 
     def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray, definite: bool) -> None:
-        self._pattern, self._kind = pattern, _KINDS[definite]
+        self._pattern, self._kind, self.stamp = pattern, _KINDS[definite], 0
         self._threads = torch.get_num_threads()  # A factor by another number than the analysis may crash.
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
         # Own options; METIS; solutions overwrite; pivots; scaling; matching; precision; from zero. Threads on two
@@ -164,6 +136,7 @@ class _Memory:
 
     def factorise(self, values: FloatArray) -> bool:
         """Returns whether the matrix of values (n_values,) has a factor, without a pivot that was made larger."""
+        self.stamp += 1
         finite = np.isfinite(values.sum())  # It sees no NaN in an indefinite matrix.
         return bool(finite and self.call(_FACTOR, values) == 0 and self._options[_PERTURBED] == 0)
 

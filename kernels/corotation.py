@@ -1,0 +1,68 @@
+"""Mean rotations of the cells around each vertex, and changes of rotation."""
+
+import warp as wp
+
+from .matrices import polar_rotation
+
+wp.set_module_options({"enable_backward": False})
+
+SMALLEST = wp.constant(wp.float64(1.0e-30))  # determinant of a gradient without a rotation, from the mean of cells
+THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
+
+
+@wp.kernel
+def cell_gradients(
+    nodes: wp.array2d[int],  # (C, K)
+    operators: wp.array2d[wp.vec3d],  # (C, K) mean gradients of the shape functions, times a weight
+    positions: wp.array2d[wp.vec3d],  # (B, N) [m]
+    gradient_out: wp.array2d[wp.mat33d],  # (B, C)
+):
+    """Weighted mean deformation gradients of cells."""
+    b, cell = wp.tid()
+    f = wp.mat33d()
+    for a in range(nodes.shape[1]):
+        f += wp.outer(positions[b, nodes[cell, a]], operators[cell, a])
+    gradient_out[b, cell] = f
+
+
+@wp.kernel
+def sum_at_vertices(
+    start: wp.array[int],  # (N + 1) first entry of each vertex in `incident`
+    incident: wp.array[int],  # cell K + local node
+    nodes_per_cell: int,
+    gradient: wp.array2d[wp.mat33d],  # (B, C)
+    sum_out: wp.array2d[wp.mat33d],  # (B, N), added to
+):
+    """Adds the gradients of the cells around each vertex."""
+    b, i = wp.tid()
+    total = sum_out[b, i]
+    for entry in range(start[i], start[i + 1]):
+        total += gradient[b, incident[entry] / nodes_per_cell]
+    sum_out[b, i] = total
+
+
+@wp.kernel
+def rotation(
+    held: wp.array[int],  # (N) not zero: vertices without rotation
+    gradient: wp.array2d[wp.mat33d],  # (B, N) up to a positive factor
+    rotation_out: wp.array2d[wp.mat33d],
+):
+    """The nearest rotations, the identity where a gradient is singular or inverted."""
+    b, i = wp.tid()
+    f = gradient[b, i]
+    size = wp.determinant(f)
+    rotation_out[b, i] = wp.identity(n=3, dtype=wp.float64)
+    if held[i] == 0 and size > SMALLEST:
+        rotation_out[b, i] = polar_rotation((ONE / wp.pow(size, THIRD)) * f)
+
+
+@wp.kernel
+def rotation_since(
+    vertices: wp.array[int],  # (F)
+    before: wp.array2d[wp.mat33d],  # (B, F)
+    rotation: wp.array2d[wp.mat33d],  # (B, N)
+    since_out: wp.array2d[wp.mat33d],  # (B, F)
+):
+    """Rotations of vertices from earlier ones to the present ones."""
+    b, k = wp.tid()
+    since_out[b, k] = rotation[b, vertices[k]] * wp.transpose(before[b, k])

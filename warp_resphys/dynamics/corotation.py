@@ -1,0 +1,75 @@
+"""Rotations of the vertices since a factor of the Hessian, which make it one of the present state.
+
+The Hessian of a body that has only been rotated is R H R^T, with the rotation R in the block of every vertex. With R of
+the mean deformation gradient around each vertex, R H^-1 R^T is close to the inverse also where a body bends: fewer
+iterations need the factor of an earlier state, and it lasts for longer.
+"""
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from ..energies.launcher import warp_view
+from ..energies.potential import IncrementalPotential
+from ..fem.elements import SolidPoints
+from ..kernels import corotation as kernels
+
+
+class Corotation:
+    """Rotations of a batch since its last factors; none of vertices in symmetry planes.
+
+    Args:
+        potential: the potential, whose positions are used.
+        vertices: (F,) vertices of the unknowns, in the order of the vectors.
+    """
+
+    def __init__(self, potential: IncrementalPotential, vertices: NDArray[np.int64]) -> None:
+        p, shape = potential, (potential.batch, potential.n_vertices)
+        self._potential, self._vertices = p, torch.as_tensor(vertices, device=p.device)
+        self._sum, self._rotation = p.zeros(shape[1], 3, 3), p.zeros(shape[1], 3, 3)
+        self._before, self._since = p.zeros(len(vertices), 3, 3), p.zeros(len(vertices), 3, 3)
+        total, rotation, before, since = (
+            warp_view(x, wp.mat33d) for x in (self._sum, self._rotation, self._before, self._since)
+        )
+        positions, commands = warp_view(p.positions, wp.vec3d), []
+        for s in p.sets:
+            if not isinstance(s.source, SolidPoints) or not s.source.shape_volume.nnz:
+                continue
+            volumes = np.asarray(s.source.shape_volume.sum(axis=1)).reshape(s.cells, s.points_per_cell)
+            operators = p.upload(np.einsum("cq,cqki->cki", volumes / volumes.mean(), s.source.gradients), wp.vec3d)
+            gradient = warp_view(p.zeros(s.cells, 3, 3), wp.mat33d)
+            commands += [
+                p.record(kernels.cell_gradients, (p.batch, s.cells), [s.nodes, operators, positions], [gradient]),
+                p.record(kernels.sum_at_vertices, shape, [s.start, s.incident, s.nodes_per_cell, gradient], [total]),
+            ]
+        held = np.zeros(shape[1], dtype=np.int32)
+        held[p.coordinates.sliding.cpu().numpy()] = 1
+        commands.append(p.record(kernels.rotation, shape, [p.upload(held, int), total], [rotation]))
+        own = [p.upload(vertices.astype(np.int32), int), before, rotation]
+        self._compute = p.capture(*commands)
+        self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), own, [since]))
+
+    def begin(self, active: torch.Tensor | None = None) -> None:
+        """Records the rotations at the potential's positions as those of new factors of environments (B,), or all."""
+        self._update()
+        now = self._rotation[:, self._vertices]
+        self._before.copy_(now if active is None else torch.where(active[:, None, None, None], now, self._before))
+        self._potential.launch(self._compare)
+
+    def follow(self) -> None:
+        """Computes the rotations from the factors' positions to the potential's."""
+        self._update()
+        self._potential.launch(self._compare)
+
+    def _update(self) -> None:
+        self._sum.zero_()
+        self._potential.launch(self._compute)
+
+    def turn_back(self, vectors: torch.Tensor) -> None:
+        """Turns vectors (B, F, 3) back to the factors' positions, in place."""
+        vectors.copy_((self._since.mT @ vectors[..., None].double())[..., 0])
+
+    def turn(self, vectors: torch.Tensor) -> None:
+        """Turns vectors (B, F, 3) with the body, in place."""
+        vectors.copy_((self._since @ vectors[..., None].double())[..., 0])

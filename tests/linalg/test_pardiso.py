@@ -1,4 +1,4 @@
-"""Pardiso's factors of one matrix as preconditioners of the next ones."""
+"""Pardiso's factors: precision, matrices without one, and the room that they share."""
 
 import gc
 
@@ -32,53 +32,75 @@ def solver():
     return solver
 
 
-def counted(solver, monkeypatch):
-    """The phases that Pardiso runs from here on."""
-    phases, memory = [], type(next(iter(next(iter(solver._rooms.values()))._memories.values())))
-    call = memory.call
-    monkeypatch.setattr(memory, "call", lambda self, phase, *rest: phases.append(phase) or call(self, phase, *rest))
-    return phases
-
-
 def solutions(factor: Factor):
     return factor.solve(RIGHT)[0].numpy()
 
 
-def test_a_later_matrix_is_solved_exactly_without_a_factor(solver, monkeypatch):
-    first, values = matrix(0)
-    kept = solver.factor(values)
-    np.testing.assert_allclose(solutions(kept), np.linalg.solve(first, RIGHT[0]), rtol=1e-9, atol=1e-12)
-    phases = counted(solver, monkeypatch)
-    later = first + 0.05 * matrix(1)[0]
-    near = solver.near(torch.as_tensor(later[np.triu_indices(NODES)])[None])
-    np.testing.assert_allclose(solutions(near), np.linalg.solve(later, RIGHT[0]), rtol=1e-9, atol=1e-11)
-    assert 22 not in phases
+def test_a_direction_is_accurate_to_single_precision_and_a_solution_to_double(solver):
+    dense, values = matrix(0)
+    exact = np.linalg.solve(dense, RIGHT[0].numpy())
+    np.testing.assert_allclose(solutions(solver.factor(values)), exact, rtol=1e-9, atol=1e-12)
+    for kind in (torch.float64, torch.float32):
+        direction = RIGHT[:, :, 0].to(kind, copy=True)
+        solver.direction_factor(values).solve_in_place(direction)
+        assert 1e-10 < np.abs(direction[0].double().numpy() - exact[:, 0]).max() < 1e-5 * np.abs(exact).max()
 
 
-@pytest.mark.parametrize("shift", [20.0, 0.0], ids=["definite", "indefinite"])
-def test_a_matrix_far_from_the_last_one_gets_its_factor(solver, shift, monkeypatch):
-    solver.factor(torch.as_tensor(np.diag(np.logspace(-6, 6, NODES))[np.triu_indices(NODES)])[None])
-    phases = counted(solver, monkeypatch)
-    dense, values = matrix(2, shift)
-    np.testing.assert_allclose(solutions(solver.near(values)), np.linalg.solve(dense, RIGHT[0]), rtol=1e-8, atol=1e-10)
-    assert 22 in phases
+def test_a_matrix_that_single_precision_makes_indefinite_has_a_direction(solver):
+    turn = np.linalg.qr(matrix(2)[0])[0]
+    dense = turn @ np.diag(np.logspace(-10, 0, NODES)) @ turn.T
+    values = torch.as_tensor(dense[np.triu_indices(NODES)])[None]
+    assert solver.factor(values.float().double()).failed.all()
+    factor = solver.direction_factor(values)
+    assert not factor.failed.any()
+    right = np.random.default_rng(4).normal(size=(1, NODES)) @ dense
+    direction = torch.as_tensor(right.copy())
+    factor.solve_in_place(direction)
+    np.testing.assert_allclose(direction.numpy() @ dense, right, atol=1e-9)
 
 
-def test_a_first_matrix_needs_a_factor_and_a_singular_one_has_no_solution(solver):
-    dense, values = matrix(4)
-    np.testing.assert_allclose(solutions(solver.near(values)), np.linalg.solve(dense, RIGHT[0]), rtol=1e-9, atol=1e-12)
-    singular = np.linalg.qr(dense)[0][:, :5]
-    for broken in (singular @ singular.T, np.full_like(dense, np.nan)):
+def test_an_indefinite_matrix_has_a_solution_but_no_direction(solver):
+    dense, values = matrix(2, shift=0.0)
+    assert solver.direction_factor(values).failed.all()
+    assert solver.factor(values).failed.all()
+    np.testing.assert_allclose(
+        solutions(solver.factor(values, definite=False)), np.linalg.solve(dense, RIGHT[0]), rtol=1e-8, atol=1e-10
+    )
+
+
+def test_an_earlier_factor_still_solves_after_a_later_one(solver):
+    earlier, later = matrix(0), matrix(1)
+    factors = [solver.factor(values) for _, values in (earlier, later)]
+    for factor, (dense, _) in [*zip(factors, (earlier, later), strict=True), (factors[0], earlier)]:
+        np.testing.assert_allclose(solutions(factor), np.linalg.solve(dense, RIGHT[0]), rtol=1e-9, atol=1e-12)
+
+
+def test_low_rank_terms_keep_double_precision(solver):
+    dense, values = matrix(0)
+    columns = 1e3 * torch.as_tensor(np.random.default_rng(6).normal(size=(1, NODES, 2)))
+    whole = dense + (columns @ columns.mT)[0].numpy()
+    direction = RIGHT[:, :, 0].clone()
+    solver.direction_factor(values, columns).solve_in_place(direction)
+    exact = np.linalg.solve(whole, RIGHT[0, :, 0].numpy())
+    np.testing.assert_allclose(direction[0].numpy(), exact, atol=1e-7 * np.abs(exact).max())
+
+
+def test_a_singular_matrix_and_one_of_nan_have_no_factor(solver):
+    singular = np.linalg.qr(matrix(4)[0])[0][:, :5]
+    for broken in (singular @ singular.T, np.full((NODES, NODES), np.nan)):
         values = torch.as_tensor(broken[np.triu_indices(NODES)])[None]
-        assert solver.factor(values, definite=False).failed.all()
-        assert np.isnan(solutions(solver.near(values))).all()
+        for factor in (solver.factor(values, definite=False), solver.direction_factor(values)):
+            assert factor.failed.all()
+            assert np.isnan(solutions(factor)).all()
 
 
 def test_memory_is_given_back_with_the_solver(monkeypatch):
     gc.collect()
     solver = PardisoSolver(ROWS, COLS, NODES, 1, torch.device("cpu"), torch.float32)
     factor = solver.factor(matrix(0)[1].float())
-    phases = counted(solver, monkeypatch)
+    phases, room = [], type(next(iter(solver._rooms.values())))
+    call = room.call
+    monkeypatch.setattr(room, "call", lambda self, phase, *rest: phases.append(phase) or call(self, phase, *rest))
     del factor, solver
     gc.collect()
     assert phases == [-1]

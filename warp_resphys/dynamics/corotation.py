@@ -33,11 +33,11 @@ class Corotation:
             warp_view(x, wp.mat33d) for x in (self._sum, self._rotation, self._before, self._since)
         )
         positions, commands = warp_view(p.positions, wp.vec3d), []
-        for s in p.sets:
-            if not isinstance(s.source, SolidPoints) or not s.source.shape_volume.nnz:
-                continue
-            volumes = np.asarray(s.source.shape_volume.sum(axis=1)).reshape(s.cells, s.points_per_cell)
-            operators = p.upload(np.einsum("cq,cqki->cki", volumes / volumes.mean(), s.source.gradients), wp.vec3d)
+        solids = [(s, s.source) for s in p.sets if isinstance(s.source, SolidPoints) and s.source.shape_volume.nnz]
+        mean = sum(source.shape_volume.sum() / s.cells for s, source in solids) / max(1, len(solids))
+        for s, source in solids:
+            volumes = np.asarray(source.shape_volume.sum(axis=1)).reshape(s.cells, s.points_per_cell)
+            operators = p.upload(np.einsum("cq,cqki->cki", volumes / mean, source.gradients), wp.vec3d)
             gradient = warp_view(p.zeros(s.cells, 3, 3), wp.mat33d)
             commands += [
                 p.record(kernels.cell_gradients, (p.batch, s.cells), [s.nodes, operators, positions], [gradient]),

@@ -22,7 +22,7 @@ from .corotation import Corotation
 
 _MOST_VALUES = 2**31 - 1  # Warp's offsets here are 32-bit.
 _EXACT = 1e-12  # relative accuracy of solutions by the factor of an earlier state
-_MOST_ITERATIONS = 20  # of such a solution
+_MOST_ITERATIONS = 40  # of such a solution
 _FACTOR = 25  # iterations that take as long as a new factor
 _ROUNDED = 8  # Numbers of vertices with couplings are rounded up to multiples of it.
 
@@ -52,8 +52,9 @@ class HessianApproximation(ABC):
             active: (B,) environments that get a new factor; the others keep theirs, if any. None: all.
         """
 
+    @abstractmethod
     def follow(self) -> None:
-        """Rotates kept factors with the body to the potential's positions, if that pays."""
+        """Adapts the last factors to the potential's positions, if that is cheap."""
 
     @abstractmethod
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
@@ -89,10 +90,10 @@ class ExactHessian(HessianApproximation):
         self.vertex_at = pattern.free[linear.order]
         self._order = torch.as_tensor(self.vertex_at, device=potential.device)
         self._coupled: CouplingSolver | None = None
-        turns = linear.patience > 1 and not potential.has_pairs
+        turns = linear.lasting and not potential.has_pairs
         self._corotation = Corotation(potential, self.vertex_at) if turns else None
-        self._kept: Factor | None = None  # positive definite factor of `iterate`
-        self._solutions, self._iterations = 0, 0  # with that factor, which counts as `_FACTOR` iterations
+        self._kept: Factor | None = None  # factor of `iterate`
+        self._solutions, self._iterations = 0, 0  # with it; the factor counts as `_FACTOR` iterations
         # Numbers of the free and, behind them, the dependent vertices; -1 for fixed ones.
         free, depends = torch.as_tensor(pattern.free, device=potential.device), potential.coordinates
         self._vertices = torch.cat([free, depends.dependent])
@@ -128,9 +129,7 @@ class ExactHessian(HessianApproximation):
         self._potential.update_tangent(self.clamped, active)
         values, columns = self.assembly(), self._columns()
         factor = self.linear.factor if self._potential.has_pairs else self.linear.direction_factor
-        self._factor = factor(
-            values, columns=columns, idle=None if active is None else ~active, before=self._factor
-        )
+        self._factor = factor(values, columns=columns, idle=None if active is None else ~active, before=self._factor)
         if self._corotation is not None:
             self._corotation.begin(active)
         if self._coupled is not None:
@@ -154,13 +153,12 @@ class ExactHessian(HessianApproximation):
     def iterate(self, right: torch.Tensor) -> torch.Tensor | None:
         """Returns solutions (B, N, 3) for right-hand sides by conjugate gradients with the factor of an earlier state.
 
-        A new factor is made if there is none, if there are too many iterations, or after a solution with more of them
-        than all solutions with that factor had on average, the time for the factor included: the rule for the
-        replacement of what wears that minimises the mean cost.
+        The factor is replaced where the iterations do not converge, and after a solution that took longer than the mean
+        of all with this factor, including the time of the factor: later replacement would increase that mean.
 
         Returns:
-            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if the linear
-            solver's factors are not worth keeping.
+            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if factors of
+            the linear solver do not last.
         """
         p, corotation = self._potential, self._corotation
         if corotation is None or p.couples_cells:
@@ -176,8 +174,8 @@ class ExactHessian(HessianApproximation):
 
         p.update_tangent()
         corotation.follow()
-        for renew in (self._kept is None, True):
-            if renew:
+        for renews in [True] if self._kept is None else [False, True]:
+            if renews:
                 self._kept = self.linear.direction_factor(self.assembly())
                 if self._kept.failed.any():
                     break
@@ -357,7 +355,11 @@ class ProjectiveHessian(HessianApproximation):
         diagonal = torch.as_tensor(self._pattern.rows == self._pattern.cols, device=blocks.device)
         vertex = torch.as_tensor(self._pattern.diagonal_vertex, device=blocks.device)[diagonal]
         values[:, self._address[diagonal]] += inertia[:, vertex]
-        self._factor = self._linear.factor(values.to(self._linear.dtype))
+        self._factor = self._linear.direction_factor(values.to(self._linear.dtype))
+
+    @override
+    def follow(self) -> None:
+        """Does nothing, as the matrix does not depend on the positions."""
 
     @override
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:

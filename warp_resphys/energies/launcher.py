@@ -66,8 +66,8 @@ class Launcher:
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
 
-        With ``by_cells``, or several points in a cell, there are two launches: the stress of a cell is read once for all
-        its nodes.
+        With ``by_cells``, or several points in a cell, there are two launches, which read the stress of a cell once for
+        all its nodes.
         """
         outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
         if not self.by_cells and s.points_per_cell == 1:

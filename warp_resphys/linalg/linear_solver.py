@@ -182,8 +182,7 @@ class LinearSolver(ABC):
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
         iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
-        patience: number of iterations for which a factor is worth keeping, relative to a banded one. Above 1 it also
-            serves the adjoints of other states, and rotates with the body.
+        lasting: whether a factor takes as long as dozens of solutions, so that it is kept for many states.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
@@ -192,7 +191,7 @@ class LinearSolver(ABC):
     order: Indices
     overwrites = False
     iterates = False
-    patience = 1
+    lasting = False
 
     def __init__(
         self,

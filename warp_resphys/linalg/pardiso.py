@@ -29,7 +29,7 @@ class PardisoSolver(LinearSolver):
     are kept for long. Solutions take as long as reading the factor, in single precision half as long.
     """
 
-    patience = 3
+    lasting = True
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:

@@ -243,7 +243,8 @@ class SolveSettings(Settings):
         "auto", "linear solver of Newton's equation; banded, bordered and pardiso run only on the CPU"
     )
     factors: Literal["double", "single"] = setting(
-        "double", "precision of factors and L-BFGS pairs; residuals, states and gradients stay accurate"
+        "double",
+        "precision of factors and L-BFGS pairs (pardiso: single); residuals, states and gradients stay accurate",
     )
     on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
 

@@ -1,0 +1,186 @@
+"""Kept factors: in single precision, rotated with the body, and preconditioning adjoints of other states."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Rigid, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.dynamics import equilibrium, hessian
+from warp_resphys.dynamics.corotation import Corotation
+from warp_resphys.fem.symmetry import SymmetryPlane
+from warp_resphys.linalg.pardiso import has_pardiso
+from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
+from warp_resphys.stepping.inputs import Inputs
+
+pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl, which x86 processors alone have")
+
+BOX = box_hexahedra((0.06, 0.04, 0.04), (4, 3, 3))
+CAP = np.flatnonzero(BOX.vertices[BOX.cells].mean(1)[:, 0] > 0.045)
+BODIES = {
+    "hexahedra": lambda: Body(BOX, select_vertices(BOX, x=0.0)),
+    "tetrahedra": lambda: Body(mesh := box_tetrahedra((0.06, 0.04, 0.04), (4, 3, 3)), select_vertices(mesh, x=0.0)),
+    "rigid part": lambda: Body(
+        Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), select_vertices(BOX, x=0.0), rigid={"cap": Rigid(1200.0)}
+    ),
+    "symmetry": lambda: Body(BOX, select_vertices(BOX, x=0.0), symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
+}
+
+
+def simulator(kind, linear_solver, poissons_ratio=0.45, youngs_modulus=264e3, **options):
+    solver = SolverSettings(linear_solver=linear_solver, **{"relative_tolerance": 1e-10, **options})
+    return Simulator(BODIES[kind](), Corotated(youngs_modulus, poissons_ratio, density=1070.0), solver=solver)
+
+
+def turned(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def adjoints(sim, states, monkeypatch):
+    """Adjoints of a random gradient at states, one after another, and the factors and iterations that they took."""
+    counts = SimpleNamespace(factors=0, iterations=[])
+    factor, iterate = type(sim.workspace(1).linear_solver("pardiso")).direction_factor, hessian.conjugate_gradients
+
+    def counted_factor(*arguments, **options):
+        counts.factors += 1
+        return factor(*arguments, **options)
+
+    def counted(*arguments):
+        result = iterate(*arguments)
+        counts.iterations.append(result.iterations)
+        return result
+
+    monkeypatch.setattr("warp_resphys.linalg.pardiso.PardisoSolver.direction_factor", counted_factor)
+    monkeypatch.setattr(hessian, "conjugate_gradients", counted)
+    own = sim.workspace(1)
+    matrix = own.hessian(sim.settings.linear_solver)
+    sim.step(sim.rest_state())  # sets the terms of a step
+    counts.factors = 0
+    right = torch.randn(1, sim.body.n_vertices, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    out = []
+    for q in states:
+        own.potential.positions.copy_(q)
+        out.append(equilibrium._adjoint_solution(own.potential, [matrix], right)[0])
+    return out, counts
+
+
+@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+@pytest.mark.parametrize("youngs_modulus", [264e3, 2e9])
+@pytest.mark.parametrize("kind", BODIES)
+def test_adjoints_by_a_factor_of_the_rest_state_are_those_of_a_factor_in_double(
+    kind, youngs_modulus, poissons_ratio, monkeypatch
+):
+    both = []
+    for name in ("pardiso", "banded"):
+        sim = simulator(kind, name, poissons_ratio, youngs_modulus)
+        rest = sim.rest_state()
+        force = torch.zeros_like(rest.q)
+        force[..., 2] = 2e-7 * youngs_modulus
+        bent = sim.rollout(rest, 3, Inputs(external_force=force)).q[-1]
+        assert float((bent - rest.q).abs().max()) > 1e-3
+        solutions, counts = adjoints(sim, [rest.q, bent], monkeypatch)
+        both.append(solutions[1])
+        if name == "pardiso":
+            assert counts.factors == 1
+            assert counts.iterations[1] > counts.iterations[0] > 0
+    torch.testing.assert_close(*both, rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
+
+
+def test_a_factor_rotates_with_the_body(monkeypatch):
+    sim = simulator("tetrahedra", "pardiso")
+    rest = sim.rest_state().q
+    _, counts = adjoints(sim, [rest, rest @ turned(1.5).T, rest @ turned(-2.5)], monkeypatch)
+    assert counts.factors == 1
+    assert max(counts.iterations[1:]) <= counts.iterations[0] + 1
+
+
+def test_rotations_are_those_of_the_body_since_the_factor_of_its_environment():
+    sim = simulator("hexahedra", "pardiso")
+    potential = sim.workspace(2).potential
+    vertices = np.setdiff1d(np.arange(sim.body.n_vertices), sim.body.fixed_vertices)[::-1].copy()
+    rest, corotation = sim.rest_state(2).q, Corotation(potential, vertices)
+    stretched = rest * torch.tensor([1.2, 0.9, 1.0], dtype=torch.float64)
+    potential.positions.copy_(stretched)
+    corotation.begin()
+    potential.positions.copy_(stretched @ turned(0.7).T)
+    corotation.begin(torch.tensor([True, False]))
+    potential.positions.copy_(stretched @ turned(2.0).T)
+    corotation.follow()
+    vectors = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).repeat(2, len(vertices), 1)
+    expected = torch.stack([vectors[0] @ turned(1.3).T, vectors[1] @ turned(2.0).T])
+    whole = vectors.clone()
+    corotation.turn(whole)
+    torch.testing.assert_close(whole, expected)
+    corotation.turn_back(whole)
+    torch.testing.assert_close(whole, vectors)
+
+
+def test_vertices_in_symmetry_planes_and_inverted_ones_are_not_turned():
+    sim = simulator("symmetry", "pardiso")
+    potential, vertices = sim.workspace(1).potential, np.arange(sim.body.n_vertices)
+    corotation, rest = Corotation(potential, vertices), sim.rest_state().q
+    potential.positions.copy_(rest)
+    corotation.begin()
+    potential.positions.copy_(rest @ turned(0.7).T)
+    corotation.follow()
+    vectors = torch.ones_like(rest)
+    corotation.turn(vectors)
+    moved = (vectors - 1.0).abs().amax(-1)[0] > 0.1
+    assert (moved.numpy() == ((BOX.vertices[:, 1] > 1e-9) | (BOX.vertices[:, 0] < 1e-9))).all()
+    potential.positions.copy_(-rest)
+    corotation.follow()
+    corotation.turn(vectors := torch.ones_like(rest))
+    torch.testing.assert_close(vectors, torch.ones_like(rest))
+
+
+def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
+    both = []
+    for name in ("pardiso", "banded"):
+        sim = simulator("hexahedra", name)
+        flat = sim.rest_state().q * torch.tensor([0.2, 1.0, 1.0], dtype=torch.float64)
+        solutions, _ = adjoints(sim, [flat], monkeypatch)
+        both.append(solutions[0])
+        assert bool((sim.workspace(1).hessian(name).linear.factor(sim.workspace(1).hessian(name).assembly())).failed)
+    torch.testing.assert_close(*both, rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
+
+
+def test_a_factor_is_replaced_after_a_solution_slower_than_the_mean(monkeypatch):
+    sim = simulator("hexahedra", "pardiso")
+    scripted = iter([3, 6, 6, 6, 12, 12, 4, 4])
+    monkeypatch.setattr(
+        hessian,
+        "conjugate_gradients",
+        lambda operator, preconditioner, right, *limits: SimpleNamespace(
+            x=right, converged=torch.ones(1, dtype=torch.bool), iterations=next(scripted)
+        ),
+    )
+    solver, made = sim.workspace(1).hessian("pardiso").linear, []
+    factor = type(solver).direction_factor
+    monkeypatch.setattr(solver, "direction_factor", lambda *rest: made.append(0) or factor(solver, *rest))
+    counts = []
+    sim.step(sim.rest_state())
+    for _ in range(8):
+        sim.workspace(1).hessian("pardiso").iterate(torch.zeros(1, sim.body.n_vertices, 3, dtype=torch.float64))
+        counts.append(len(made))
+    # (25 + 3 + 6 + 6 + 6 + 12) / 5 = 11.6 < 12
+    assert counts == [1, 1, 1, 1, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+def test_roll_outs_and_gradients_agree_with_those_of_the_banded_solver(poissons_ratio):
+    """A soft body that gravity bends by large rotations."""
+    ends = []
+    for name in ("pardiso", "banded"):
+        sim = simulator("tetrahedra", name, poissons_ratio, youngs_modulus=1e4)
+        rest = sim.rest_state()
+        q = rest.q.clone().requires_grad_(True)
+        end = sim.rollout(State(q, rest.v), 8, Inputs())
+        gradient = torch.autograd.grad(end.q[-1].square().sum() + end.v[-1].sum(), q)[0]
+        ends.append((end.q[-1].detach(), gradient, sum(int(r.factorisations) for r in end.reports)))
+    assert float((ends[1][0] - rest.q).abs().max()) > 0.01
+    assert ends[0][2] < ends[1][2]
+    for a, b in zip(ends[0][:2], ends[1][:2], strict=True):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=1e-7 * float(b.abs().max()))

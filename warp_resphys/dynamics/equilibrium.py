@@ -323,6 +323,8 @@ def _adjoint_solution(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the adjoint z (B, N, 3) [m] and its product with the stiffness [N] at the potential's positions.
 
+    Without a factor of its own where `ExactHessian.iterate` solves it.
+
     Args:
         potential: potential with the terms and positions of the solution.
         hessians: Hessians to try in turn; a float32 factor is combined with iterative refinement.

@@ -26,7 +26,7 @@ class PardisoSolver(LinearSolver):
     """Pardiso (Schenk and Gaertner 2004) of Intel's oneMKL, in an order by nested dissection.
 
     A factor costs as much as some fifty solutions, and the analysis of the pattern, made once, a third of it: factors
-    are kept for long. Solutions take as long as reading the factor, in single precision half as long.
+    are kept for long. A solution takes as long as reading the factor from memory, and half as long in single precision.
     """
 
     lasting = True

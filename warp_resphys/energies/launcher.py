@@ -15,6 +15,7 @@ from ..kernels import points
 from ..kernels.modules import launch_stream, shareable
 
 _CAPTURES = Lock()  # A capture records launches of all threads: only one thread may use Warp during the first step.
+_MANY_POINTS = 10_000  # of a set, whose stresses a CPU's caches do not hold
 BLOCK = 128  # threads per block on a GPU; the same for all kernels, as Warp compiles a module once per block size
 
 ensure_kernel_cache()  # before Warp is first used
@@ -66,11 +67,11 @@ class Launcher:
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
 
-        With ``by_cells``, or several points in a cell, there are two launches, which read the stress of a cell once for
-        all its nodes.
+        With ``by_cells``, or many points and several of them in a cell, there are two launches, which read the stress
+        of a cell once for all its nodes.
         """
         outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
-        if not self.by_cells and s.points_per_cell == 1:
+        if not self.by_cells and (s.points_per_cell == 1 or s.n_points < _MANY_POINTS):
             inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
             return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, outputs)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]

@@ -221,3 +221,27 @@ def test_a_factor_that_rotates_lasts_for_longer(monkeypatch):
         factors.append([sum(int(getattr(r, count)) for r in reports) for count in ("factorisations", "iterations")])
     assert factors[0][0] < factors[1][0]
     assert factors[0][1] < 0.8 * factors[1][1]
+
+
+@pytest.mark.parametrize("kind", ["hexahedra", "symmetry"])
+def test_a_linearised_step_needs_a_factor_only_for_many_right_hand_sides(kind, monkeypatch):
+    factors, refactor = [], hessian.ExactHessian.refactor_exact
+    monkeypatch.setattr(hessian.ExactHessian, "refactor_exact", lambda self: (factors.append(0), refactor(self)))
+    both = []
+    for name in ("pardiso", "banded"):
+        sim = simulator(kind, name)
+        step = sim.linearise(sim.rest_state())
+        force = torch.zeros_like(step.start)
+        force[..., 2] = 0.05
+        bent = step.hold(sim.step(sim.rest_state(), Inputs(external_force=force))[0].q)
+        random = torch.Generator().manual_seed(2)
+        right = torch.randn(1, force[0].numel(), 6, generator=random, dtype=torch.float64)
+        step = sim.linearise(sim.rest_state())
+        step.factorise(bent)
+        step.residual(step.start)
+        few = step.solve(right[..., :2])
+        assert len(factors) == 2 * len(both)
+        both.append((few, step.solve(right)))
+    assert len(factors) == 2
+    for a, b in zip(*both, strict=True):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=1e-9 * float(b.abs().max()))

@@ -18,6 +18,8 @@ from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 
+_FEW = 4  # right-hand sides up to which a factor of another state may be cheaper
+
 
 class Linearisation:
     """The residual g(x) of a step and its Hessian H = dg/dx.
@@ -57,6 +59,7 @@ class Linearisation:
         self._potential.set_terms(terms)
         self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
         self._unknowns = 3 * self._potential.n_vertices
+        self._at, self._has_factor = self.start, True
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
         """Returns x with fixed and dependent vertices in their places, and sliding vertices in their planes."""
@@ -70,17 +73,35 @@ class Linearisation:
         return self._potential.residual.clone()
 
     def factorise(self, x: torch.Tensor) -> None:
-        """Prepares H at x (B, N, 3) [m] for `solve` and `product`."""
-        self._potential.positions.copy_(x)
-        with threads_for(self._unknowns):
-            self._workspace.hessian(self._name).refactor_exact()
+        """Prepares H at x (B, N, 3) [m] for `solve`, which makes its factor if it needs one, and for `product`."""
+        self.update(x)
+        self._at, self._has_factor = x.detach().clone(), False
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
+        hessian = self._workspace.hessian(self._name)
         fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
         with threads_for(self._unknowns):
-            solution = self._workspace.hessian(self._name).solve(fields.flatten(1, 2))
-        return self._coordinates.expand(solution.unflatten(1, (-1, 3))).flatten(1, 2)
+            solution = None
+            if not self._has_factor:
+                self._potential.positions.copy_(self._at)
+                solution = self._iterated(fields) if 0 < fields.shape[3] <= _FEW else None
+                if solution is None:
+                    hessian.refactor_exact()
+                    self._has_factor = True
+            if solution is None:
+                solution = hessian.solve(fields.flatten(1, 2)).unflatten(1, (-1, 3))
+        return self._coordinates.expand(solution).flatten(1, 2)
+
+    def _iterated(self, fields: torch.Tensor) -> torch.Tensor | None:
+        """Returns solutions (B, N, 3, m) by `ExactHessian.iterate`, or None."""
+        columns = []
+        for field in fields.unbind(3):
+            column = self._workspace.hessian(self._name).iterate(self._potential.restrict(field.double()))
+            if column is None:
+                return None
+            columns.append(column.to(fields))
+        return torch.stack(columns, 3)
 
     def update(self, x: torch.Tensor) -> None:
         """Prepares H at x for `product` and `shifted`, without a factor."""

@@ -1,6 +1,7 @@
 """Closed surfaces filled with tetrahedra."""
 
 import contextlib
+import subprocess
 import sys
 
 import numpy as np
@@ -40,6 +41,30 @@ def test_a_box_is_filled_to_its_edges(tmp_path, name, order):
     assert 0.004 < np.median(edges) < 0.02
     again = fill_surface(path, 0.01, "mm", order)
     np.testing.assert_array_equal(mesh.cells, again.cells)
+
+
+@pytest.mark.usefixtures("_gmsh")
+def test_a_closed_pipe_is_an_error_after_a_mesh():
+    """The solids of gmsh reset the signal that would end the process."""
+    program = """
+import os
+from warp_resphys.mesh.tetrahedra import tetrahedra_by_gmsh
+
+def describe(gmsh):
+    ball, box = gmsh.model.occ.addSphere(0, 0, 0, 0.02), gmsh.model.occ.addBox(0, 0, 0, 0.03, 0.03, 0.03)
+    gmsh.model.occ.cut([(3, ball)], [(3, box)])
+    gmsh.model.occ.synchronize()
+
+tetrahedra_by_gmsh(describe, 0.01, "a ball")
+unread, end = os.pipe()
+os.close(unread)
+try:
+    os.write(end, b"nobody reads")
+except BrokenPipeError:
+    print("an error")
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert (ended.returncode, ended.stdout) == (0, "an error\n"), ended.stderr
 
 
 @pytest.mark.usefixtures("_gmsh")

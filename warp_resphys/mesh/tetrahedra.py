@@ -2,6 +2,8 @@
 
 import math
 import os
+import signal
+import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -68,6 +70,9 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
         raise MeshError(f"gmsh cannot mesh {what} ({error}): try another size.") from error
     finally:
         gmsh.finalize()
+        if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGPIPE"):
+            # Its solids reset this signal, by which a closed pipe would end the process.
+            signal.signal(signal.SIGPIPE, signal.getsignal(signal.SIGPIPE))
     if not len(nodes):
         raise MeshError(f"gmsh made no tetrahedra of {what}: try another size.")
     places = np.zeros(int(tags.max()) + 1, dtype=np.int64)

@@ -13,7 +13,6 @@ import pytest
 import torch
 import warp as wp
 from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
-from matplotlib.figure import Figure
 
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from warp_resphys.mesh.mesh import box_hexahedra
@@ -24,6 +23,7 @@ wp.init()
 torch.set_num_threads(1)
 
 NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
+LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_run"}  # folders and modules of tests
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -83,31 +83,22 @@ def _configurations_are_read_once():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _coarse_pictures():
-    """Small pictures and figures without a layout, but for tests that look at them (`whole_pictures`)."""
+@pytest.fixture(scope="module", autouse=True)
+def _coarse_pictures(request):
+    """Small pictures and figures without a layout, but for tests that look at them."""
+    if {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES:
+        yield
+        return
     packed = render.packed
 
     def coarse(scene: render.RenderScene) -> bytes:
         return packed(replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
-    def unsettled(figure: Figure) -> None:
-        figure.set_layout_engine("none")
-
-    def coarse_png(figure: Figure, path: Path) -> None:
-        figure.savefig(path, format="png", dpi=20)
-
     with pytest.MonkeyPatch.context() as patch:
-        before = {place: getattr(*place) for place in ((render, "packed"), (figures, "settle"), (figures, "save_png"))}
-        for (module, name), function in zip(before, (coarse, unsettled, coarse_png), strict=True):
-            patch.setattr(module, name, function)
-        yield before
-
-
-@pytest.fixture
-def whole_pictures(_coarse_pictures, monkeypatch):
-    for (module, name), function in _coarse_pictures.items():
-        monkeypatch.setattr(module, name, function)
+        patch.setattr(render, "packed", coarse)
+        patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
+        patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
+        yield
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import logging
 import sys
 from pathlib import Path
 
@@ -45,6 +46,8 @@ def end_of(program, *arguments):
             code = end.code
         finally:
             sys.argv = argv
+            for name in logging.root.manager.loggerDict:
+                logging.getLogger(name).disabled = False  # Hydra's logging of one run silences those of others.
     return code, err.getvalue()
 
 

@@ -6,7 +6,7 @@ from .matrices import polar_rotation
 
 wp.set_module_options({"enable_backward": False})
 
-SMALLEST = wp.constant(wp.float64(1.0e-30))  # determinant of a gradient without a rotation, from the mean of cells
+SMALLEST = wp.constant(wp.float64(1.0e-30))  # of determinants; gradients are scaled by the mean volume of cells
 THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
 
 

@@ -59,6 +59,17 @@ def test_a_matrix_that_single_precision_makes_indefinite_has_a_direction(solver)
     np.testing.assert_allclose(direction.numpy() @ dense, right, atol=1e-9)
 
 
+def test_a_factor_is_kept_where_low_rank_columns_vanish(solver):
+    (first, values), (second, others) = matrix(0), matrix(1)
+    both, right = torch.cat([values, others]), RIGHT[:, :, 0].repeat(2, 1)
+    before = solver.direction_factor(both, columns=torch.ones(2, NODES, 1, dtype=torch.float64))
+    factor = solver.direction_factor(both, idle=torch.tensor([True, False]), before=before)
+    directions = right.clone()
+    factor.solve_in_place(directions)
+    expected = [np.linalg.solve(dense, RIGHT[0, :, 0].numpy()) for dense in (first, second)]
+    np.testing.assert_allclose(directions.numpy(), expected, rtol=0.0, atol=1e-5 * np.abs(expected).max())
+
+
 def test_an_indefinite_matrix_has_a_solution_but_no_direction(solver):
     dense, values = matrix(2, shift=0.0)
     assert solver.direction_factor(values).failed.all()

@@ -50,26 +50,27 @@ class Corotation:
         self._compute = p.capture(*commands)
         self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), own, [since]))
 
-    def begin(self, active: torch.Tensor | None = None) -> None:
+    def record(self, active: torch.Tensor | None = None) -> None:
         """Records the rotations at the potential's positions as those of new factors of environments (B,), or all."""
-        self._update()
+        self._compute_rotations()
         now = self._rotation[:, self._vertices]
-        self._before.copy_(now if active is None else torch.where(active[:, None, None, None], now, self._before))
-        self._potential.launch(self._compare)
+        active = torch.ones_like(now[:, 0, 0, 0], dtype=torch.bool) if active is None else active
+        self._before.copy_(torch.where(active[:, None, None, None], now, self._before))
+        self._since[active] = torch.eye(3, device=now.device, dtype=now.dtype)
 
-    def follow(self) -> None:
+    def update(self) -> None:
         """Computes the rotations from the factors' positions to the potential's."""
-        self._update()
+        self._compute_rotations()
         self._potential.launch(self._compare)
 
-    def _update(self) -> None:
+    def _compute_rotations(self) -> None:
         self._sum.zero_()
         self._potential.launch(self._compute)
 
-    def turn_back(self, vectors: torch.Tensor) -> None:
-        """Turns vectors (B, F, 3) back to the factors' positions, in place."""
+    def rotate_back(self, vectors: torch.Tensor) -> None:
+        """Rotates vectors (B, F, 3) back to the factors' positions, in place."""
         vectors.copy_((self._since.mT @ vectors[..., None].double())[..., 0])
 
-    def turn(self, vectors: torch.Tensor) -> None:
-        """Turns vectors (B, F, 3) with the body, in place."""
+    def rotate(self, vectors: torch.Tensor) -> None:
+        """Rotates vectors (B, F, 3) with the body, in place."""
         vectors.copy_((self._since @ vectors[..., None].double())[..., 0])

@@ -53,7 +53,7 @@ class HessianApproximation(ABC):
         """
 
     @abstractmethod
-    def follow(self) -> None:
+    def adapt(self) -> None:
         """Adapts the last factors to the potential's positions, if that is cheap."""
 
     @abstractmethod
@@ -90,9 +90,9 @@ class ExactHessian(HessianApproximation):
         self.vertex_at = pattern.free[linear.order]
         self._order = torch.as_tensor(self.vertex_at, device=potential.device)
         self._coupled: CouplingSolver | None = None
-        turns = linear.lasting and not potential.has_pairs
-        self._corotation = Corotation(potential, self.vertex_at) if turns else None
-        self._kept: Factor | None = None  # factor of `iterate`
+        rotates = linear.keeps_factors and not potential.has_pairs
+        self._corotation = Corotation(potential, self.vertex_at) if rotates else None
+        self._kept: Factor | None = None  # factor of `solve_with_kept_factor`
         self._solutions, self._iterations = 0, 0  # with it; the factor counts as `_FACTOR` iterations
         # Numbers of the free and, behind them, the dependent vertices; -1 for fixed ones.
         free, depends = torch.as_tensor(pattern.free, device=potential.device), potential.coordinates
@@ -131,7 +131,7 @@ class ExactHessian(HessianApproximation):
         factor = self.linear.factor if self._potential.has_pairs else self.linear.direction_factor
         self._factor = factor(values, columns=columns, idle=None if active is None else ~active, before=self._factor)
         if self._corotation is not None:
-            self._corotation.begin(active)
+            self._corotation.record(active)
         if self._coupled is not None:
             self._coupled.forget(active)
 
@@ -144,25 +144,39 @@ class ExactHessian(HessianApproximation):
         """Factorises the Hessian without clamping, for `solve`."""
         self.clamped.zero_()
         self._potential.update_tangent()
-        self._factor = self.linear.factor(self.assembly(), columns=self._columns(), before=self._factor)
+        self._factor = self.linear.factor(self.assembly(), columns=self._columns())
         if self._factor.failed.any():
-            self._factor = self.linear.factor(self.assembly(), False, self._columns(), before=self._factor)
+            self._factor = self.linear.factor(self.assembly(), False, self._columns())
         if self._coupled is not None:
             self._coupled.forget()
 
-    def iterate(self, right: torch.Tensor) -> torch.Tensor | None:
+    def solve_with_kept_factor(self, rights: Sequence[torch.Tensor]) -> list[torch.Tensor] | None:
         """Returns solutions (B, N, 3) for right-hand sides by conjugate gradients with the factor of an earlier state.
 
-        The factor is replaced where the iterations do not converge, and after a solution that took longer than the mean
-        of all with this factor, including the time of the factor: later replacement would increase that mean.
+        Their last digits depend on which factor that is, and so on earlier solutions. The factor is replaced where the
+        iterations do not converge, and after a solution that took longer than the mean of all with this factor,
+        including the time of the factor: later replacement would increase that mean.
 
         Returns:
-            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if factors of
-            the linear solver do not last.
+            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if the linear
+            solver does not keep factors.
         """
-        p, corotation = self._potential, self._corotation
-        if corotation is None or p.couples_cells:
+        if self._corotation is None or self._potential.couples_cells:
             return None
+        self._potential.update_tangent()
+        self._corotation.update()
+        solutions = []
+        for right in rights:
+            size = right.flatten(1).norm(dim=1)[:, None, None]
+            size = torch.where(size > 0.0, size, 1.0)  # residuals are rounded to float32
+            solution = self._solved_with_kept_factor(right / size, self._corotation)
+            if solution is None:
+                return None
+            solutions.append(solution * size)
+        return solutions
+
+    def _solved_with_kept_factor(self, right: torch.Tensor, corotation: Corotation) -> torch.Tensor | None:
+        p = self._potential
 
         def product(x: torch.Tensor) -> torch.Tensor:
             return p.restrict(p.stiffness_product(x) + p.inertia[..., None] * x)
@@ -172,14 +186,12 @@ class ExactHessian(HessianApproximation):
             self.solve_in_place(own, self.clamped)
             return torch.zeros_like(x).index_copy_(1, self._order, own)
 
-        p.update_tangent()
-        corotation.follow()
         for renews in [True] if self._kept is None else [False, True]:
             if renews:
                 self._kept = self.linear.direction_factor(self.assembly())
                 if self._kept.failed.any():
                     break
-                corotation.begin()
+                corotation.record()
                 self._solutions, self._iterations = 0, _FACTOR
             self._factor = self._kept
             iterate = conjugate_gradients(product, precondition, right, _EXACT, _MOST_ITERATIONS)
@@ -193,19 +205,19 @@ class ExactHessian(HessianApproximation):
         return None
 
     @override
-    def follow(self) -> None:
+    def adapt(self) -> None:
         if self._corotation is not None:
-            self._corotation.follow()
+            self._corotation.update()
 
     @override
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
         if self._factor is None:
             raise RuntimeError("refactor before solve")
         if self._corotation is not None:
-            self._corotation.turn_back(right)
+            self._corotation.rotate_back(right)
         self._factor.solve_in_place(right.flatten(1))
         if self._corotation is not None:
-            self._corotation.turn(right)
+            self._corotation.rotate(right)
         if self._potential.has_pairs:
             self._correct(self._potential.pair_tangents(True, needed), right.flatten(1)[:, :, None], self.linear.dofs)
 
@@ -358,7 +370,7 @@ class ProjectiveHessian(HessianApproximation):
         self._factor = self._linear.direction_factor(values.to(self._linear.dtype))
 
     @override
-    def follow(self) -> None:
+    def adapt(self) -> None:
         """Does nothing, as the matrix does not depend on the positions."""
 
     @override

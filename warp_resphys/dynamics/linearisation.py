@@ -18,7 +18,7 @@ from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
 from .equilibrium import Workspace
 
-_FEW = 4  # right-hand sides up to which a factor of another state may be cheaper
+_MOST_COLUMNS = 4  # right-hand sides up to which a factor of another state may be cheaper
 
 
 class Linearisation:
@@ -85,7 +85,7 @@ class Linearisation:
             solution = None
             if not self._has_factor:
                 self._potential.positions.copy_(self._at)
-                solution = self._iterated(fields) if 0 < fields.shape[3] <= _FEW else None
+                solution = self._solved_with_kept_factor(fields) if 0 < fields.shape[3] <= _MOST_COLUMNS else None
                 if solution is None:
                     hessian.refactor_exact()
                     self._has_factor = True
@@ -93,15 +93,11 @@ class Linearisation:
                 solution = hessian.solve(fields.flatten(1, 2)).unflatten(1, (-1, 3))
         return self._coordinates.expand(solution).flatten(1, 2)
 
-    def _iterated(self, fields: torch.Tensor) -> torch.Tensor | None:
-        """Returns solutions (B, N, 3, m) by `ExactHessian.iterate`, or None."""
-        columns = []
-        for field in fields.unbind(3):
-            column = self._workspace.hessian(self._name).iterate(self._potential.restrict(field.double()))
-            if column is None:
-                return None
-            columns.append(column.to(fields))
-        return torch.stack(columns, 3)
+    def _solved_with_kept_factor(self, fields: torch.Tensor) -> torch.Tensor | None:
+        """Returns solutions (B, N, 3, m) by `ExactHessian.solve_with_kept_factor`, or None."""
+        hessian, columns = self._workspace.hessian(self._name), fields.double().unbind(3)
+        solutions = hessian.solve_with_kept_factor([self._potential.restrict(column) for column in columns])
+        return None if solutions is None else torch.stack(solutions, 3).to(fields)
 
     def update(self, x: torch.Tensor) -> None:
         """Prepares H at x for `product` and `shifted`, without a factor."""

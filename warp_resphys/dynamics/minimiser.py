@@ -208,7 +208,7 @@ class Minimiser:
         try:
             state = self.begin(start)
             if state.directions > state.factors:
-                self._hessian.follow()
+                self._hessian.adapt()
             while state.active:
                 if state.factors:
                     self.refactor(state)

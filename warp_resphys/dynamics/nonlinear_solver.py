@@ -52,7 +52,7 @@ class SolverSettings:
     memory: int = 12  # number of L-BFGS pairs
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` refactorises
     linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse``, ``multigrid``, ...
-    factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32, as ``pardiso`` has them in any case
+    factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32; see ``factors`` in docs/settings.md
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and continue
 
     def __post_init__(self) -> None:
@@ -134,12 +134,12 @@ class NonlinearSolver:
             linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
             self.hessian = ExactHessian(potential, pattern, linear)
         # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
-        quasi = 0 if linear.iterates else settings.refactor_after * (_PATIENCE if linear.lasting else 1)
+        quasi = 0 if linear.iterates else settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
         self._minimiser = Minimiser(
             potential,
             self.hessian,
-            torch.float32 if linear.lasting and not potential.couples_cells else factors,
+            torch.float32 if linear.keeps_factors and not potential.couples_cells else factors,
             memory=0 if after[settings.name] == 0 else settings.memory,
             relative_tolerance=settings.relative_tolerance,
             absolute_tolerance=settings.absolute_tolerance,

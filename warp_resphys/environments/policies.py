@@ -19,6 +19,7 @@ from .vector import Observation, RobotVectorEnv
 Policy = Callable[[Observation], NDArray[np.float32]]
 
 _UPDATE: Final = 2048  # actions of all robots between updates of the policy, at most
+_BATCH: Final = 512  # actions, at most
 _NETWORK: Final = 128  # width of the policy's layers
 _ORDER: Final = 2  # of the polynomial from actions to equilibria
 _EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
@@ -107,7 +108,7 @@ def learn(
 
     Args:
         environment: with ``autoreset_mode`` SAME_STEP.
-        steps: total number of actions of all robots.
+        steps: total number of actions of all robots, at least; each robot makes eight or more.
         seed: of the network and of the sampled actions.
         on_progress: called with the number of further actions done.
 
@@ -133,13 +134,16 @@ def learn(
             on_progress(environment.num_envs)
             return True
 
-    count = max(min(steps, _UPDATE) // environment.num_envs, 8)
+    robots = environment.num_envs
+    count = max(min(-(-steps // robots), _UPDATE // robots), 8)
+    batches = -(-count * robots // _BATCH)
+    count = -(-count // batches) * batches  # so that all batches have one size
     with threads_for(_NETWORK):
         model = PPO(
             "MlpPolicy",
             Robots(environment),
             n_steps=count,
-            batch_size=min(512, count * environment.num_envs),
+            batch_size=count * robots // batches,
             n_epochs=6,
             gamma=0.95,
             learning_rate=5e-4,

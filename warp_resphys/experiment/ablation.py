@@ -198,9 +198,9 @@ def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDAr
 
 def report_ablation(context: StageContext) -> None:
     """Writes report.html and its figure."""
-    run: RunSettings = context.settings.config
-    from ..report.ablation_page import write_ablation_report
+    from ..report.ablation_page import write_ablation_report  # matplotlib
 
+    run: RunSettings = context.settings.config
     body = build_body(run)
     mesh, fixed = body.mesh, body.fixed_vertices
     surface = surface_vertices(mesh)

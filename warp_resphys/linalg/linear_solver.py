@@ -182,7 +182,7 @@ class LinearSolver(ABC):
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
         iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
-        lasting: whether a factor takes as long as dozens of solutions, so that it is kept for many states.
+        keeps_factors: whether a factor takes as long as dozens of solutions, so that it is kept for many states.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
 
@@ -191,7 +191,7 @@ class LinearSolver(ABC):
     order: Indices
     overwrites = False
     iterates = False
-    lasting = False
+    keeps_factors = False
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
+from .linear_solver import CorrectedFactor, Factor, Indices, LinearSolver, Mask, SeparateFactors
 
 _ANALYSIS, _FACTOR, _SOLVE, _RELEASE = 11, 22, 33, -1  # phases
 _NO_MEMORY = -2  # error
@@ -29,7 +29,7 @@ class PardisoSolver(LinearSolver):
     are kept for long. A solution takes as long as reading the factor from memory, and half as long in single precision.
     """
 
-    lasting = True
+    keeps_factors = True
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
@@ -43,6 +43,7 @@ class PardisoSolver(LinearSolver):
         starts = np.searchsorted(row[order], np.arange(self.n + 1))
         self._pattern = (starts.astype(np.int32), column[order].astype(np.int32))  # CSR of the upper triangle
         self._rooms: dict[tuple[object, ...], _Room] = {}
+        self._needs_double: set[tuple[int, int]] = set()  # environments that once had no factor in float32
 
     @override
     def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
@@ -61,16 +62,25 @@ class PardisoSolver(LinearSolver):
     ) -> Factor:
         if columns is not None:  # Rounding errors along C would be amplified.
             return self.factor(values, True, columns, idle, before)
+        kept = before.factor if isinstance(before, CorrectedFactor) else before
 
         def factorise(number: int, own: torch.Tensor) -> _System | None:
-            room = (len(values), number)
-            return self._system(room, own.float(), True) or self._system(room, own, True)
+            environment = (len(values), number)
+            if environment not in self._needs_double:
+                if system := self._system(environment, own.float(), True):
+                    return system
+                if own.dtype == torch.float32:
+                    return None
+            system = self._system(environment, own, True)
+            if system is not None:
+                self._needs_double.add(environment)
+            return system
 
-        return _Systems(self, values, factorise, idle, before)
+        return _Systems(self, values, factorise, idle, None if idle is None else kept)
 
     def _system(self, environment: tuple[int, int], own: torch.Tensor, definite: bool) -> "_System | None":
         """Returns the factorised matrix of an environment's values, or None if it has no factor."""
-        values = own.detach().numpy().copy()
+        values = own.detach().clone().numpy()
         key = (*environment, definite, own.dtype)
         if key not in self._rooms:
             self._rooms[key] = _Room(self._pattern, values, definite)

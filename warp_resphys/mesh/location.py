@@ -44,7 +44,10 @@ def locate(mesh: Mesh, points: FloatArray) -> Location:
     parts = [
         _located(mesh.element, nodes, low, high, points[k : k + _TOGETHER]) for k in range(0, len(points), _TOGETHER)
     ]
-    return Location(*map(np.concatenate, zip(*parts, strict=True))) if parts else Location(*np.zeros((5, 0)))
+    if not parts:
+        none, k = np.zeros(0), mesh.cells.shape[1]
+        return Location(np.zeros(0, dtype=np.int64), np.zeros((0, k)), np.zeros((0, k, 3)), none, none)
+    return Location(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _located(

@@ -244,7 +244,8 @@ class SolveSettings(Settings):
     )
     factors: Literal["double", "single"] = setting(
         "double",
-        "precision of factors and L-BFGS pairs (pardiso: single); residuals, states and gradients stay accurate",
+        "precision of factors and L-BFGS pairs (pardiso, but for tendons and contact: single); residuals, states and "
+        "gradients stay accurate",
     )
     on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
 

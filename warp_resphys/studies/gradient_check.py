@@ -136,10 +136,10 @@ def check_gradients(
         seed: of the random directions and functional.
         change: factor of the largest changes; less than one where second derivatives jump, as those of sliders do.
         names: of the inputs and parameters that are compared, with `q` and `v` of the start; None for all.
-        together: whether inputs and parameters of one shape change at the same time, by amounts that contribute the
-            same, which takes a fraction of the time. The difference of a row is then that of all less the adjoints of
-            the others: a wrong derivative shows in all rows of its shape. Derivatives below a thousandth of the
-            largest are compared alone.
+        together: whether inputs and parameters of one shape change at the same time, by amounts that contribute
+            about the same, which takes a fraction of the time. The difference of a row is then that of all less the
+            adjoints of the others: a wrong derivative shows in all rows of its shape. Derivatives below a thousandth of
+            the largest are compared alone.
 
     Returns:
         A row for initial positions, initial velocities, each input and each parameter. Parameters are checked as one
@@ -236,9 +236,12 @@ class _Problem:
         return [row for group in groups if group for row in self._rows(cases, adjoints, group)]
 
     def _rows(self, cases: Sequence[_Case], adjoints: Sequence[float], group: Sequence[int]) -> Iterator[GradientRow]:
-        """Rows of the cases of a group, which change together by amounts that contribute the same."""
+        """Rows of the cases of a group, which change together by amounts that contribute about the same."""
         least = min(abs(adjoints[k]) for k in group)
         shares = {k: least / adjoints[k] if adjoints[k] else 1.0 for k in group}
+        if len(group) > 1:  # at random, so that wrong derivatives do not cancel
+            factors = 0.5 + 0.5 * torch.rand(len(group), generator=self.random)
+            shares = {k: share * float(factor) for (k, share), factor in zip(shares.items(), factors, strict=True)}
 
         def loss(step: float) -> float:
             return float(self.loss(cases, [step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)]))

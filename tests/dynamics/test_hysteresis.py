@@ -303,7 +303,8 @@ class TestGradients:
     def test_of_a_roll_out(self, start, poissons_ratio, integrator):
         material = replace(TWO_SLIDERS, mass_damping=0.5, poissons_ratio=poissons_ratio)
         simulator = Simulator(CLAMPED, material, integrator=integrator, solver=TIGHT)
-        rows = {row.parameter: row for row in check_gradients(simulator, start, change=1e-3)}
+        compared = check_gradients(simulator, start, change=1e-3, together=False)
+        rows = {row.parameter: row for row in compared}
         assert {"hysteresis_ratio_2, each environment", "hysteresis_strain_1, each environment"} <= rows.keys()
         assert {name: row for name, row in rows.items() if not row.relative_error < 3e-6} == {}
 

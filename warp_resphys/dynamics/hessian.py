@@ -150,6 +150,11 @@ class ExactHessian(HessianApproximation):
         if self._coupled is not None:
             self._coupled.forget()
 
+    @property
+    def keeps_factor(self) -> bool:
+        """Whether a factor may serve several states (`solve_with_kept_factor`)."""
+        return self._corotation is not None and not self._potential.couples_cells
+
     def solve_with_kept_factor(self, rights: Sequence[torch.Tensor]) -> list[torch.Tensor] | None:
         """Returns solutions (B, N, 3) for right-hand sides by conjugate gradients with the factor of an earlier state.
 
@@ -158,8 +163,8 @@ class ExactHessian(HessianApproximation):
         including the time of the factor: later replacement would increase that mean.
 
         Returns:
-            None if the Hessian is not positive definite, if energies couple vertices of many cells, or if the linear
-            solver does not keep factors.
+            None if the Hessian is not positive definite, or without `keeps_factor`: where energies couple vertices of
+            many cells, and for linear solvers whose factors are cheap.
         """
         if self._corotation is None or self._potential.couples_cells:
             return None

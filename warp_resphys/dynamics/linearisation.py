@@ -73,9 +73,15 @@ class Linearisation:
         return self._potential.residual.clone()
 
     def factorise(self, x: torch.Tensor) -> None:
-        """Prepares H at x (B, N, 3) [m] for `solve`, which makes its factor if it needs one, and for `product`."""
-        self.update(x)
-        self._at, self._has_factor = x.detach().clone(), False
+        """Prepares H at x (B, N, 3) [m] for `product` and `solve`, which makes an expensive factor if it needs one."""
+        hessian = self._workspace.hessian(self._name)
+        self._at, self._has_factor = x.detach().clone(), not hessian.keeps_factor
+        if hessian.keeps_factor:
+            self.update(x)
+            return
+        self._potential.positions.copy_(x)
+        with threads_for(self._unknowns):
+            hessian.refactor_exact()
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""

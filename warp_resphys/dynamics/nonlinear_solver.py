@@ -37,7 +37,7 @@ from .minimiser import Minimiser
 SolverName = Literal["projective_dynamics", "quasi_newton", "newton"]
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 FACTORS = ("double", "single")
-_PATIENCE = 3  # by which `SolverSettings.refactor_after` is multiplied for lasting factors
+_PATIENCE = 3  # by which `SolverSettings.refactor_after` is multiplied where factors are kept
 
 
 @dataclass(frozen=True)

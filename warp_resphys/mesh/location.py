@@ -10,7 +10,7 @@ from .mesh import FloatArray, IntArray, Mesh
 
 _ITERATIONS = 20
 _CANDIDATES = 12  # smallest number of cells searched for a point
-_TOGETHER = 256  # points
+_TOGETHER = 256  # points located at the same time
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
     finally:
         gmsh.finalize()
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGPIPE"):
-            # Its solids reset this signal, by which a closed pipe would end the process.
+            # gmsh's kernel of solids resets this signal to its default, by which a closed pipe ends the process.
             signal.signal(signal.SIGPIPE, signal.getsignal(signal.SIGPIPE))
     if not len(nodes):
         raise MeshError(f"gmsh made no tetrahedra of {what}: try another size.")

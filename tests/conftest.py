@@ -14,6 +14,7 @@ import torch
 import warp as wp
 from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 
+from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, figures, render
@@ -99,6 +100,11 @@ def _coarse_pictures(request):
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
         patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _loggers_are_enabled():
+    enable_loggers()
 
 
 @pytest.fixture

@@ -2,7 +2,9 @@
 
 import contextlib
 import io
+import logging
 import sys
+from collections.abc import Callable
 from typing import NamedTuple
 from unittest import mock
 
@@ -22,19 +24,33 @@ class Outcome(NamedTuple):
     err: str
 
 
-def outcome(*arguments: object) -> Outcome:
-    """Runs `warp-resphys` with these arguments in the working directory."""
+def enable_loggers() -> None:
+    """Undoes the silence after a run whose logging Hydra has disabled, which lasts in this process."""
+    logging.root.setLevel(logging.WARNING)
+    for name in logging.root.manager.loggerDict:
+        logging.getLogger(name).disabled = False
+
+
+def ended(program: Callable[[], object], *arguments: object) -> Outcome:
+    """Runs a program in this process, with its name as the first argument."""
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (
-        mock.patch.object(sys, "argv", ["warp-resphys", *map(str, arguments)]),
+        mock.patch.object(sys, "argv", list(map(str, arguments))),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
         try:
-            cli.main()
+            program()
         except SystemExit as end:
             code = end.code
+        finally:
+            enable_loggers()
     return Outcome(code, out.getvalue(), err.getvalue())
+
+
+def outcome(*arguments: object) -> Outcome:
+    """Runs `warp-resphys` with these arguments in the working directory."""
+    return ended(cli.main, "warp-resphys", *arguments)
 
 
 def refusal(*arguments: object) -> str:

@@ -1,15 +1,13 @@
 """A small main job by its command line: its settings, and the files of its run folder."""
 
 import contextlib
-import io
 import json
-import logging
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from support.command_line import ended
 from warp_resphys import cli, pipeline
 
 REPOSITORY = Path(__file__).parents[2]
@@ -37,18 +35,8 @@ IN_RUN = "hydra.run.dir=run"
 
 def end_of(program, *arguments):
     """Runs a program in this process, with its name as the first argument; returns exit code and stderr."""
-    err, argv, code = io.StringIO(), sys.argv, 0
-    sys.argv = list(arguments)
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
-        try:
-            program()
-        except SystemExit as end:
-            code = end.code
-        finally:
-            sys.argv = argv
-            for name in logging.root.manager.loggerDict:
-                logging.getLogger(name).disabled = False  # Hydra's logging of one run silences those of others.
-    return code, err.getvalue()
+    code, _, err = ended(program, *arguments)
+    return code, err
 
 
 @contextlib.contextmanager

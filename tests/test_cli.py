@@ -441,7 +441,7 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "\nexperiment: beam_" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.labels", ".io.pipes")
+        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.imports", ".io.labels", ".io.pipes")
         assert set(names) == {f"warp_resphys{name}" for name in ours}
         assert err == ""
 

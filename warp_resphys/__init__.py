@@ -6,8 +6,11 @@ Public names are imported when they are first used, so that importing the packag
 import importlib
 import importlib.util
 import re
+import sys
 from pathlib import Path
 from typing import Any
+
+from .io.imports import uncollected
 
 # In a copy of the repository without an editable installation, kernels/ and conf/ are next to this folder.
 if importlib.util.find_spec(f"{__name__}.kernels") is None:
@@ -25,7 +28,10 @@ def __getattr__(name: str) -> Any:
         return _version()
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
+    if (module := f"{__name__}.{_MODULES[name]}") not in sys.modules:
+        with uncollected():
+            importlib.import_module(module)
+    return getattr(sys.modules[module], name)
 
 
 def __dir__() -> list[str]:

@@ -8,6 +8,7 @@ import sys
 from . import __version__
 from .commands import COMMANDS, USER_ERROR, help_text, parse
 from .io.errors import InputError
+from .io.imports import uncollected
 from .io.pipes import ends_where_nobody_reads
 
 
@@ -32,7 +33,8 @@ def main() -> None:
             raise SystemExit(USER_ERROR) from None
         # Read when NumPy is imported. Its threads cost more than they save where others use the cores as well.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        from .launch import launch
+        with uncollected():
+            from .launch import launch
 
         launch(command, COMMANDS[command].function, arguments)
 

@@ -33,6 +33,7 @@ from yaml import MarkedYAMLError
 from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
+from .io.imports import uncollected
 from .io.labels import OWN_OPTIONS, run_label
 from .io.pipes import ends_where_nobody_reads
 from .io.settings import parse
@@ -71,8 +72,10 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
             with ends_where_nobody_reads():
-                with _never_collected():
+                gc.collect()  # What an earlier job of a sweep has left would be kept for good.
+                with uncollected():
                     run = getattr(import_module(f"{__package__}.{module}"), name)
+                gc.freeze()
                 settings, *_ = get_type_hints(run).values()
                 return run(parse(settings, values), folder)
         except Exception as error:
@@ -135,18 +138,6 @@ def _ends_as_after_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
-
-
-@contextmanager
-def _never_collected() -> Iterator[None]:
-    """Spares the garbage collector the objects of imported modules, whose search takes a fifth of the imports."""
-    gc.collect()  # What an earlier job of a sweep has left would be kept for good.
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
 
 
 def _sentence_of_warning(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from warp_resphys.io import atomic, fan_out, memory, pipes
+from warp_resphys.io import atomic, children, memory, pipes
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.machine import available_cores, hardware
 from warp_resphys.io.stages import run_lock
@@ -93,7 +93,7 @@ def test_files_are_written_where_folders_cannot_be_synchronised(tmp_path, monkey
 
 def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
-    with fan_out.interrupts_blocked():
+    with children.interrupts_blocked():
         pass
 
 

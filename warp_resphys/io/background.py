@@ -27,8 +27,9 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
+from .children import begin_worker, interrupts_blocked
 from .errors import ResphysError
-from .fan_out import WorkerError, WorkerFaultError, begin_work, end_with, interrupts_blocked
+from .fan_out import WorkerError, WorkerFaultError, begin_work
 from .memory import peak_memory_gib
 from .progress import print_line, print_to
 from .stages import Stage, StageContext, run_stage
@@ -58,7 +59,7 @@ class BackgroundProcess:
         for left in Path(context.run_dir).glob(f"{_FOLDER}*"):  # of a process that was killed
             shutil.rmtree(left, ignore_errors=True)
         folder = TemporaryDirectory(prefix=_FOLDER, dir=context.run_dir, ignore_cleanup_errors=True)
-        ends: Any = {"initializer": end_with, "initargs": (os.getpid(),)}
+        ends: Any = {"initializer": begin_worker, "initargs": (os.getpid(),)}
         executor = ProcessPoolExecutor(1, **ends)
         with interrupts_blocked():  # The process leaves Ctrl-C to this one.
             future = executor.submit(_work, stage, context, Path(folder.name))

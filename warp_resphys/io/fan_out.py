@@ -8,7 +8,6 @@ its own files, and return at once if it was finished.
 import json
 import logging
 import os
-import signal
 import socket
 import threading
 import time
@@ -26,6 +25,7 @@ import warp as wp
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
+from .children import begin_worker, end_imports, interrupts_blocked
 from .errors import InputError, ResphysError, ResphysWarning
 from .memory import WorkersMemory, forget_peak_memory, peak_memory_gib
 from .progress import be_quiet
@@ -38,7 +38,6 @@ _Status = tuple[int, dict[str, object]]  # units that a task has counted, and it
 _ATTEMPTS = 3
 _IDLE_SECONDS = 60.0  # after which an idle local worker ends
 _PROGRESS_SECONDS = 0.1  # interval of writing and of reading the progress
-_PARENT_SECONDS = 0.02  # interval at which a worker checks that its parent process lives
 _ANSWER_SECONDS = 10.0  # timeout of the connection to a cluster
 _LOST = {  # names of the errors that mean that a worker is lost
     *("BrokenProcessPool", "KilledWorker", "CommClosedError", "RayActorError"),
@@ -161,6 +160,7 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
 
 def begin_work() -> None:
     """Prepares a worker process: one thread of torch, and no warnings that the parent process has shown."""
+    end_imports()
     warnings.simplefilter("ignore", ResphysWarning)
     torch.set_num_threads(1)
     wp.config.log_level = wp.LOG_WARNING
@@ -232,7 +232,7 @@ def _followed(folder: Path, reported: dict[str, _Status], advance: Advance) -> I
 
 @contextmanager
 def _local(workers: Workers) -> Iterator[None]:
-    ends = {"initializer": end_with, "initargs": (os.getpid(),)}
+    ends = {"initializer": begin_worker, "initargs": (os.getpid(),)}
     with warnings.catch_warnings(), parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
         # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
@@ -240,30 +240,6 @@ def _local(workers: Workers) -> Iterator[None]:
             # loky ends a worker whose memory grows by 300 MB after its first call, which hence has all imports.
             Parallel(n_jobs=max(workers.count, 2))(delayed(begin_work)() for _ in range(workers.count))
         yield
-
-
-@contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Blocks Ctrl-C in processes that start meanwhile."""
-    if not hasattr(signal, "pthread_sigmask"):  # On Windows, Ctrl-C reaches the workers as well.
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def end_with(parent: int) -> None:
-    """Ends this process as soon as its parent has ended, whatever it is doing."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_PARENT_SECONDS)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 @contextmanager

@@ -1,4 +1,5 @@
 import contextlib
+import functools
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
@@ -12,10 +13,14 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra._internal.hydra import Hydra
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigSource
 
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
+from warp_resphys.io.settings import Settings
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, figures, render
 
@@ -71,16 +76,23 @@ def can_draw() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _configurations_are_read_once():
-    """The files of the package's own configuration, which every command reads anew."""
-    load, kept = ImportlibResourcesConfigSource.load_config, {}
+    """The files of the package's own configuration and the schemas of settings, which every command reads anew.
 
-    def read(self: ImportlibResourcesConfigSource, config_path: str) -> Any:
+    Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing here sets.
+    """
+    Plugins.instance()  # imports the classes of the sources anew
+    source, kept = SourcesRegistry.instance().resolve("pkg"), {}
+    load = source.load_config
+
+    def read(self: ConfigSource, config_path: str) -> Any:
         if (place := (self.path, config_path)) not in kept:
             kept[place] = load(self, config_path)
         return deepcopy(kept[place])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ImportlibResourcesConfigSource, "load_config", read)
+        patch.setattr(source, "load_config", read)
+        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
+        patch.setattr(Settings, "model_json_schema", classmethod(functools.cache(Settings.model_json_schema.__func__)))
         yield
 
 

@@ -5,6 +5,8 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
 
 import shutil
+import weakref
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -96,21 +98,53 @@ def _configurations_are_read_once():
         yield
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _coarse_pictures(request):
-    """Small pictures and figures without a layout, but for tests that look at them."""
-    if {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES:
-        yield
-        return
-    packed = render.packed
+@pytest.fixture(scope="session")
+def kept_renderers():
+    """Drawing processes that no report needs any more, which draw the next one."""
+    kept = []
+    yield kept
+    for process, messages in kept:
+        render._end(process, messages)
+
+
+@contextlib.contextmanager
+def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
+    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
+    packed, start, close = render.packed, render.Renderer._start, render.Renderer.close
+
+    def started(self: render.Renderer) -> None:
+        if kept_renderers:
+            self._process, self._messages = own = kept_renderers.pop()
+            self._end = weakref.finalize(self, render._end, *own)
+        else:
+            start(self)
+
+    def closed(self: render.Renderer) -> None:
+        if self._end is not None and self._process.poll() is None:
+            self._end.detach()
+            self._end = None
+            kept_renderers.append((self._process, self._messages))
+        else:
+            close(self)
 
     def coarse(scene: render.RenderScene) -> bytes:
         return packed(replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "packed", coarse)
+        patch.setattr(render.Renderer, "_start", started)
+        patch.setattr(render.Renderer, "close", closed)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
         patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
+        patch.setattr(figures, "themed_svg", lambda figure, name: b"<svg/>")
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _pictures(request, kept_renderers):
+    """Coarse pictures, but for tests that look at them."""
+    looks = {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES
+    with contextlib.nullcontext() if looks else coarse_pictures(kept_renderers):
         yield
 
 
@@ -132,10 +166,10 @@ def no_report():
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, kept_renderers):
     """A complete run with its report, and its files before and after a second run of the same command."""
     root = tmp_path_factory.mktemp("finished")
-    with contextlib.chdir(root):
+    with contextlib.chdir(root), coarse_pictures(kept_renderers):
         assert run(*TINY, IN_RUN)[0] == 0
         first = files()
         assert run(*TINY, IN_RUN)[0] == 0

@@ -41,8 +41,9 @@ def end_of(program, *arguments):
 
 @contextlib.contextmanager
 def without_reports():
-    """Replaces the reports, which take most of a tiny run's time and have tests of their own."""
+    """Replaces reports and estimates of durations, which take most of a tiny run's time and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "may_be_long", lambda stages, folder: False)
         for name in ("make_report", "make_folds_report"):
             patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
         yield

@@ -1,9 +1,11 @@
 """The main job with a network that is trained in a second process."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -78,22 +80,48 @@ def test_a_failure_is_one_sentence_and_keeps_the_reconstruction(folder, started)
     assert "reconstruct_resphys" not in ran(before)
 
 
-@pytest.mark.skipif(available_cores() < 2, reason="a second process needs a second core")
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=lambda sent: sent.name)
-def test_an_interruption_of_a_real_process_ends_both(folder, sent):
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    program += "from warp_resphys.cli import main\nmain()"
-    command = [sys.executable, "-c", program, *TINY, IN_RUN, "device=cpu", LONG]
-    child = subprocess.Popen(command, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    while child.poll() is None and not any("started" in path.read_text() for path in lines("run")):
-        time.sleep(0.05)
-    child.send_signal(sent)
-    err = child.communicate(timeout=100)[1]
-    assert child.returncode == 130, err
+def second_process_has_started():
+    return any("started" in path.read_text() for path in lines("run"))
+
+
+def check_both_ended(code, err):
+    assert code == 130, err
     assert "'train_simfree'" in err
     assert "Traceback" not in err, err
     assert json.loads(Path("run/stages/train_simfree.interrupted.json").read_text())["seconds"] > 0.0
     assert not [*Path("run").glob(".background_*")]
+
+
+@pytest.mark.skipif(available_cores() < 2, reason="a second process needs a second core")
+def test_an_interruption_of_a_real_process_ends_both(folder):
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += "from warp_resphys.cli import main\nmain()"
+    command = [sys.executable, "-c", program, *TINY, IN_RUN, "device=cpu", LONG]
+    child = subprocess.Popen(command, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    while child.poll() is None and not second_process_has_started():
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    err = child.communicate(timeout=100)[1]
+    check_both_ended(child.returncode, err)
+
+
+def test_the_end_that_a_cluster_asks_for_ends_both(folder, started):
+    ended = threading.Event()
+
+    def end():
+        while not ended.wait(0.05):
+            if second_process_has_started():
+                os.kill(os.getpid(), signal.SIGTERM)
+                return
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    try:
+        code, err = run(*TINY, IN_RUN, "device=cpu", LONG)
+    finally:
+        ended.set()
+        thread.join()
+    check_both_ended(code, err)
 
 
 def test_where_there_is_none(monkeypatch):

@@ -36,7 +36,7 @@ TINY = [
     *(
         "trainer={epochs:4,rollout_every:2,batch_size:16}",
         "network={position_modes:1,force_modes:2,width:8}",
-        "in_the_loop.epochs=2",
+        "in_the_loop.epochs=1",
         "simfree.network.position_modes=1",
     ),
     *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
@@ -133,7 +133,7 @@ def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     write(Path("recordings"), poses_of(recorded, recorded.tendons.changed(friction=0.3), STRONG))
     offsets = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
     friction = ["tendons.friction=0.05", "+identify.parameters.tendon_friction={lower:0.0,upper:1.0}"]
-    run_without_report(tmp_path, *TINY, *trials(STRONG), *offsets, *friction)
+    run_without_report(tmp_path, *TINY, *trials(STRONG), *offsets, *friction, "mesh_check=null")
     identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     assert identified["tendon_friction"] == pytest.approx(0.3, abs=0.02)
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
@@ -149,7 +149,7 @@ def test_poses_identify_where_tendons_end(tmp_path, monkeypatch):
     recorded = settings(*given, *trials(STRONG))
     write(Path("recordings"), poses_of(recorded, moved(recorded.tendons, ENDS, 1), STRONG))
     known = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
-    run_without_report(tmp_path, *given, *trials(STRONG), *known)
+    run_without_report(tmp_path, *given, *trials(STRONG), *known, "mesh_check=null")
     identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
     assert {name: identified[f"tendon_offset_2_{name}"] for name in ENDS} == pytest.approx(ENDS, abs=3e-4)
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.05)
@@ -188,12 +188,13 @@ def test_a_law_is_identified_from_poses(poses, tmp_path):
 
 
 def test_refinement_knows_no_sessions():
+    tentacle = ["experiment=tentacle", "mesh.layers=4", "mesh.nodes=20"]
     with pytest.raises(InputError, match=r"refinement knows one placement .* set refinement=none"):
-        check(composed("experiment=tentacle", "data.folder=recordings", "refinement=solver_in_the_loop"))
+        check(composed(*tentacle, "data.folder=recordings", "refinement=solver_in_the_loop"))
     with pytest.raises(InputError, match=r"per is session, but no trial names one: set data\.trials\.NAME\.session"):
         check(
             composed(
-                "experiment=tentacle",
+                *tentacle,
                 "data.folder=recordings",
                 "data.trials=null",
                 "+data.trials={one: {file: one.csv, inputs: [1.0, 0.0]}, other: {file: other.csv, inputs: [0.0, 1.0]}}",
@@ -312,7 +313,7 @@ def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(p
         f"{name}: {{file: {name}.csv, session: {sessions[name]}, inputs: {list(POSES[name])}}}" for name in POSES
     )
     training = ["data.train=[weak,strong,second,other]", "data.validation=[]", "in_the_loop.hold_out=false"]
-    quick = ["mesh_check=null", "in_the_loop.epochs=1", "trainer.epochs=1"]
+    quick = ["mesh_check=null", "trainer.epochs=1"]
     folder = run_without_report(tmp_path, *TINY, "data.trials=null", f"+data.trials={{{table}}}", *training, *quick)
     intervals = json.loads((folder / "errors.json").read_text())["intervals"]
     assert intervals["calibrated_on"] == "left_out"

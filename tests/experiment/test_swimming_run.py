@@ -25,7 +25,7 @@ TINY = [
     *("identify.max_evaluations=6", "~identify.parameters"),
     "+identify.parameters={tendon_contraction_factor: {lower: 0.3, upper: 3.0, logarithmic: true}}",
     "identify.first_guess={}",
-    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={width:8}", "in_the_loop.epochs=2"),
+    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={width:8}", "in_the_loop.epochs=1"),
     *("reconstruction.max_iterations=2", "parallel.processes=1"),
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]

@@ -46,6 +46,7 @@ TINY = [
     "correct_uncorrected=false",
     "simfree.trainer.epochs=10",
     "simfree.trainer.rollout_every=10",
+    "in_the_loop.epochs=1",
     "hydra/job_logging=none",
     "hydra/hydra_logging=none",
     IN_RUN,

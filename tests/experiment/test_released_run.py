@@ -67,6 +67,9 @@ FOLDS = [
     "data.trials.load52={file: m50.h5, payload: 0.05}",
     "~data.trials.load101",
     "identify.max_evaluations=3",
+    "identify.elastic=null",
+    "identify.landscape=false",
+    "correct_uncorrected=false",
     "in_the_loop.epochs=1",
     "parallel.processes=1",  # in this process, where no report is drawn
 ]

@@ -17,7 +17,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
 
 FACTOR = 1.3  # true over commanded contraction of the winch
-STEPS = 24
+STEPS = 16
 TINY = [
     "experiment=starfish_limb",
     *("mesh.layers=6", "mesh.nodes=20", "fixed.z=[-0.03,0.03]", "tendons.routes.limbs.pieces=3"),

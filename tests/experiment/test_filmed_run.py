@@ -23,6 +23,7 @@ PLAYED = [
     "data.simulated.size=[640,360]",
     "data.simulated.noise=0.5",
     "data.simulated.frames=24",
+    "identify.tolerance=1e-2",
     "data.train=[released,level]",
     "data.test=[]",
     "hydra/job_logging=none",

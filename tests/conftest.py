@@ -23,6 +23,7 @@ from hydra.plugins.config_source import ConfigSource
 
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
+from warp_resphys.io import atomic
 from warp_resphys.io.settings import Settings
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import bodies, figures, render
@@ -154,6 +155,15 @@ def _pictures(request, kept_renderers):
     """Coarse pictures, but for tests that look at them."""
     looks = {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES
     with contextlib.nullcontext() if looks else coarse_pictures(kept_renderers):
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_waits_for_the_disk(request):
+    """Files that outlive no loss of power, but where writing is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "io":
+            patch.setattr(atomic, "_sync", lambda path: None)
         yield
 
 

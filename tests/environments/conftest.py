@@ -3,7 +3,8 @@
 import pytest
 
 from support.main_job import IN_RUN, run_without_report
-from warp_resphys.environments.making import register
+from warp_resphys.control.reduction import fingerprint
+from warp_resphys.environments import making
 
 RUN = [
     "experiment=tendon_rod",
@@ -19,5 +20,20 @@ RUN = [
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    register()
+    making.register()
     return run_without_report(tmp_path_factory.mktemp("environments"), *RUN)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def sampled_places():
+    """The reachable places of every robot so far, which are not sampled again."""
+    sample, kept = making._reach, {}
+
+    def sampled(robot, *arguments):
+        if (key := fingerprint(robot) + repr(arguments)) not in kept:
+            kept[key] = sample(robot, *arguments)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(making, "_reach", sampled)
+        yield kept

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import get_args
 
-import jsonschema
 import pytest
+from jsonschema import Draft202012Validator, ValidationError
 from omegaconf import OmegaConf
 
 from warp_resphys.data.marker_view import FRAMES
@@ -29,16 +29,23 @@ def test_the_page_of_all_keys_is_current():
     assert (ROOT / "docs" / "settings.md").read_text(encoding="utf-8").rstrip() == page().rstrip()
 
 
+@pytest.fixture(scope="module")
+def editor():
+    schema = editor_schema()
+    Draft202012Validator.check_schema(schema)
+    return Draft202012Validator(schema)
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "conf" / "experiment").glob("*.yaml")), ids=lambda path: path.stem)
-def test_experiments_are_what_editors_expect(path):
+def test_experiments_are_what_editors_expect(path, editor):
     content = OmegaConf.to_container(OmegaConf.load(path))
     content = {key: group for key, group in content.items() if key not in ("mesh", "data")}  # their kind is elsewhere
-    jsonschema.validate(content, editor_schema())
+    editor.validate(content)
 
 
-def test_an_editor_marks_a_wrong_key():
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate({"trainer": {"epoch": 3}}, editor_schema())
+def test_an_editor_marks_a_wrong_key(editor):
+    with pytest.raises(ValidationError):
+        editor.validate({"trainer": {"epoch": 3}})
 
 
 def test_choices_in_the_settings_are_those_in_the_code():

@@ -1,4 +1,7 @@
-"""Tasks in several processes: results, lost workers, errors and interruption."""
+"""Tasks in several processes: results, lost workers, errors and interruption.
+
+Workers import this module. Tasks that need torch or a simulator import it, as it takes most of the start of a worker.
+"""
 
 import gc
 import os
@@ -11,15 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.catalogue import make_material
-from warp_resphys.fem.body import Body
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import WorkerError, WorkerFaultError, Workers, fan_out
 from warp_resphys.io.memory import WorkersMemory
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 
 CLUSTERS = {"ray": "ray", "dask": "distributed"}
 
@@ -33,6 +31,8 @@ def wait_until(condition, seconds=60.0):
 
 def work(task, advance):
     """Waits until a second worker has started."""
+    import torch
+
     folder, number = task
     (folder / f"worker_{os.getpid()}").touch()
     wait_until(lambda: len([*folder.glob("worker_*")]) > 1)
@@ -206,6 +206,11 @@ def test_workers_end_with_their_parent(tmp_path):
 
 def falls(steps, advance):
     """Positions of a beam after so many steps, computed in a worker."""
+    from warp_resphys.dynamics.simulator import Simulator
+    from warp_resphys.energies.catalogue import make_material
+    from warp_resphys.fem.body import Body
+    from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
     simulator = Simulator(body, make_material("corotated", youngs_modulus=2e5, poissons_ratio=0.45, density=1e3), 0.01)

@@ -1,4 +1,5 @@
 import errno
+import functools
 import logging
 import os
 import re
@@ -387,11 +388,16 @@ def test_every_documented_line_has_keys_that_exist():
                 assert all("." not in name or _is_key(name) for name in names), line
 
 
+@functools.cache
+def _patterns():
+    """Regular expressions of the dotted names of all keys of a run."""
+    return [key.replace(".", r"\.").replace("NAME", "[^.]+") for key in keys(RunSettings.model_json_schema())]
+
+
 def _is_key(name):
     """Whether a run has a key of a dotted name."""
-    patterns = [key.replace(".", r"\.").replace("NAME", "[^.]+") for key in keys(RunSettings.model_json_schema())]
     free = ("hydra.", "tune.", "simulation.", "target.", "laboratory.material.")  # not in the schema
-    return name.startswith(free) or any(re.fullmatch(pattern, name) for pattern in patterns)
+    return name.startswith(free) or any(re.fullmatch(pattern, name) for pattern in _patterns())
 
 
 class TestSettingsOfARun:

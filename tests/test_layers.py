@@ -1,6 +1,7 @@
 """The table in CONTRIBUTING.md says where every module is; imports point up it, and never in a circle."""
 
 import ast
+import functools
 import importlib
 import re
 from collections import Counter
@@ -14,6 +15,7 @@ PACKAGE = REPOSITORY / "warp_resphys"
 KERNELS = REPOSITORY / "kernels"
 
 
+@functools.cache
 def rows():
     """Row of each place in the table: `cli` for a module, `io/` for a folder."""
     text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -30,6 +32,7 @@ def place_of(name):
     return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf") else first
 
 
+@functools.cache
 def modules():
     """File and dotted name below the package of every module but the package's own file, which only hands out names."""
     found = {}
@@ -46,12 +49,13 @@ def modules():
     return found
 
 
+@functools.cache
 def imported(path):
     """Names below the package that a file imports from, and whether it does so when it is itself imported."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = ("warp_resphys", *modules()[path].split("."))
     package = package if path.name == "__init__.py" else package[:-1]
-    known = set(modules().values())
+    known, found = set(modules().values()), []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
@@ -63,7 +67,8 @@ def imported(path):
         for name in names:
             if name.startswith("warp_resphys."):
                 name = name.removeprefix("warp_resphys.")
-                yield name if name in known else name.rpartition(".")[0], node in tree.body
+                found.append((name if name in known else name.rpartition(".")[0], node in tree.body))
+    return found
 
 
 def test_every_module_has_its_place_and_every_place_a_module():

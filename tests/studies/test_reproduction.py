@@ -15,6 +15,7 @@ import pytest
 
 from support.command_line import configuration, settings_of
 from support.main_job import end_of
+from support.reproduced import runs_in_this_process
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.metrics import PUBLISHED_MM, PublishedError
@@ -42,6 +43,13 @@ def plan(*overrides):
 def run(*arguments):
     """Exit code of the command in this process, and what it wrote to stderr."""
     return end_of(cli.main, "warp-resphys", "reproduce", *arguments)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _runs_are_in_this_process():
+    """Other processes are tested by Ctrl-C below, and in `test_robots`."""
+    with runs_in_this_process():
+        yield
 
 
 @pytest.fixture(scope="module")

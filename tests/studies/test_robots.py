@@ -9,6 +9,7 @@ import pytest
 
 from support.command_line import configuration, settings_of
 from support.main_job import end_of
+from support.reproduced import runs_in_this_process
 from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
@@ -44,7 +45,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     root = tmp_path_factory.mktemp("robots")
-    with contextlib.chdir(root):
+    with contextlib.chdir(root), runs_in_this_process():
         (root / "shelf").mkdir()
         code, err = run(*ARGUMENTS, "only=[sopra,tentacle]", "data=shelf", "results=docs")
     assert (code, err[-500:] if code else "") == (0, "")

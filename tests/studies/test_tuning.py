@@ -224,19 +224,23 @@ class TestCrashes:
 
     def test_a_worker_process_is_killed(self, searched, folder, caplog):
         """Its trial is done by another one; so few trials are drawn without looking at others."""
-        killed = []
+        killed, ended = [], threading.Event()
 
         def kill():
-            while not killed:
-                killed.extend(at_work()[:1])
-                time.sleep(0.01)
-            os.kill(killed[0], signal.SIGKILL)
+            while not killed and not ended.wait(0.01):
+                killed.extend(process for process in at_work()[:1] if process != os.getpid())
+            for process in killed:
+                os.kill(process, signal.SIGKILL)
 
-        killer = threading.Thread(target=kill, daemon=True)
+        killer = threading.Thread(target=kill)
         killer.start()
-        code, err = run(*SEARCH, "parallel.processes=2", IN_RUN)
+        try:
+            code, err = run(*SEARCH, "parallel.processes=2", IN_RUN)
+        finally:
+            ended.set()
+            killer.join()
         assert code == 0, err
-        assert killed[0] != os.getpid()
+        assert len(killed) == 1
         assert "a worker process was lost" in caplog.text
         assert f"{TRIALS}/{TRIALS} trials" in err
         assert results() == results(searched / FOLDER)

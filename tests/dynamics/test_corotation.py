@@ -221,7 +221,7 @@ def test_a_factor_that_rotates_lasts_for_longer(monkeypatch):
         reports = sim.rollout(sim.rest_state(), 40).reports
         factors.append([sum(int(getattr(r, count)) for r in reports) for count in ("factorisations", "iterations")])
     assert factors[0][0] < factors[1][0]
-    assert factors[0][1] < factors[1][1]
+    assert factors[0][1] < 0.8 * factors[1][1]
 
 
 def test_an_environment_does_not_depend_on_the_others_in_its_batch():

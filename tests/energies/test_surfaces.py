@@ -583,14 +583,14 @@ def test_a_body_touches_itself(device):
 
 @pytest.mark.parametrize("rigid", ["", "layer", "whole"])
 def test_batch_is_what_its_environments_are_alone(rigid, device):
-    """Eight environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
+    """Sixteen environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)
-    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (8, 3)))
-    spin = torch.linspace(-4.0, 4.0, 8, dtype=torch.float64)
+    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (16, 3)))
+    spin = torch.linspace(-4.0, 4.0, 16, dtype=torch.float64)
     settings = SolverSettings(linear_solver="banded" if device == "cpu" else "tiled")
     together, alone = (landing(rigid=rigid, solver=settings, device=device) for _ in range(2))
-    path = together.rollout(thrown(together, velocity, spin, 8), 12)
-    for b in range(8):
+    path = together.rollout(thrown(together, velocity, spin, 16), 12)
+    for b in range(16):
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
         if device == "cpu":
             assert torch.equal(own.q[:, 0], path.q[:, b])

@@ -55,9 +55,9 @@ def outcome(*arguments: object) -> Outcome:
 
 def refusal(*arguments: object) -> str:
     """The sentence with which a command refuses its arguments."""
-    ended = outcome(*arguments)
-    assert ended.code == 2, ended.out
-    return ended.err
+    refused = outcome(*arguments)
+    assert refused.code == 2, refused.out
+    return refused.err
 
 
 def configuration(name: str, *overrides: str) -> dict:

@@ -1,4 +1,4 @@
-"""How worker processes begin and end.
+"""Start and end of worker processes.
 
 They import this module before any large library, so that it imports none itself.
 """

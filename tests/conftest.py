@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
-from hydra._internal import defaults_list
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
@@ -82,8 +81,7 @@ def can_draw() -> None:
 def _configurations_are_read_once():
     """The files of the package's own configuration and the schemas of settings, which every command reads anew.
 
-    Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing here sets, and does
-    not collect what names in lists of defaults may refer to where none refers to anything.
+    Hydra does not compose a configuration twice, the first time to read `hydra.mode`, which nothing here sets.
     """
     Plugins.instance()  # imports the classes of the sources anew
     source, kept = SourcesRegistry.instance().resolve("pkg"), {}
@@ -94,15 +92,8 @@ def _configurations_are_read_once():
             kept[place] = load(self, config_path)
         return deepcopy(kept[place])
 
-    collect = defaults_list._create_interpolation_map
-
-    def collected(overrides: Any, entries: list[Any], self_added: bool) -> Any:
-        refers = any(entry.is_interpolation() for entry in entries)
-        return collect(overrides, entries, self_added) if refers else None
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "load_config", read)
-        patch.setattr(defaults_list, "_create_interpolation_map", collected)
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         patch.setattr(Settings, "model_json_schema", classmethod(functools.cache(Settings.model_json_schema.__func__)))
         yield

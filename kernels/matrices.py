@@ -1,10 +1,10 @@
-"""Functions of one 3x3 matrix: cofactor, polar rotation, nearest unimodular matrix, signed SVD."""
+"""Functions of one 3x3 matrix: cofactor, polar rotation, signed SVD."""
 
 import warp as wp
 
 # Squared norm of the last update at which an iteration has converged to rounding; Newton's converges quadratically.
-UPDATE_TOLERANCE, NEWTON_TOLERANCE = wp.float64(1.0e-30), wp.float64(1.0e-16)
-SINGULAR, NEARLY_A_LINE, ROUNDING = wp.float64(1.0e-12), wp.float64(1.0e-3), wp.float64(1.0e-32)
+NEWTON_TOLERANCE = wp.float64(1.0e-16)
+SINGULAR, ROUNDING = wp.float64(1.0e-12), wp.float64(1.0e-32)
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 
 
@@ -111,27 +111,3 @@ def signed_svd(f: wp.mat33d):
     stretch = wp.transpose(r) * f
     v, s = symmetric_eigen(HALF * (stretch + wp.transpose(stretch)))
     return r * v, s, v
-
-
-@wp.func
-def nearest_unimodular(f: wp.mat33d) -> wp.mat33d:
-    """The matrix D with det D = 1 that minimises ||F - D||.
-
-    Successive projection of F on the tangent plane of {det D = 1} at the last D: at convergence F - D is normal to that
-    surface, which is the stationarity condition (Bouaziz et al. 2014, section 5.2). The start is F, or the rotation of
-    F if F is nearly a line or a point and its own tangent plane is undefined. For an inverted F the result may be
-    another stationary point.
-    """
-    d = f
-    c = cofactor(f)
-    if wp.ddot(c, c) < NEARLY_A_LINE:
-        d = polar_rotation(f)
-    for _ in range(60):
-        c = cofactor(d)
-        offset = wp.ddot(c, d - f) - (wp.ddot(c, d) / wp.float64(3.0) - ONE)
-        step = (f - d) + (offset / (wp.ddot(c, c) + SINGULAR)) * c
-        d += step
-        update = wp.ddot(step, step)
-        if update < UPDATE_TOLERANCE:
-            break
-    return d

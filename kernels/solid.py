@@ -44,6 +44,23 @@ def strain_adjoint(
 
 
 @wp.func
+def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
+    """2 mu E + lambda e I."""
+    t = volume * dilation
+    return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
+
+
+@wp.func
+def viscous_response(f: wp.mat33d, lame: wp.vec2d, c: wp.vec2d, offset: wp.mat33d, dilation_offset: wp.float64):
+    """Returns energy and stress by viscosity (`energies.viscosity`), with mu and lambda times the point's volume."""
+    strain = green_strain(f)
+    dilation = wp.trace(strain)
+    left, rest = c[0] * strain - offset, c[1] * dilation - dilation_offset
+    energy = lame[0] * wp.ddot(left - offset, strain) + HALF * lame[1] * (rest - dilation_offset) * dilation
+    return energy, f * isotropic(left, rest, lame[0], lame[1])
+
+
+@wp.func
 def add_strain_tangent(
     f: wp.mat33d, stress: wp.mat33d, shape: wp.float64, volume: wp.float64, out: wp.array[wp.mat33d]
 ):
@@ -79,12 +96,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     dissipation = getattr(law, "dissipation", None)
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
-    @wp.func(module=module)
-    def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
-        """2 mu E + lambda e I."""
-        t = volume * dilation
-        return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
-
     @wp.kernel(module=module, launch_bounds=BOUNDS)
     def local_step(
         active: wp.array[int],  # (B) zero: skip the environment
@@ -111,18 +122,16 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             energy, stress = response(f, m)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
-            shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
-            strain = green_strain(f)
-            dilation = wp.trace(strain)
-            left, rest = c[0] * strain - strain_offset[b, p], c[1] * dilation - dilation_offset[b, p]
+            lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
             if wp.static(shares):
+                left = c[0] * green_strain(f) - strain_offset[b, p]
                 phi = dissipation(wp.ddot(left, left), shared[b])
-                energy += shape * phi[0] / c[0]
-                left = phi[1] * left
-            else:
-                energy += shape * wp.ddot(left - strain_offset[b, p], strain)
-            energy += HALF * bulk * (rest - dilation_offset[b, p]) * dilation
-            stress += f * isotropic(left, rest, shape, bulk)
+                energy += lame[0] * phi[0] / c[0]
+                stress += f * ((TWO * lame[0] * phi[1]) * left)
+                lame[0] = ZERO
+            added = viscous_response(f, lame, c, strain_offset[b, p], dilation_offset[b, p])
+            energy += added[0]
+            stress += added[1]
         stress_out[b, p] = stress
         energy_out[b, p] = energy
 

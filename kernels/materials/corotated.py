@@ -6,10 +6,12 @@ has the trace ``3 e``: for small strains the second term is that of linear elast
 
 import warp as wp
 
-from ..matrices import nearest_unimodular, polar_rotation, signed_svd
+from ..matrices import polar_rotation, signed_svd
 from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
+from ..unimodular import unimodular_offset
 
 NAME, LAME = "corotated", ((1.0, 0.0), (0.0, 1.0 / 3.0))
+TOGETHER = True  # the shape term is that of `kernels.lanes`
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 
 moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
@@ -25,7 +27,7 @@ def response(f: wp.mat33d, m: moduli):
         energy += m[0] * wp.ddot(offset, offset)
         stress += (TWO * m[0]) * offset
     if m[1] != ZERO:
-        offset = f - nearest_unimodular(f)
+        offset = unimodular_offset(f)
         energy += HALF * m[1] * wp.ddot(offset, offset)
         stress += m[1] * offset
     return energy, stress
@@ -38,7 +40,7 @@ def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
     if carried[0] != ZERO:
         result[0] = TWO * wp.ddot(f - polar_rotation(f), df)
     if carried[1] != ZERO:
-        result[1] = wp.ddot(f - nearest_unimodular(f), df)
+        result[1] = wp.ddot(unimodular_offset(f), df)
     return result
 
 
@@ -98,7 +100,7 @@ def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
         u, s, v = signed_svd(f)
         d = s
         if m[1] != ZERO:
-            d = wp.get_diag(wp.transpose(u) * nearest_unimodular(f) * v)
+            d = s - wp.get_diag(wp.transpose(u) * unimodular_offset(f) * v)
         normal, flip, twist = second_derivatives(s, d, m[0], m[1])
         spectral_blocks(u, v, normal, flip, twist, clamp, out)
     else:

@@ -4,8 +4,9 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
-from warp_resphys.kernels.matrices import cofactor, nearest_unimodular, polar_rotation, signed_svd, symmetric_eigen
+from warp_resphys.kernels.matrices import cofactor, polar_rotation, signed_svd, symmetric_eigen
 from warp_resphys.kernels.spectral import spectral_blocks
+from warp_resphys.kernels.unimodular import unimodular_offset
 
 wp.set_module_options({"enable_backward": False})
 RANDOM = np.random.default_rng(0)
@@ -27,7 +28,7 @@ def decompose(
     i = wp.tid()
     cofactor_out[i] = cofactor(f[i])
     rotation_out[i] = polar_rotation(f[i])
-    unimodular_out[i] = nearest_unimodular(f[i])
+    unimodular_out[i] = f[i] - unimodular_offset(f[i])
     u, s, v = signed_svd(f[i])
     u_out[i] = u
     s_out[i] = s

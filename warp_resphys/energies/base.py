@@ -433,6 +433,16 @@ class Term(ABC):
         """Returns the kernel of stress and energy, and its inputs after ``active``."""
         return self._kernels.local_step, self._arguments(s, values, positions)
 
+    def residual_launch(
+        self, s: PointSet, values: Values, positions: Any, residual: torch.Tensor, energy: Any
+    ) -> Any | None:
+        """Returns a launch that adds the forces of a set to a residual and sets its energies, or None.
+
+        It takes the place of the kernel of `step` and of `Launcher.gather` where cells can be taken as a whole.
+        """
+        del s, values, positions, residual, energy
+        return None
+
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
         """Returns the kernel of the tangent's blocks, and its inputs after ``active`` and ``clamp``."""
         return self._kernels.tangent, self._arguments(s, values, positions)

@@ -117,7 +117,6 @@ class IncrementalPotential(Launcher):
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
         self.residual = self.zeros(n_vertices, 3)
-        self._stress = [self.zeros(s.n_points, 3, s.width) for s in self.sets]
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
         self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
@@ -142,18 +141,22 @@ class IncrementalPotential(Launcher):
             ],
             [warp_view(self.residual, wp.vec3d), warp_view(self._vertex_energy, wp.float64)],
         )
-        active, stresses = warp_view(self.active, wp.int32), iter(self._stress)
+        active = warp_view(self.active, wp.int32)
         self._internal_commands: list[Any] = []
         self._load_commands: list[Any] = []
         for term, values, is_load in zip(self.energies, self.own_values, self._loads, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
             commands += term.before(values, self._position_view, active)
             for s in term.sets:
-                stress = s.stress_view(next(stresses))
-                outputs = [stress, warp_view(self._point_energy[:, s.part], wp.float64)]
+                energy = warp_view(self._point_energy[:, s.part], wp.float64)
+                whole = term.residual_launch(s, values, self._position_view, self.residual, energy)
+                if whole is not None:
+                    commands.append(whole)
+                    continue
+                stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 kernel, inputs = term.step(s, values, self._position_view)
                 commands += [
-                    self.record(kernel, (b, s.n_points), [active, *inputs], outputs),
+                    self.record(kernel, (b, s.n_points), [active, *inputs], [stress, energy]),
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)

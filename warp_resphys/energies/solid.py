@@ -15,6 +15,7 @@ from typing_extensions import override
 from ..fem.body import Body
 from ..fem.elements import Discretisation, Points, SolidPoints
 from ..io.errors import InputError
+from ..kernels import lanes
 from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
@@ -238,7 +239,7 @@ class SolidTerm(StrainTerm):
         self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: NDArray[np.float64]
     ) -> None:
         super().__init__(launcher, sets)
-        law = material.law
+        self._law = law = material.law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli, self._shared = len(material.rules), int(getattr(law, "SHARED", 0))
         self._carried = carried
@@ -269,6 +270,41 @@ class SolidTerm(StrainTerm):
             warp_view(dilation[:, s.own], wp.float64),
         ]
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
+
+    @override
+    def residual_launch(
+        self, s: PointSet, values: Values, positions: Any, residual: torch.Tensor, energy: Any
+    ) -> Any | None:
+        together = self._together(s)
+        if together is None:
+            return None
+        own, (nodes, gradients, stiffness, _, *rest) = self.launcher, self._arguments(s, values, positions)
+        inputs = [warp_view(own.active, wp.int32), nodes, gradients, stiffness, *rest, *together]
+        outputs = [warp_view(residual, wp.vec3d), energy]
+        return own.record(lanes.cell_kernel(self._law), (own.batch, s.cells), inputs, outputs)
+
+    def _together(self, s: PointSet) -> tuple[Any, Any, int] | None:
+        """Returns the gradients of those points of a set that `kernels.lanes` takes together, and their number a cell.
+
+        None where there are none: on a GPU, for other laws, and in cells with less than two points without a volume
+        term before the others.
+        """
+        if self.launcher.by_cells or not getattr(self._law, "TOGETHER", False):
+            return None
+        with_volume = (self._carried[s.own].reshape(s.cells, s.points_per_cell, -1)[..., 1:] > 0.0).any((0, 2))
+        count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
+        if count < 2:
+            return None
+        own, nodes = s.source.gradients, s.nodes_per_cell
+        groups, parts = -(-count // lanes.WIDTH), -(-nodes // lanes.WIDTH)
+        chosen = np.minimum(np.arange(groups * lanes.WIDTH), count - 1)
+        # (C, Q, K, 3) to (C, G, K, 3, points of a group)
+        together = own[:, chosen].reshape(s.cells, groups, lanes.WIDTH, nodes, 3).transpose(0, 1, 3, 4, 2)
+        by_nodes = np.zeros((s.n_points, parts * lanes.WIDTH, 3))
+        by_nodes[:, :nodes] = own.reshape(s.n_points, nodes, 3)
+        by_nodes = by_nodes.reshape(s.n_points, parts, lanes.WIDTH, 3).transpose(0, 1, 3, 2)
+        upload = self.launcher.upload
+        return upload(together, lanes.lanes), upload(by_nodes, lanes.lanes), count
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

@@ -1,0 +1,216 @@
+"""Local step of whole cells by the vector instructions of a CPU: eight points at a time, and their forces at once.
+
+A quantity of eight points is one vector, on which Warp's elementwise operations become vector instructions. Launches on
+a CPU run one thread after another, so that threads may add to the same forces.
+
+The shape term of the corotated material needs no rotation here. With F = R U, C = F^T F = U^2 and J = det F, the trace
+i of U is the largest root of
+
+    (i^2 - c_1)^2 = 4 c_2 + 8 J i
+
+with the invariants of C, and i_2 = (i^2 - c_1) / 2 (Hoger and Carlson 1984). By the theorem of Cayley and Hamilton,
+(i i_2 - J) U = (i^2 - i_2) C - C^2 + i J I and J U^-1 = C - i U + i_2 I, and F - R = F (I - U^-1).
+"""
+
+import functools
+from types import ModuleType
+from typing import Any
+
+import warp as wp
+
+from .modules import named_module
+from .points import deformation_gradient
+from .solid import viscous_response
+
+WIDTH = 8  # points: as many doubles as the widest vector instructions take
+ITERATIONS = 12
+TOLERANCE = wp.float64(1.0e-11)  # of the trace's last squared change: Halley's iteration, of third order, is exact then
+FLATTEST = wp.float64(0.05)  # smallest J of points that are taken together
+ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
+FOUR, EIGHT, TWELVE = wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
+
+lanes = wp.types.vector(WIDTH, wp.float64)
+
+
+@wp.func
+def dot3(x: lanes, y: lanes, z: lanes, u: lanes, v: lanes, w: lanes) -> lanes:
+    """Returns x u + y v + z w."""
+    return wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
+
+
+@wp.func
+def minor(x: lanes, y: lanes, u: lanes, v: lanes) -> lanes:
+    """Returns x y - u v."""
+    return wp.cw_mul(x, y) - wp.cw_mul(u, v)
+
+
+@wp.func
+def trace_of_stretch(c1: lanes, c2: lanes, j: lanes):
+    """Returns the trace of U and the squared norm of its last change."""
+    i = HALF * c1 + lanes(wp.float64(1.5))  # not below the root, to which Halley's iteration falls
+    change = ONE
+    for _ in range(ITERATIONS):
+        q = wp.cw_mul(i, i) - c1
+        value = wp.cw_mul(q, q) - EIGHT * wp.cw_mul(j, i) - FOUR * c2
+        slope = FOUR * wp.cw_mul(i, q) - EIGHT * j
+        bend = TWELVE * wp.cw_mul(i, i) - FOUR * c1
+        step = wp.cw_div(TWO * wp.cw_mul(value, slope), TWO * wp.cw_mul(slope, slope) - wp.cw_mul(value, bend))
+        i -= step
+        change = wp.dot(step, step)
+        if change < TOLERANCE:
+            break
+    return i, change
+
+
+@wp.func
+def along(x: wp.float64, y: wp.float64, z: wp.float64, gradients: wp.array[lanes]) -> lanes:
+    """Product of a row of the stress with the gradients of some nodes."""
+    return x * gradients[0] + y * gradients[1] + z * gradients[2]
+
+
+@wp.func
+def scatter(x: lanes, y: lanes, z: lanes, nodes: wp.array[int], part: int, force_out: wp.array[wp.vec3d]):
+    """Adds the forces of some nodes of a cell."""
+    first = part * WIDTH
+    for n in range(wp.min(nodes.shape[0] - first, WIDTH)):
+        force_out[nodes[first + n]] += wp.vec3d(x[n], y[n], z[n])
+
+
+@functools.cache
+def cell_kernel(law: ModuleType) -> Any:
+    """Returns the local step of a material whose shape term is that of ``kernels.materials.corotated``."""
+    module = named_module(f"lanes.{law.NAME}")
+    respond, moduli = law.response, law.moduli
+    mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
+
+    @wp.kernel(module=module)
+    def cell_step(
+        active: wp.array[int],  # (B) zero: skip the environment
+        nodes: wp.array2d[int],  # (C, K)
+        gradients: wp.array2d[wp.vec3d],  # (P, K)
+        stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
+        viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
+        strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
+        dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        together: wp.array4d[lanes],  # (C, G, K, 3) gradients of a cell's first S points, filled up with the last
+        by_nodes: wp.array3d[lanes],  # (P, K / 8, 3) gradients, of eight nodes at a time, filled up with zeros
+        shape_points: int,  # S, the number of points without a volume term, which come first
+        force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
+        energy_out: wp.array2d[wp.float64],  # (B, P) [J]
+    ):
+        b, cell = wp.tid()
+        if active[b] == 0:
+            return
+        damping, begin = viscosity[b], cell * points_per_cell
+        alone = wp.int32(0)  # first point of those that are taken one by one
+        for group in range(together.shape[1]):
+            f00, f01, f02 = lanes(), lanes(), lanes()
+            f10, f11, f12 = lanes(), lanes(), lanes()
+            f20, f21, f22 = lanes(), lanes(), lanes()
+            for a in range(nodes.shape[1]):
+                at = positions[b, nodes[cell, a]]
+                g0, g1, g2 = together[cell, group, a, 0], together[cell, group, a, 1], together[cell, group, a, 2]
+                f00 += at[0] * g0
+                f01 += at[0] * g1
+                f02 += at[0] * g2
+                f10 += at[1] * g0
+                f11 += at[1] * g1
+                f12 += at[1] * g2
+                f20 += at[2] * g0
+                f21 += at[2] * g1
+                f22 += at[2] * g2
+            j = dot3(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
+            c00, c01 = dot3(f00, f10, f20, f00, f10, f20), dot3(f00, f10, f20, f01, f11, f21)
+            c02, c11 = dot3(f00, f10, f20, f02, f12, f22), dot3(f01, f11, f21, f01, f11, f21)
+            c12, c22 = dot3(f01, f11, f21, f02, f12, f22), dot3(f02, f12, f22, f02, f12, f22)
+            c1 = c00 + c11 + c22
+            c2 = minor(c00, c11, c01, c01) + minor(c00, c22, c02, c02) + minor(c11, c22, c12, c12)
+            i, change = trace_of_stretch(c1, c2, j)
+            if not (change < TOLERANCE and wp.min(j) > FLATTEST):
+                break
+            # h = U - I and t = I - U^-1
+            i2 = HALF * (wp.cw_mul(i, i) - c1)
+            g = wp.cw_div(lanes(ONE), wp.cw_mul(i, i2) - j)
+            gj, gc = wp.cw_mul(g, wp.cw_mul(i, j)) - lanes(ONE), wp.cw_mul(g, wp.cw_mul(i, i) - i2)
+            h00 = wp.cw_mul(gc, c00) - wp.cw_mul(g, dot3(c00, c01, c02, c00, c01, c02)) + gj
+            h11 = wp.cw_mul(gc, c11) - wp.cw_mul(g, dot3(c01, c11, c12, c01, c11, c12)) + gj
+            h22 = wp.cw_mul(gc, c22) - wp.cw_mul(g, dot3(c02, c12, c22, c02, c12, c22)) + gj
+            h01 = wp.cw_mul(gc, c01) - wp.cw_mul(g, dot3(c00, c01, c02, c01, c11, c12))
+            h02 = wp.cw_mul(gc, c02) - wp.cw_mul(g, dot3(c00, c01, c02, c02, c12, c22))
+            h12 = wp.cw_mul(gc, c12) - wp.cw_mul(g, dot3(c01, c11, c12, c02, c12, c22))
+            k = wp.cw_div(lanes(ONE), j)
+            ki, kj = wp.cw_mul(k, i), wp.cw_mul(k, i - i2) + lanes(ONE)
+            t00 = wp.cw_mul(ki, h00) - wp.cw_mul(k, c00) + kj
+            t11 = wp.cw_mul(ki, h11) - wp.cw_mul(k, c11) + kj
+            t22 = wp.cw_mul(ki, h22) - wp.cw_mul(k, c22) + kj
+            t01 = wp.cw_mul(ki, h01) - wp.cw_mul(k, c01)
+            t02 = wp.cw_mul(ki, h02) - wp.cw_mul(k, c02)
+            t12 = wp.cw_mul(ki, h12) - wp.cw_mul(k, c12)
+            energy = dot3(h00, h11, h22, h00, h11, h22) + TWO * dot3(h01, h02, h12, h01, h02, h12)
+            first = begin + group * WIDTH
+            count = wp.min(shape_points - group * WIDTH, WIDTH)
+            mu = lanes()
+            for n in range(count):
+                mu[n] = wp.dot(mu_of, stiffness[b, first + n])
+            if damping[0] > ZERO:
+                w00, w01, w02, w11, w12, w22 = lanes(), lanes(), lanes(), lanes(), lanes(), lanes()
+                for n in range(count):
+                    w = strain_offset[b, first + n]
+                    w00[n] = w[0, 0]
+                    w01[n] = w[0, 1]
+                    w02[n] = w[0, 2]
+                    w11[n] = w[1, 1]
+                    w12[n] = w[1, 2]
+                    w22[n] = w[2, 2]
+                half = HALF * damping[0]
+                e00, e11, e22 = half * (c00 - lanes(ONE)), half * (c11 - lanes(ONE)), half * (c22 - lanes(ONE))
+                e01, e02, e12 = half * c01, half * c02, half * c12
+                normal = dot3(e00 - TWO * w00, e11 - TWO * w11, e22 - TWO * w22, e00, e11, e22)
+                shear = dot3(e01 - TWO * w01, e02 - TWO * w02, e12 - TWO * w12, e01, e02, e12)
+                energy += (ONE / damping[0]) * (normal + TWO * shear)
+                t00 += e00 - w00
+                t01 += e01 - w01
+                t02 += e02 - w02
+                t11 += e11 - w11
+                t12 += e12 - w12
+                t22 += e22 - w22
+            energy = wp.cw_mul(mu, energy)
+            for n in range(count):
+                energy_out[b, first + n] = energy[n]
+            mu = TWO * mu
+            p00 = wp.cw_mul(mu, dot3(f00, f01, f02, t00, t01, t02))
+            p01 = wp.cw_mul(mu, dot3(f00, f01, f02, t01, t11, t12))
+            p02 = wp.cw_mul(mu, dot3(f00, f01, f02, t02, t12, t22))
+            p10 = wp.cw_mul(mu, dot3(f10, f11, f12, t00, t01, t02))
+            p11 = wp.cw_mul(mu, dot3(f10, f11, f12, t01, t11, t12))
+            p12 = wp.cw_mul(mu, dot3(f10, f11, f12, t02, t12, t22))
+            p20 = wp.cw_mul(mu, dot3(f20, f21, f22, t00, t01, t02))
+            p21 = wp.cw_mul(mu, dot3(f20, f21, f22, t01, t11, t12))
+            p22 = wp.cw_mul(mu, dot3(f20, f21, f22, t02, t12, t22))
+            for part in range(by_nodes.shape[1]):
+                x, y, z = lanes(), lanes(), lanes()
+                for n in range(count):
+                    x += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
+                    y += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
+                    z += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
+                scatter(x, y, z, nodes[cell], part, force_out[b])
+            alone = wp.min((group + 1) * WIDTH, shape_points)
+        for p in range(begin + alone, begin + points_per_cell):
+            f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+            m = stiffness[b, p]
+            point_energy, stress = respond(f, m)
+            if damping[0] + damping[1] > ZERO:
+                lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
+                added = viscous_response(f, lame, damping, strain_offset[b, p], dilation_offset[b, p])
+                point_energy += added[0]
+                stress += added[1]
+            energy_out[b, p] = point_energy
+            for part in range(by_nodes.shape[1]):
+                x_one = along(stress[0, 0], stress[0, 1], stress[0, 2], by_nodes[p, part])
+                y_one = along(stress[1, 0], stress[1, 1], stress[1, 2], by_nodes[p, part])
+                z_one = along(stress[2, 0], stress[2, 1], stress[2, 2], by_nodes[p, part])
+                scatter(x_one, y_one, z_one, nodes[cell], part, force_out[b])
+
+    return cell_step

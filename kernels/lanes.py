@@ -3,13 +3,17 @@
 A quantity of eight points is one vector, on which Warp's elementwise operations become vector instructions. Launches on
 a CPU run one thread after another, so that threads may add to the same forces.
 
-The shape term of the corotated material needs no rotation here. With F = R U, C = F^T F = U^2 and J = det F, the trace
-i of U is the largest root of
+The shape term of the corotated material needs no rotation here (Hoger and Carlson 1984). With F = R U, J = det F and
+U^2 = F^T F = I + e, the invariants 3 + x, 3 + y and J = 1 + z of U follow from those of e:
 
-    (i^2 - c_1)^2 = 4 c_2 + 8 J i
+    p (12 + p) = 8 (x + e_1) + 4 e_2 + 8 z (3 + x),        p = 6 x + x^2 - e_1 = 2 y
 
-with the invariants of C, and i_2 = (i^2 - c_1) / 2 (Hoger and Carlson 1984). By the theorem of Cayley and Hamilton,
-(i i_2 - J) U = (i^2 - i_2) C - C^2 + i J I and J U^-1 = C - i U + i_2 I, and F - R = F (I - U^-1).
+of which x is the largest root. With s = x - y + z, the theorem of Cayley and Hamilton gives
+
+    ((3 + x) (3 + y) - J) (U - I) = s (4 + x) I + ((3 + x)^2 - y - 5) e - e^2
+    J (I - U^-1)                  = s I + (3 + x) (U - I) - e
+
+and F - R = F (I - U^-1). All terms are small with the strain, so that their rounding errors are, too.
 """
 
 import functools
@@ -27,7 +31,8 @@ ITERATIONS = 12
 TOLERANCE = wp.float64(1.0e-11)  # of the trace's last squared change: Halley's iteration, of third order, is exact then
 FLATTEST = wp.float64(0.05)  # smallest J of points that are taken together
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
-FOUR, EIGHT, TWELVE = wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
+THREE, FOUR, FIVE, SIX = wp.float64(3.0), wp.float64(4.0), wp.float64(5.0), wp.float64(6.0)
+EIGHT, TWELVE = wp.float64(8.0), wp.float64(12.0)
 
 lanes = wp.types.vector(WIDTH, wp.float64)
 
@@ -45,21 +50,23 @@ def minor(x: lanes, y: lanes, u: lanes, v: lanes) -> lanes:
 
 
 @wp.func
-def trace_of_stretch(c1: lanes, c2: lanes, j: lanes):
-    """Returns the trace of U and the squared norm of its last change."""
-    i = HALF * c1 + lanes(wp.float64(1.5))  # not below the root, to which Halley's iteration falls
+def growth_of_trace(e1: lanes, e2: lanes, z: lanes):
+    """Returns x and the squared norm of its last change."""
+    x = HALF * e1  # not below the root, to which Halley's iteration falls
     change = ONE
     for _ in range(ITERATIONS):
-        q = wp.cw_mul(i, i) - c1
-        value = wp.cw_mul(q, q) - EIGHT * wp.cw_mul(j, i) - FOUR * c2
-        slope = FOUR * wp.cw_mul(i, q) - EIGHT * j
-        bend = TWELVE * wp.cw_mul(i, i) - FOUR * c1
+        p = wp.cw_mul(x, lanes(SIX) + x) - e1
+        q = lanes(SIX) + p
+        i = lanes(THREE) + x
+        value = TWELVE * p + wp.cw_mul(p, p) - EIGHT * (x + e1 + wp.cw_mul(z, i)) - FOUR * e2
+        slope = FOUR * wp.cw_mul(i, q) - EIGHT * (lanes(ONE) + z)
+        bend = FOUR * q + EIGHT * wp.cw_mul(i, i)
         step = wp.cw_div(TWO * wp.cw_mul(value, slope), TWO * wp.cw_mul(slope, slope) - wp.cw_mul(value, bend))
-        i -= step
+        x -= step
         change = wp.dot(step, step)
         if change < TOLERANCE:
             break
-    return i, change
+    return x, change
 
 
 @wp.func
@@ -122,32 +129,33 @@ def cell_kernel(law: ModuleType) -> Any:
                 f21 += at[2] * g1
                 f22 += at[2] * g2
             j = dot3(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
-            c00, c01 = dot3(f00, f10, f20, f00, f10, f20), dot3(f00, f10, f20, f01, f11, f21)
-            c02, c11 = dot3(f00, f10, f20, f02, f12, f22), dot3(f01, f11, f21, f01, f11, f21)
-            c12, c22 = dot3(f01, f11, f21, f02, f12, f22), dot3(f02, f12, f22, f02, f12, f22)
-            c1 = c00 + c11 + c22
-            c2 = minor(c00, c11, c01, c01) + minor(c00, c22, c02, c02) + minor(c11, c22, c12, c12)
-            i, change = trace_of_stretch(c1, c2, j)
+            one = lanes(ONE)
+            e00, e01 = dot3(f00, f10, f20, f00, f10, f20) - one, dot3(f00, f10, f20, f01, f11, f21)
+            e02, e11 = dot3(f00, f10, f20, f02, f12, f22), dot3(f01, f11, f21, f01, f11, f21) - one
+            e12, e22 = dot3(f01, f11, f21, f02, f12, f22), dot3(f02, f12, f22, f02, f12, f22) - one
+            e1, z = e00 + e11 + e22, j - one
+            e2 = minor(e00, e11, e01, e01) + minor(e00, e22, e02, e02) + minor(e11, e22, e12, e12)
+            x, change = growth_of_trace(e1, e2, z)
             if not (change < TOLERANCE and wp.min(j) > FLATTEST):
                 break
             # h = U - I and t = I - U^-1
-            i2 = HALF * (wp.cw_mul(i, i) - c1)
-            g = wp.cw_div(lanes(ONE), wp.cw_mul(i, i2) - j)
-            gj, gc = wp.cw_mul(g, wp.cw_mul(i, j)) - lanes(ONE), wp.cw_mul(g, wp.cw_mul(i, i) - i2)
-            h00 = wp.cw_mul(gc, c00) - wp.cw_mul(g, dot3(c00, c01, c02, c00, c01, c02)) + gj
-            h11 = wp.cw_mul(gc, c11) - wp.cw_mul(g, dot3(c01, c11, c12, c01, c11, c12)) + gj
-            h22 = wp.cw_mul(gc, c22) - wp.cw_mul(g, dot3(c02, c12, c22, c02, c12, c22)) + gj
-            h01 = wp.cw_mul(gc, c01) - wp.cw_mul(g, dot3(c00, c01, c02, c01, c11, c12))
-            h02 = wp.cw_mul(gc, c02) - wp.cw_mul(g, dot3(c00, c01, c02, c02, c12, c22))
-            h12 = wp.cw_mul(gc, c12) - wp.cw_mul(g, dot3(c01, c11, c12, c02, c12, c22))
-            k = wp.cw_div(lanes(ONE), j)
-            ki, kj = wp.cw_mul(k, i), wp.cw_mul(k, i - i2) + lanes(ONE)
-            t00 = wp.cw_mul(ki, h00) - wp.cw_mul(k, c00) + kj
-            t11 = wp.cw_mul(ki, h11) - wp.cw_mul(k, c11) + kj
-            t22 = wp.cw_mul(ki, h22) - wp.cw_mul(k, c22) + kj
-            t01 = wp.cw_mul(ki, h01) - wp.cw_mul(k, c01)
-            t02 = wp.cw_mul(ki, h02) - wp.cw_mul(k, c02)
-            t12 = wp.cw_mul(ki, h12) - wp.cw_mul(k, c12)
+            y = HALF * (wp.cw_mul(x, lanes(SIX) + x) - e1)
+            s, i = x - y + z, lanes(THREE) + x
+            g = wp.cw_div(one, wp.cw_mul(i, lanes(THREE) + y) - j)
+            gs, ge = wp.cw_mul(wp.cw_mul(g, s), one + i), wp.cw_mul(g, wp.cw_mul(i, i) - y - lanes(FIVE))
+            h00 = gs + wp.cw_mul(ge, e00) - wp.cw_mul(g, dot3(e00, e01, e02, e00, e01, e02))
+            h11 = gs + wp.cw_mul(ge, e11) - wp.cw_mul(g, dot3(e01, e11, e12, e01, e11, e12))
+            h22 = gs + wp.cw_mul(ge, e22) - wp.cw_mul(g, dot3(e02, e12, e22, e02, e12, e22))
+            h01 = wp.cw_mul(ge, e01) - wp.cw_mul(g, dot3(e00, e01, e02, e01, e11, e12))
+            h02 = wp.cw_mul(ge, e02) - wp.cw_mul(g, dot3(e00, e01, e02, e02, e12, e22))
+            h12 = wp.cw_mul(ge, e12) - wp.cw_mul(g, dot3(e01, e11, e12, e02, e12, e22))
+            k = wp.cw_div(one, j)
+            t00 = wp.cw_mul(k, s + wp.cw_mul(i, h00) - e00)
+            t11 = wp.cw_mul(k, s + wp.cw_mul(i, h11) - e11)
+            t22 = wp.cw_mul(k, s + wp.cw_mul(i, h22) - e22)
+            t01 = wp.cw_mul(k, wp.cw_mul(i, h01) - e01)
+            t02 = wp.cw_mul(k, wp.cw_mul(i, h02) - e02)
+            t12 = wp.cw_mul(k, wp.cw_mul(i, h12) - e12)
             energy = dot3(h00, h11, h22, h00, h11, h22) + TWO * dot3(h01, h02, h12, h01, h02, h12)
             first = begin + group * WIDTH
             count = wp.min(shape_points - group * WIDTH, WIDTH)
@@ -164,18 +172,19 @@ def cell_kernel(law: ModuleType) -> Any:
                     w11[n] = w[1, 1]
                     w12[n] = w[1, 2]
                     w22[n] = w[2, 2]
+                # c E and c E - W
                 half = HALF * damping[0]
-                e00, e11, e22 = half * (c00 - lanes(ONE)), half * (c11 - lanes(ONE)), half * (c22 - lanes(ONE))
-                e01, e02, e12 = half * c01, half * c02, half * c12
-                normal = dot3(e00 - TWO * w00, e11 - TWO * w11, e22 - TWO * w22, e00, e11, e22)
-                shear = dot3(e01 - TWO * w01, e02 - TWO * w02, e12 - TWO * w12, e01, e02, e12)
+                a00, a11, a22 = half * e00, half * e11, half * e22
+                a01, a02, a12 = half * e01, half * e02, half * e12
+                normal = dot3(a00 - TWO * w00, a11 - TWO * w11, a22 - TWO * w22, a00, a11, a22)
+                shear = dot3(a01 - TWO * w01, a02 - TWO * w02, a12 - TWO * w12, a01, a02, a12)
                 energy += (ONE / damping[0]) * (normal + TWO * shear)
-                t00 += e00 - w00
-                t01 += e01 - w01
-                t02 += e02 - w02
-                t11 += e11 - w11
-                t12 += e12 - w12
-                t22 += e22 - w22
+                t00 += a00 - w00
+                t01 += a01 - w01
+                t02 += a02 - w02
+                t11 += a11 - w11
+                t12 += a12 - w12
+                t22 += a22 - w22
             energy = wp.cw_mul(mu, energy)
             for n in range(count):
                 energy_out[b, first + n] = energy[n]
@@ -190,12 +199,12 @@ def cell_kernel(law: ModuleType) -> Any:
             p21 = wp.cw_mul(mu, dot3(f20, f21, f22, t01, t11, t12))
             p22 = wp.cw_mul(mu, dot3(f20, f21, f22, t02, t12, t22))
             for part in range(by_nodes.shape[1]):
-                x, y, z = lanes(), lanes(), lanes()
+                px, py, pz = lanes(), lanes(), lanes()
                 for n in range(count):
-                    x += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
-                    y += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
-                    z += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
-                scatter(x, y, z, nodes[cell], part, force_out[b])
+                    px += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
+                    py += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
+                    pz += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
+                scatter(px, py, pz, nodes[cell], part, force_out[b])
             alone = wp.min((group + 1) * WIDTH, shape_points)
         for p in range(begin + alone, begin + points_per_cell):
             f = deformation_gradient(positions, nodes, gradients, b, p, cell)

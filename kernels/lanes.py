@@ -1,4 +1,4 @@
-"""Local step of whole cells by the vector instructions of a CPU: eight points at a time, and their forces at once.
+"""Local step and tangent of whole cells by the vector instructions of a CPU: eight points at a time.
 
 A quantity of eight points is one vector, on which Warp's elementwise operations become vector instructions. Launches on
 a CPU run one thread after another, so that threads may add to the same forces.
@@ -8,17 +8,17 @@ U^2 = F^T F = I + e, the invariants 3 + x, 3 + y and J = 1 + z of U follow from 
 
     p (12 + p) = 8 (x + e_1) + 4 e_2 + 8 z (3 + x),        p = 6 x + x^2 - e_1 = 2 y
 
-of which x is the largest root. With s = x - y + z, the theorem of Cayley and Hamilton gives
+of which x is the largest root. With s = x - y + z and g = (3 + x) (3 + y) - J, the theorem of Cayley and Hamilton gives
 
-    ((3 + x) (3 + y) - J) (U - I) = s (4 + x) I + ((3 + x)^2 - y - 5) e - e^2
-    J (I - U^-1)                  = s I + (3 + x) (U - I) - e
+    g (U - I)      = s (4 + x) I + ((3 + x)^2 - y - 5) e - e^2
+    J (I - U^-1)   = s I + (3 + x) (U - I) - e
 
-and F - R = F (I - U^-1). All terms are small with the strain, so that their rounding errors are, too.
+and F - R = F (I - U^-1). All terms are small with the strain, so that their rounding errors are, too. By the same
+theorem, the matrix of `kernels.materials.corotated.turning` is (F F^T + (3 + y) I) / g.
 """
 
 import functools
-from types import ModuleType
-from typing import Any
+from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
@@ -34,11 +34,11 @@ ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.flo
 THREE, FOUR, FIVE, SIX = wp.float64(3.0), wp.float64(4.0), wp.float64(5.0), wp.float64(6.0)
 EIGHT, TWELVE = wp.float64(8.0), wp.float64(12.0)
 
-lanes = wp.types.vector(WIDTH, wp.float64)
+lanes = wp.types.vector(WIDTH, wp.float64)  # A tensor has its components one by one; matrices of lanes would be slower.
 
 
 @wp.func
-def dot3(x: lanes, y: lanes, z: lanes, u: lanes, v: lanes, w: lanes) -> lanes:
+def dot(x: lanes, y: lanes, z: lanes, u: lanes, v: lanes, w: lanes) -> lanes:
     """Returns x u + y v + z w."""
     return wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
 
@@ -50,23 +50,83 @@ def minor(x: lanes, y: lanes, u: lanes, v: lanes) -> lanes:
 
 
 @wp.func
-def growth_of_trace(e1: lanes, e2: lanes, z: lanes):
-    """Returns x and the squared norm of its last change."""
+def deformation(nodes: wp.array[int], together: wp.array2d[lanes], positions: wp.array[wp.vec3d]):
+    """F = sum_a x_a (grad N_a)^T, row by row."""
+    f00, f01, f02 = lanes(), lanes(), lanes()
+    f10, f11, f12 = lanes(), lanes(), lanes()
+    f20, f21, f22 = lanes(), lanes(), lanes()
+    for a in range(nodes.shape[0]):
+        x = positions[nodes[a]]
+        g0, g1, g2 = together[a, 0], together[a, 1], together[a, 2]
+        f00 += x[0] * g0
+        f01 += x[0] * g1
+        f02 += x[0] * g2
+        f10 += x[1] * g0
+        f11 += x[1] * g1
+        f12 += x[1] * g2
+        f20 += x[2] * g0
+        f21 += x[2] * g1
+        f22 += x[2] * g2
+    return f00, f01, f02, f10, f11, f12, f20, f21, f22
+
+
+@wp.func
+def metric(f00: lanes, f01: lanes, f02: lanes, f10: lanes, f11: lanes, f12: lanes, f20: lanes, f21: lanes, f22: lanes):
+    """Returns e = F^T F - I: components 00, 11, 22, 12, 02 and 01."""
+    one = lanes(ONE)
+    return (
+        dot(f00, f10, f20, f00, f10, f20) - one,
+        dot(f01, f11, f21, f01, f11, f21) - one,
+        dot(f02, f12, f22, f02, f12, f22) - one,
+        dot(f01, f11, f21, f02, f12, f22),
+        dot(f00, f10, f20, f02, f12, f22),
+        dot(f00, f10, f20, f01, f11, f21),
+    )
+
+
+@wp.func
+def stretch(j: lanes, e00: lanes, e11: lanes, e22: lanes, e12: lanes, e02: lanes, e01: lanes):
+    """Returns 1 / g, 3 + y, |U - I|^2, the components of I - U^-1, and whether all are exact."""
+    one = lanes(ONE)
+    e1, z = e00 + e11 + e22, j - one
+    e2 = minor(e00, e11, e01, e01) + minor(e00, e22, e02, e02) + minor(e11, e22, e12, e12)
     x = HALF * e1  # not below the root, to which Halley's iteration falls
     change = ONE
     for _ in range(ITERATIONS):
         p = wp.cw_mul(x, lanes(SIX) + x) - e1
-        q = lanes(SIX) + p
-        i = lanes(THREE) + x
-        value = TWELVE * p + wp.cw_mul(p, p) - EIGHT * (x + e1 + wp.cw_mul(z, i)) - FOUR * e2
-        slope = FOUR * wp.cw_mul(i, q) - EIGHT * (lanes(ONE) + z)
-        bend = FOUR * q + EIGHT * wp.cw_mul(i, i)
+        q, trace = lanes(SIX) + p, lanes(THREE) + x
+        value = TWELVE * p + wp.cw_mul(p, p) - EIGHT * (x + e1 + wp.cw_mul(z, trace)) - FOUR * e2
+        slope = FOUR * wp.cw_mul(trace, q) - EIGHT * j
+        bend = FOUR * q + EIGHT * wp.cw_mul(trace, trace)
         step = wp.cw_div(TWO * wp.cw_mul(value, slope), TWO * wp.cw_mul(slope, slope) - wp.cw_mul(value, bend))
         x -= step
         change = wp.dot(step, step)
         if change < TOLERANCE:
             break
-    return x, change
+    y = HALF * (wp.cw_mul(x, lanes(SIX) + x) - e1)
+    s, i = x - y + z, lanes(THREE) + x
+    g = wp.cw_div(one, wp.cw_mul(i, lanes(THREE) + y) - j)
+    # h = U - I
+    gs, ge = wp.cw_mul(wp.cw_mul(g, s), one + i), wp.cw_mul(g, wp.cw_mul(i, i) - y - lanes(FIVE))
+    h00 = gs + wp.cw_mul(ge, e00) - wp.cw_mul(g, dot(e00, e01, e02, e00, e01, e02))
+    h11 = gs + wp.cw_mul(ge, e11) - wp.cw_mul(g, dot(e01, e11, e12, e01, e11, e12))
+    h22 = gs + wp.cw_mul(ge, e22) - wp.cw_mul(g, dot(e02, e12, e22, e02, e12, e22))
+    h12 = wp.cw_mul(ge, e12) - wp.cw_mul(g, dot(e01, e11, e12, e02, e12, e22))
+    h02 = wp.cw_mul(ge, e02) - wp.cw_mul(g, dot(e00, e01, e02, e02, e12, e22))
+    h01 = wp.cw_mul(ge, e01) - wp.cw_mul(g, dot(e00, e01, e02, e01, e11, e12))
+    k = wp.cw_div(one, j)
+    return (
+        g,
+        lanes(THREE) + y,
+        dot(h00, h11, h22, h00, h11, h22) + TWO * dot(h12, h02, h01, h12, h02, h01),
+        wp.cw_mul(k, s + wp.cw_mul(i, h00) - e00),
+        wp.cw_mul(k, s + wp.cw_mul(i, h11) - e11),
+        wp.cw_mul(k, s + wp.cw_mul(i, h22) - e22),
+        wp.cw_mul(k, wp.cw_mul(i, h12) - e12),
+        wp.cw_mul(k, wp.cw_mul(i, h02) - e02),
+        wp.cw_mul(k, wp.cw_mul(i, h01) - e01),
+        change < TOLERANCE and wp.min(j) > FLATTEST,
+    )
 
 
 @wp.func
@@ -84,8 +144,8 @@ def scatter(x: lanes, y: lanes, z: lanes, nodes: wp.array[int], part: int, force
 
 
 @functools.cache
-def cell_kernel(law: ModuleType) -> Any:
-    """Returns the local step of a material whose shape term is that of ``kernels.materials.corotated``."""
+def cell_kernels(law: ModuleType) -> SimpleNamespace:
+    """Returns the kernels of a material whose shape term is that of ``kernels.materials.corotated``."""
     module = named_module(f"lanes.{law.NAME}")
     respond, moduli = law.response, law.moduli
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
@@ -113,113 +173,80 @@ def cell_kernel(law: ModuleType) -> Any:
         damping, begin = viscosity[b], cell * points_per_cell
         alone = wp.int32(0)  # first point of those that are taken one by one
         for group in range(together.shape[1]):
-            f00, f01, f02 = lanes(), lanes(), lanes()
-            f10, f11, f12 = lanes(), lanes(), lanes()
-            f20, f21, f22 = lanes(), lanes(), lanes()
-            for a in range(nodes.shape[1]):
-                at = positions[b, nodes[cell, a]]
-                g0, g1, g2 = together[cell, group, a, 0], together[cell, group, a, 1], together[cell, group, a, 2]
-                f00 += at[0] * g0
-                f01 += at[0] * g1
-                f02 += at[0] * g2
-                f10 += at[1] * g0
-                f11 += at[1] * g1
-                f12 += at[1] * g2
-                f20 += at[2] * g0
-                f21 += at[2] * g1
-                f22 += at[2] * g2
-            j = dot3(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
-            one = lanes(ONE)
-            e00, e01 = dot3(f00, f10, f20, f00, f10, f20) - one, dot3(f00, f10, f20, f01, f11, f21)
-            e02, e11 = dot3(f00, f10, f20, f02, f12, f22), dot3(f01, f11, f21, f01, f11, f21) - one
-            e12, e22 = dot3(f01, f11, f21, f02, f12, f22), dot3(f02, f12, f22, f02, f12, f22) - one
-            e1, z = e00 + e11 + e22, j - one
-            e2 = minor(e00, e11, e01, e01) + minor(e00, e22, e02, e02) + minor(e11, e22, e12, e12)
-            x, change = growth_of_trace(e1, e2, z)
-            if not (change < TOLERANCE and wp.min(j) > FLATTEST):
+            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
+            j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
+            e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
+            _g, _y, energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
+            if not exact:
                 break
-            # h = U - I and t = I - U^-1
-            y = HALF * (wp.cw_mul(x, lanes(SIX) + x) - e1)
-            s, i = x - y + z, lanes(THREE) + x
-            g = wp.cw_div(one, wp.cw_mul(i, lanes(THREE) + y) - j)
-            gs, ge = wp.cw_mul(wp.cw_mul(g, s), one + i), wp.cw_mul(g, wp.cw_mul(i, i) - y - lanes(FIVE))
-            h00 = gs + wp.cw_mul(ge, e00) - wp.cw_mul(g, dot3(e00, e01, e02, e00, e01, e02))
-            h11 = gs + wp.cw_mul(ge, e11) - wp.cw_mul(g, dot3(e01, e11, e12, e01, e11, e12))
-            h22 = gs + wp.cw_mul(ge, e22) - wp.cw_mul(g, dot3(e02, e12, e22, e02, e12, e22))
-            h01 = wp.cw_mul(ge, e01) - wp.cw_mul(g, dot3(e00, e01, e02, e01, e11, e12))
-            h02 = wp.cw_mul(ge, e02) - wp.cw_mul(g, dot3(e00, e01, e02, e02, e12, e22))
-            h12 = wp.cw_mul(ge, e12) - wp.cw_mul(g, dot3(e01, e11, e12, e02, e12, e22))
-            k = wp.cw_div(one, j)
-            t00 = wp.cw_mul(k, s + wp.cw_mul(i, h00) - e00)
-            t11 = wp.cw_mul(k, s + wp.cw_mul(i, h11) - e11)
-            t22 = wp.cw_mul(k, s + wp.cw_mul(i, h22) - e22)
-            t01 = wp.cw_mul(k, wp.cw_mul(i, h01) - e01)
-            t02 = wp.cw_mul(k, wp.cw_mul(i, h02) - e02)
-            t12 = wp.cw_mul(k, wp.cw_mul(i, h12) - e12)
-            energy = dot3(h00, h11, h22, h00, h11, h22) + TWO * dot3(h01, h02, h12, h01, h02, h12)
-            first = begin + group * WIDTH
-            count = wp.min(shape_points - group * WIDTH, WIDTH)
+            first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
             mu = lanes()
             for n in range(count):
                 mu[n] = wp.dot(mu_of, stiffness[b, first + n])
             if damping[0] > ZERO:
-                w00, w01, w02, w11, w12, w22 = lanes(), lanes(), lanes(), lanes(), lanes(), lanes()
+                w00, w11, w22, w12, w02, w01 = lanes(), lanes(), lanes(), lanes(), lanes(), lanes()
                 for n in range(count):
                     w = strain_offset[b, first + n]
                     w00[n] = w[0, 0]
-                    w01[n] = w[0, 1]
-                    w02[n] = w[0, 2]
                     w11[n] = w[1, 1]
-                    w12[n] = w[1, 2]
                     w22[n] = w[2, 2]
-                # c E and c E - W
+                    w12[n] = w[1, 2]
+                    w02[n] = w[0, 2]
+                    w01[n] = w[0, 1]
                 half = HALF * damping[0]
-                a00, a11, a22 = half * e00, half * e11, half * e22
-                a01, a02, a12 = half * e01, half * e02, half * e12
-                normal = dot3(a00 - TWO * w00, a11 - TWO * w11, a22 - TWO * w22, a00, a11, a22)
-                shear = dot3(a01 - TWO * w01, a02 - TWO * w02, a12 - TWO * w12, a01, a02, a12)
+                c00, c11, c22, c12, c02, c01 = half * e00, half * e11, half * e22, half * e12, half * e02, half * e01
+                normal = dot(c00 - TWO * w00, c11 - TWO * w11, c22 - TWO * w22, c00, c11, c22)
+                shear = dot(c12 - TWO * w12, c02 - TWO * w02, c01 - TWO * w01, c12, c02, c01)
                 energy += (ONE / damping[0]) * (normal + TWO * shear)
-                t00 += a00 - w00
-                t01 += a01 - w01
-                t02 += a02 - w02
-                t11 += a11 - w11
-                t12 += a12 - w12
-                t22 += a22 - w22
+                t00 += c00 - w00
+                t11 += c11 - w11
+                t22 += c22 - w22
+                t12 += c12 - w12
+                t02 += c02 - w02
+                t01 += c01 - w01
             energy = wp.cw_mul(mu, energy)
             for n in range(count):
                 energy_out[b, first + n] = energy[n]
             mu = TWO * mu
-            p00 = wp.cw_mul(mu, dot3(f00, f01, f02, t00, t01, t02))
-            p01 = wp.cw_mul(mu, dot3(f00, f01, f02, t01, t11, t12))
-            p02 = wp.cw_mul(mu, dot3(f00, f01, f02, t02, t12, t22))
-            p10 = wp.cw_mul(mu, dot3(f10, f11, f12, t00, t01, t02))
-            p11 = wp.cw_mul(mu, dot3(f10, f11, f12, t01, t11, t12))
-            p12 = wp.cw_mul(mu, dot3(f10, f11, f12, t02, t12, t22))
-            p20 = wp.cw_mul(mu, dot3(f20, f21, f22, t00, t01, t02))
-            p21 = wp.cw_mul(mu, dot3(f20, f21, f22, t01, t11, t12))
-            p22 = wp.cw_mul(mu, dot3(f20, f21, f22, t02, t12, t22))
+            p00, p01 = (
+                wp.cw_mul(mu, dot(f00, f01, f02, t00, t01, t02)),
+                wp.cw_mul(mu, dot(f00, f01, f02, t01, t11, t12)),
+            )
+            p02, p10 = (
+                wp.cw_mul(mu, dot(f00, f01, f02, t02, t12, t22)),
+                wp.cw_mul(mu, dot(f10, f11, f12, t00, t01, t02)),
+            )
+            p11, p12 = (
+                wp.cw_mul(mu, dot(f10, f11, f12, t01, t11, t12)),
+                wp.cw_mul(mu, dot(f10, f11, f12, t02, t12, t22)),
+            )
+            p20, p21 = (
+                wp.cw_mul(mu, dot(f20, f21, f22, t00, t01, t02)),
+                wp.cw_mul(mu, dot(f20, f21, f22, t01, t11, t12)),
+            )
+            p22 = wp.cw_mul(mu, dot(f20, f21, f22, t02, t12, t22))
             for part in range(by_nodes.shape[1]):
-                px, py, pz = lanes(), lanes(), lanes()
+                x, y, z = lanes(), lanes(), lanes()
                 for n in range(count):
-                    px += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
-                    py += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
-                    pz += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
-                scatter(px, py, pz, nodes[cell], part, force_out[b])
+                    x += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
+                    y += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
+                    z += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
+                scatter(x, y, z, nodes[cell], part, force_out[b])
             alone = wp.min((group + 1) * WIDTH, shape_points)
         for p in range(begin + alone, begin + points_per_cell):
-            f = deformation_gradient(positions, nodes, gradients, b, p, cell)
+            f_one = deformation_gradient(positions, nodes, gradients, b, p, cell)
             m = stiffness[b, p]
-            point_energy, stress = respond(f, m)
+            energy_one, stress_one = respond(f_one, m)
             if damping[0] + damping[1] > ZERO:
                 lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-                added = viscous_response(f, lame, damping, strain_offset[b, p], dilation_offset[b, p])
-                point_energy += added[0]
-                stress += added[1]
-            energy_out[b, p] = point_energy
+                added = viscous_response(f_one, lame, damping, strain_offset[b, p], dilation_offset[b, p])
+                energy_one += added[0]
+                stress_one += added[1]
+            energy_out[b, p] = energy_one
             for part in range(by_nodes.shape[1]):
-                x_one = along(stress[0, 0], stress[0, 1], stress[0, 2], by_nodes[p, part])
-                y_one = along(stress[1, 0], stress[1, 1], stress[1, 2], by_nodes[p, part])
-                z_one = along(stress[2, 0], stress[2, 1], stress[2, 2], by_nodes[p, part])
+                x_one = along(stress_one[0, 0], stress_one[0, 1], stress_one[0, 2], by_nodes[p, part])
+                y_one = along(stress_one[1, 0], stress_one[1, 1], stress_one[1, 2], by_nodes[p, part])
+                z_one = along(stress_one[2, 0], stress_one[2, 1], stress_one[2, 2], by_nodes[p, part])
                 scatter(x_one, y_one, z_one, nodes[cell], part, force_out[b])
 
-    return cell_step
+    return SimpleNamespace(step=cell_step)

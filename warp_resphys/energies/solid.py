@@ -281,7 +281,7 @@ class SolidTerm(StrainTerm):
         own, (nodes, gradients, stiffness, _, *rest) = self.launcher, self._arguments(s, values, positions)
         inputs = [warp_view(own.active, wp.int32), nodes, gradients, stiffness, *rest, *together]
         outputs = [warp_view(residual, wp.vec3d), energy]
-        return own.record(lanes.cell_kernel(self._law), (own.batch, s.cells), inputs, outputs)
+        return own.record(lanes.cell_kernels(self._law).step, (own.batch, s.cells), inputs, outputs)
 
     def _together(self, s: PointSet) -> tuple[Any, Any, int] | None:
         """Returns the gradients of those points of a set that `kernels.lanes` takes together, and their number a cell.

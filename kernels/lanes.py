@@ -22,9 +22,10 @@ from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
+from .materials.corotated import rotation_blocks
 from .modules import named_module
 from .points import deformation_gradient
-from .solid import viscous_response
+from .solid import add_viscous_tangent, viscous_response
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
 ITERATIONS = 12
@@ -147,7 +148,7 @@ def scatter(x: lanes, y: lanes, z: lanes, nodes: wp.array[int], part: int, force
 def cell_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of a material whose shape term is that of ``kernels.materials.corotated``."""
     module = named_module(f"lanes.{law.NAME}")
-    respond, moduli = law.response, law.moduli
+    respond, elastic_tangent, moduli = law.response, law.tangent, law.moduli
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.kernel(module=module)
@@ -162,8 +163,8 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         together: wp.array4d[lanes],  # (C, G, K, 3) gradients of a cell's first S points, filled up with the last
-        by_nodes: wp.array3d[lanes],  # (P, K / 8, 3) gradients, of eight nodes at a time, filled up with zeros
         shape_points: int,  # S, the number of points without a volume term, which come first
+        by_nodes: wp.array3d[lanes],  # (P, K / 8, 3) gradients, of eight nodes at a time, filled up with zeros
         force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
     ):
@@ -249,4 +250,79 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
                 z_one = along(stress_one[2, 0], stress_one[2, 1], stress_one[2, 2], by_nodes[p, part])
                 scatter(x_one, y_one, z_one, nodes[cell], part, force_out[b])
 
-    return SimpleNamespace(step=cell_step)
+    @wp.kernel(module=module)
+    def cell_tangent(
+        active: wp.array[int],
+        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
+        nodes: wp.array2d[int],
+        gradients: wp.array2d[wp.vec3d],
+        stiffness: wp.array2d[moduli],
+        viscosity: wp.array[wp.vec2d],
+        strain_offset: wp.array2d[wp.mat33d],
+        dilation_offset: wp.array2d[wp.float64],
+        points_per_cell: int,
+        positions: wp.array2d[wp.vec3d],
+        together: wp.array4d[lanes],
+        shape_points: int,
+        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
+    ):
+        b, cell = wp.tid()
+        if active[b] == 0:
+            return
+        c, begin, clamped = viscosity[b], cell * points_per_cell, clamp[b] != 0
+        damped = c[0] + c[1] > ZERO
+        alone = wp.int32(0)
+        for group in range(together.shape[1]):
+            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
+            j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
+            e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
+            g, y, _energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
+            if clamped or not exact:
+                break
+            r00, r01, r02 = (
+                f00 - dot(f00, f01, f02, t00, t01, t02),
+                f01 - dot(f00, f01, f02, t01, t11, t12),
+                f02 - dot(f00, f01, f02, t02, t12, t22),
+            )
+            r10, r11, r12 = (
+                f10 - dot(f10, f11, f12, t00, t01, t02),
+                f11 - dot(f10, f11, f12, t01, t11, t12),
+                f12 - dot(f10, f11, f12, t02, t12, t22),
+            )
+            r20, r21, r22 = (
+                f20 - dot(f20, f21, f22, t00, t01, t02),
+                f21 - dot(f20, f21, f22, t01, t11, t12),
+                f22 - dot(f20, f21, f22, t02, t12, t22),
+            )
+            a00, a11, a22 = (
+                wp.cw_mul(g, y + dot(f00, f01, f02, f00, f01, f02)),
+                wp.cw_mul(g, y + dot(f10, f11, f12, f10, f11, f12)),
+                wp.cw_mul(g, y + dot(f20, f21, f22, f20, f21, f22)),
+            )
+            a12, a02, a01 = (
+                wp.cw_mul(g, dot(f10, f11, f12, f20, f21, f22)),
+                wp.cw_mul(g, dot(f00, f01, f02, f20, f21, f22)),
+                wp.cw_mul(g, dot(f00, f01, f02, f10, f11, f12)),
+            )
+            first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
+            for n in range(count):
+                p = first + n
+                mu = wp.dot(mu_of, stiffness[b, p])
+                r = wp.mat33d(r00[n], r01[n], r02[n], r10[n], r11[n], r12[n], r20[n], r21[n], r22[n])
+                a = wp.mat33d(a00[n], a01[n], a02[n], a01[n], a11[n], a12[n], a02[n], a12[n], a22[n])
+                rotation_blocks(r, (TWO * mu) * a, mu, tangent_out[b, p])
+                if damped:
+                    f = wp.mat33d(f00[n], f01[n], f02[n], f10[n], f11[n], f12[n], f20[n], f21[n], f22[n])
+                    add_viscous_tangent(f, wp.vec2d(mu, ZERO), c, strain_offset[b, p], ZERO, False, tangent_out[b, p])
+            alone = wp.min((group + 1) * WIDTH, shape_points)
+        for p_one in range(begin + alone, begin + points_per_cell):
+            f_one = deformation_gradient(positions, nodes, gradients, b, p_one, cell)
+            m = stiffness[b, p_one]
+            out = tangent_out[b, p_one]
+            elastic_tangent(f_one, m, clamped, out)
+            if damped:
+                lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
+                offset, dilation = strain_offset[b, p_one], dilation_offset[b, p_one]
+                add_viscous_tangent(f_one, lame, c, offset, dilation, clamped, out)
+
+    return SimpleNamespace(step=cell_step, tangent=cell_tangent)

@@ -79,6 +79,24 @@ def add_strain_tangent(
 
 
 @wp.func
+def add_viscous_tangent(
+    f: wp.mat33d,
+    lame: wp.vec2d,
+    c: wp.vec2d,
+    offset: wp.mat33d,
+    dilation_offset: wp.float64,
+    clamp: bool,
+    out: wp.array[wp.mat33d],
+):
+    """Adds the blocks of `viscous_response`; clamped ones without the part by stress, which may be indefinite."""
+    stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    if not clamp:
+        strain = green_strain(f)
+        stress = isotropic(c[0] * strain - offset, c[1] * wp.trace(strain) - dilation_offset, lame[0], lame[1])
+    add_strain_tangent(f, stress, c[0] * lame[0], c[1] * lame[1], out)
+
+
+@wp.func
 def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
     """Adds the blocks of a factor times the product of a matrix with itself."""
     columns = wp.transpose(a)
@@ -162,18 +180,13 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             elastic_tangent(f, m, clamp[b] != 0, out)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
-            shape, bulk = wp.dot(mu_of, m), wp.dot(lambda_of, m)
-            strain = green_strain(f)
-            left, rest = c[0] * strain - strain_offset[b, p], c[1] * wp.trace(strain) - dilation_offset[b, p]
+            lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
             if wp.static(shares):
+                left = c[0] * green_strain(f) - strain_offset[b, p]
                 phi = dissipation(wp.ddot(left, left), shared[b])
-                add_square(f * left, FOUR * c[0] * shape * phi[2], out)
-                shape = phi[1] * shape
-            stress = isotropic(left, rest, shape, bulk)
-            if clamp[b] != 0:
-                # The stress part of the viscous Hessian may be indefinite and is dropped in a clamped Hessian.
-                stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-            add_strain_tangent(f, stress, c[0] * shape, c[1] * bulk, out)
+                add_square(f * left, FOUR * c[0] * lame[0] * phi[2], out)
+                lame[0] = phi[1] * lame[0]
+            add_viscous_tangent(f, lame, c, strain_offset[b, p], dilation_offset[b, p], clamp[b] != 0, out)
 
     @wp.kernel(module=module)
     def adjoint(

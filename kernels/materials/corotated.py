@@ -77,10 +77,8 @@ def turning(f: wp.mat33d, r: wp.mat33d) -> wp.mat33d:
 
 
 @wp.func
-def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
-    """Writes the blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
-    r = polar_rotation(f)
-    scaled = TWO * shape * turning(f, r)
+def rotation_blocks(r: wp.mat33d, scaled: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
+    """Writes the blocks of 2 mu (dF - dR) from R and 2 mu A^-1 (`turning`)."""
     columns = wp.transpose(r)
     for k in range(3):
         turned = wp.skew(columns[k]) * scaled
@@ -91,6 +89,13 @@ def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
                 block[1, 1] += TWO * shape
                 block[2, 2] += TWO * shape
             out[(k * (k + 1)) / 2 + n] = block
+
+
+@wp.func
+def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
+    """Writes the blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
+    r = polar_rotation(f)
+    rotation_blocks(r, TWO * shape * turning(f, r), shape, out)
 
 
 @wp.func

@@ -443,9 +443,9 @@ class Term(ABC):
         del s, values, positions, residual, energy
         return None
 
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        """Returns the kernel of the tangent's blocks, and its inputs after ``active`` and ``clamp``."""
-        return self._kernels.tangent, self._arguments(s, values, positions)
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, int, list[Any]]:
+        """Returns the kernel of the tangent's blocks, its threads, and its inputs after ``active`` and ``clamp``."""
+        return self._kernels.tangent, s.n_points, self._arguments(s, values, positions)
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:

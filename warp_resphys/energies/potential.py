@@ -354,8 +354,8 @@ class IncrementalPotential(Launcher):
             tangents += term.before(values, self._position_view, masks[0])
             for s in term.sets:
                 tangent = warp_view(next(blocks), wp.mat33d)
-                kernel, inputs = term.tangent(s, values, self._position_view)
-                tangents.append(self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]))
+                kernel, threads, inputs = term.tangent(s, values, self._position_view)
+                tangents.append(self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent]))
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 products += [
                     self.product(s, tangent, direction, stress),

@@ -278,12 +278,28 @@ class SolidTerm(StrainTerm):
         together = self._together(s)
         if together is None:
             return None
-        own, (nodes, gradients, stiffness, _, *rest) = self.launcher, self._arguments(s, values, positions)
-        inputs = [warp_view(own.active, wp.int32), nodes, gradients, stiffness, *rest, *together]
+        own, inputs = self.launcher, self._cell_arguments(s, values, positions)
+        by_nodes = np.zeros((s.n_points, -(-s.nodes_per_cell // lanes.WIDTH) * lanes.WIDTH, 3))
+        by_nodes[:, : s.nodes_per_cell] = s.source.gradients.reshape(s.n_points, -1, 3)
+        by_nodes = by_nodes.reshape(s.n_points, -1, lanes.WIDTH, 3).swapaxes(2, 3)
+        inputs = [warp_view(own.active, wp.int32), *inputs, *together, own.upload(by_nodes, lanes.lanes)]
         outputs = [warp_view(residual, wp.vec3d), energy]
         return own.record(lanes.cell_kernels(self._law).step, (own.batch, s.cells), inputs, outputs)
 
-    def _together(self, s: PointSet) -> tuple[Any, Any, int] | None:
+    @override
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, int, list[Any]]:
+        together = self._together(s)
+        if together is None:
+            return super().tangent(s, values, positions)
+        inputs = [*self._cell_arguments(s, values, positions), *together]
+        return lanes.cell_kernels(self._law).tangent, s.cells, inputs
+
+    def _cell_arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+        """Returns those of `_arguments` that `kernels.lanes` takes."""
+        nodes, gradients, stiffness, _, *rest = self._arguments(s, values, positions)
+        return [nodes, gradients, stiffness, *rest]
+
+    def _together(self, s: PointSet) -> tuple[Any, int] | None:
         """Returns the gradients of those points of a set that `kernels.lanes` takes together, and their number a cell.
 
         None where there are none: on a GPU, for other laws, and in cells with less than two points without a volume
@@ -295,16 +311,11 @@ class SolidTerm(StrainTerm):
         count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
         if count < 2:
             return None
-        own, nodes = s.source.gradients, s.nodes_per_cell
-        groups, parts = -(-count // lanes.WIDTH), -(-nodes // lanes.WIDTH)
+        groups = -(-count // lanes.WIDTH)
         chosen = np.minimum(np.arange(groups * lanes.WIDTH), count - 1)
         # (C, Q, K, 3) to (C, G, K, 3, points of a group)
-        together = own[:, chosen].reshape(s.cells, groups, lanes.WIDTH, nodes, 3).transpose(0, 1, 3, 4, 2)
-        by_nodes = np.zeros((s.n_points, parts * lanes.WIDTH, 3))
-        by_nodes[:, :nodes] = own.reshape(s.n_points, nodes, 3)
-        by_nodes = by_nodes.reshape(s.n_points, parts, lanes.WIDTH, 3).transpose(0, 1, 3, 2)
-        upload = self.launcher.upload
-        return upload(together, lanes.lanes), upload(by_nodes, lanes.lanes), count
+        gradients = s.source.gradients[:, chosen].reshape(s.cells, groups, lanes.WIDTH, s.nodes_per_cell, 3)
+        return self.launcher.upload(gradients.transpose(0, 1, 3, 4, 2), lanes.lanes), count
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

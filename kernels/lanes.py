@@ -163,8 +163,8 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         together: wp.array4d[lanes],  # (C, G, K, 3) gradients of a cell's first S points, filled up with the last
-        shape_points: int,  # S, the number of points without a volume term, which come first
         by_nodes: wp.array3d[lanes],  # (P, K / 8, 3) gradients, of eight nodes at a time, filled up with zeros
+        shape_points: int,  # S, the number of points without a volume term, which come first
         force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
     ):
@@ -263,6 +263,7 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         together: wp.array4d[lanes],
+        by_nodes: wp.array3d[lanes],
         shape_points: int,
         tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
     ):

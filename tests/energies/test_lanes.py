@@ -32,7 +32,7 @@ def positions(mesh):
 
 
 def evaluated(mesh, viscous):
-    """Residual and energies of points, and whether cells are taken as a whole."""
+    """A potential after an evaluation and a tangent, of which one environment has clamped eigenvalues."""
     body, batch = Body(mesh), len(STRAINS)
     solid = Solid(body.discretisation, MATERIALS["corotated"]())
     none = torch.zeros(0, dtype=torch.int64)
@@ -53,6 +53,7 @@ def evaluated(mesh, viscous):
     p.set_terms(StepTerms(p.zeros(n, 3), p.zeros(n), p.zeros(n, 3), values))
     p.positions.copy_(torch.as_tensor(positions(mesh)))
     p.evaluate()
+    p.update_tangent(torch.arange(batch) == 1)
     return p
 
 
@@ -60,8 +61,8 @@ def evaluated(mesh, viscous):
 @pytest.mark.parametrize("mesh", MESHES)
 def test_cells_as_a_whole_equal_their_points(mesh, viscous, monkeypatch):
     whole = evaluated(MESHES[mesh], viscous)
-    assert all(term._together(s) is not None for term in whole.energies for s in term.sets)
-    monkeypatch.setattr(SolidTerm, "_together", lambda *_: None)
+    assert all(whole.energies[0].whole_cells(s, whole.own_values[0], whole._position_view) for s in whole.sets)
+    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
     single = evaluated(MESHES[mesh], viscous)
     for points in whole.sets:
         own = points.source
@@ -73,4 +74,6 @@ def test_cells_as_a_whole_equal_their_points(mesh, viscous, monkeypatch):
         size = float(other.abs().max())
         torch.testing.assert_close(one, other, rtol=0.0, atol=1e-13 * (size + 1.0) / SIZE[1])
     torch.testing.assert_close(whole.energy, single.energy, rtol=1e-9, atol=1e-14)
+    for one, other in zip(whole.tangents, single.tangents, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(whole._point_energy, single._point_energy, rtol=1e-9, atol=1e-14)

@@ -15,7 +15,7 @@ Simulator, solver, adjoint, tape, gradient check, identification and configurati
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -329,6 +329,20 @@ class BoundEnergy:
         return {}
 
 
+class WholeCells(NamedTuple):
+    """Kernels with one thread per cell.
+
+    Attributes:
+        step: adds forces to a residual (B, N) and sets the points' energies (B, P).
+        tangent: sets the tangent's blocks (B, P, blocks).
+        inputs: of both after ``active``, and of the second after ``clamp`` too.
+    """
+
+    step: Any
+    tangent: Any
+    inputs: list[Any]
+
+
 class Term(ABC):
     """An energy's kernels for a batch.
 
@@ -433,19 +447,14 @@ class Term(ABC):
         """Returns the kernel of stress and energy, and its inputs after ``active``."""
         return self._kernels.local_step, self._arguments(s, values, positions)
 
-    def residual_launch(
-        self, s: PointSet, values: Values, positions: Any, residual: torch.Tensor, energy: Any
-    ) -> Any | None:
-        """Returns a launch that adds the forces of a set to a residual and sets its energies, or None.
+    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
+        """Returns the kernel of the tangent's blocks, and its inputs after ``active`` and ``clamp``."""
+        return self._kernels.tangent, self._arguments(s, values, positions)
 
-        It takes the place of the kernel of `step` and of `Launcher.gather` where cells can be taken as a whole.
-        """
-        del s, values, positions, residual, energy
+    def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
+        """Returns kernels with one thread per cell, in place of those of `step` and `tangent`, or None."""
+        del s, values, positions
         return None
-
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, int, list[Any]]:
-        """Returns the kernel of the tangent's blocks, its threads, and its inputs after ``active`` and ``clamp``."""
-        return self._kernels.tangent, s.n_points, self._arguments(s, values, positions)
 
     @abstractmethod
     def curvature(self, values: Values) -> torch.Tensor:

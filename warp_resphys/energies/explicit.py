@@ -67,7 +67,7 @@ class ExplicitEnergy(Launcher):
         view = s.stress_view(self.zeros(s.n_points, 3, s.width))
         tangent = warp_view(self.zeros(s.n_points, s.blocks, 3, 3), wp.mat33d)
         masks = [warp_view(mask, wp.int32) for mask in (self.active, torch.zeros_like(self.active))]
-        kernel, _, inputs = self.term.tangent(s, named, self._view(positions))
+        kernel, inputs = self.term.tangent(s, named, self._view(positions))
         out = torch.zeros_like(positions)
         self.launch(
             self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]),

@@ -149,9 +149,10 @@ class IncrementalPotential(Launcher):
             commands += term.before(values, self._position_view, active)
             for s in term.sets:
                 energy = warp_view(self._point_energy[:, s.part], wp.float64)
-                whole = term.residual_launch(s, values, self._position_view, self.residual, energy)
+                whole = term.whole_cells(s, values, self._position_view)
                 if whole is not None:
-                    commands.append(whole)
+                    outputs = [warp_view(self.residual, wp.vec3d), energy]
+                    commands.append(self.record(whole.step, (b, s.cells), [active, *whole.inputs], outputs))
                     continue
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 kernel, inputs = term.step(s, values, self._position_view)
@@ -354,7 +355,11 @@ class IncrementalPotential(Launcher):
             tangents += term.before(values, self._position_view, masks[0])
             for s in term.sets:
                 tangent = warp_view(next(blocks), wp.mat33d)
-                kernel, threads, inputs = term.tangent(s, values, self._position_view)
+                whole, threads = term.whole_cells(s, values, self._position_view), s.n_points
+                if whole is None:
+                    kernel, inputs = term.tangent(s, values, self._position_view)
+                else:
+                    kernel, inputs, threads = whole.tangent, whole.inputs, s.cells
                 tangents.append(self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent]))
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 products += [

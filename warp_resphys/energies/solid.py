@@ -20,7 +20,18 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
+from .base import (
+    Adjoint,
+    BoundEnergy,
+    Energy,
+    EnergySite,
+    EnergyStep,
+    Memory,
+    PointSet,
+    Values,
+    WholeCells,
+    value_of,
+)
 from .launcher import Launcher, warp_view
 from .materials import Material
 from .strain import GreenStrain, StrainTerm
@@ -243,6 +254,7 @@ class SolidTerm(StrainTerm):
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli, self._shared = len(material.rules), int(getattr(law, "SHARED", 0))
         self._carried = carried
+        self._lanes = dict[PointSet, tuple[Any, Any, int] | None]()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
         stiff = self._curvature > 0.0
         self._stiff: torch.Tensor | slice = slice(None) if bool(stiff.all()) else stiff  # a slice copies nothing
@@ -272,50 +284,33 @@ class SolidTerm(StrainTerm):
         return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
 
     @override
-    def residual_launch(
-        self, s: PointSet, values: Values, positions: Any, residual: torch.Tensor, energy: Any
-    ) -> Any | None:
-        together = self._together(s)
-        if together is None:
-            return None
-        own, inputs = self.launcher, self._cell_arguments(s, values, positions)
-        by_nodes = np.zeros((s.n_points, -(-s.nodes_per_cell // lanes.WIDTH) * lanes.WIDTH, 3))
-        by_nodes[:, : s.nodes_per_cell] = s.source.gradients.reshape(s.n_points, -1, 3)
-        by_nodes = by_nodes.reshape(s.n_points, -1, lanes.WIDTH, 3).swapaxes(2, 3)
-        inputs = [warp_view(own.active, wp.int32), *inputs, *together, own.upload(by_nodes, lanes.lanes)]
-        outputs = [warp_view(residual, wp.vec3d), energy]
-        return own.record(lanes.cell_kernels(self._law).step, (own.batch, s.cells), inputs, outputs)
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, int, list[Any]]:
-        together = self._together(s)
-        if together is None:
-            return super().tangent(s, values, positions)
-        inputs = [*self._cell_arguments(s, values, positions), *together]
-        return lanes.cell_kernels(self._law).tangent, s.cells, inputs
-
-    def _cell_arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        """Returns those of `_arguments` that `kernels.lanes` takes."""
-        nodes, gradients, stiffness, _, *rest = self._arguments(s, values, positions)
-        return [nodes, gradients, stiffness, *rest]
-
-    def _together(self, s: PointSet) -> tuple[Any, int] | None:
-        """Returns the gradients of those points of a set that `kernels.lanes` takes together, and their number a cell.
-
-        None where there are none: on a GPU, for other laws, and in cells with less than two points without a volume
-        term before the others.
-        """
+    def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
         if self.launcher.by_cells or not getattr(self._law, "TOGETHER", False):
             return None
+        if s not in self._lanes:
+            self._lanes[s] = self._lane_arrays(s)
+        if (arrays := self._lanes[s]) is None:
+            return None
+        own = lanes.cell_kernels(self._law)
+        nodes, gradients, stiffness, _, *rest = self._arguments(s, values, positions)
+        return WholeCells(own.step, own.tangent, [nodes, gradients, stiffness, *rest, *arrays])
+
+    def _lane_arrays(self, s: PointSet) -> tuple[Any, Any, int] | None:
+        """Returns the last inputs of `kernels.lanes` for a set.
+
+        None where cells have less than two points without a volume term before the others.
+        """
         with_volume = (self._carried[s.own].reshape(s.cells, s.points_per_cell, -1)[..., 1:] > 0.0).any((0, 2))
         count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
         if count < 2:
             return None
-        groups = -(-count // lanes.WIDTH)
-        chosen = np.minimum(np.arange(groups * lanes.WIDTH), count - 1)
+        gradients, width, nodes = s.source.gradients, lanes.WIDTH, s.nodes_per_cell
+        chosen = np.minimum(np.arange(-(-count // width) * width), count - 1)
         # (C, Q, K, 3) to (C, G, K, 3, points of a group)
-        gradients = s.source.gradients[:, chosen].reshape(s.cells, groups, lanes.WIDTH, s.nodes_per_cell, 3)
-        return self.launcher.upload(gradients.transpose(0, 1, 3, 4, 2), lanes.lanes), count
+        together = gradients[:, chosen].reshape(s.cells, -1, width, nodes, 3).transpose(0, 1, 3, 4, 2)
+        by_nodes = np.pad(gradients.reshape(-1, nodes, 3), ((0, 0), (0, -nodes % width), (0, 0)))
+        by_nodes = by_nodes.reshape(s.n_points, -1, width, 3).swapaxes(2, 3)
+        return self.launcher.upload(together, lanes.lanes), self.launcher.upload(by_nodes, lanes.lanes), count
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

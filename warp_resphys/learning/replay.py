@@ -4,12 +4,12 @@ A replay simulates every trial from its own start, under its own inputs, for one
 at once, and interpolates the observation at the times of the frames. All of it is differentiable.
 """
 
+import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import torch
 
@@ -32,6 +32,7 @@ Near = Callable[[int], torch.Tensor | None]
 Record = Callable[[torch.Tensor, torch.Tensor], None]
 
 _FIRST, _OTHERS = slice(0, 1), slice(1, None)  # sets of parameters
+_AT_ONCE = 16  # positions that are observed together
 _EXACT = 1e-12  # relative tolerance of a solver, small enough for differences of solutions
 
 
@@ -259,10 +260,17 @@ class Replay:
                 log.debug("the step is solved again without a prediction: %s", error)
         return self.simulator.step(state, inputs, constants)[0]
 
+    def _observed(self, positions: Iterable[torch.Tensor]) -> torch.Tensor:
+        """(B, K, M, 3) points at K positions (B, N, 3) [m], some at once: for few, most time is overhead."""
+        series, rest = list[torch.Tensor](), iter(positions)
+        while some := list(itertools.islice(rest, _AT_ONCE)):
+            series.append(self.observe(torch.cat(some)).unflatten(0, (len(some), -1)).transpose(0, 1))
+        return torch.cat(series, 1)
+
     def seen(self, start: Start, states: Sequence[State]) -> torch.Tensor:
         """(1, R, T, M, 3) points at the times of the frames [m], from `states`."""
         self.settled = states[0].q if start.at_rest else None
-        return self.at_frames(torch.stack([self.observe(state.q) for state in states], 1), start)[None]
+        return self.at_frames(self._observed(state.q for state in states), start)[None]
 
     def varied(
         self,
@@ -300,6 +308,12 @@ class Replay:
         """
         first, others = ({name: value[own] for name, value in parameters.items()} for own in (_FIRST, _OTHERS))
         states = self.states(start, first) if states is None else states
+        return self._observed(self._varied_positions(start, first, others, states, record))
+
+    def _varied_positions(
+        self, start: Start, first: Parameters, others: Parameters, states: Sequence[State], record: Record | None
+    ) -> Iterator[torch.Tensor]:
+        """Yields the positions (E R, N, 3) of `varied_series` [m], from the release on."""
         (own, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
         sets, state = _count(others), states[0]
         if not start.at_rest:
@@ -312,8 +326,8 @@ class Replay:
             there = self._beside[1].linearise_equilibrium(their_resting, their, sets * state.batch)
             varied = self._varied(state.q, here, there)
         self.settled = torch.cat([state.q, varied.q]) if start.at_rest else None
-        series = [self.observe(torch.cat([state.q, varied.q]))]
-        for k, (state, solved) in enumerate(pairwise(states)):
+        yield torch.cat([state.q, varied.q])
+        for k, (state, solved) in enumerate(itertools.pairwise(states)):
             here = self._beside[0].linearise(state, inputs.at(k), own)
             try:
                 there = self._beside[1].linearise(varied, their_inputs.at(k), their)
@@ -321,10 +335,9 @@ class Replay:
                 message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
                 raise ConvergenceError(message, None, None) from error
             varied = self._varied(self.simulator.method.solution_for(state, solved.q), here, there)
-            series.append(self.observe(torch.cat([solved.q, varied.q])))
+            yield torch.cat([solved.q, varied.q])
             if record is not None:
                 record(solved.q, varied.q)
-        return torch.stack(series, 1)
 
     def _varied(self, x: torch.Tensor, here: Linearisation, there: Linearisation) -> State:
         """Returns the states of the other sets of parameters, from the solution (R, N, 3) x of the first [m]."""

@@ -1,4 +1,4 @@
-"""The ten error messages that users meet most, word for word: what is wrong, where, and what to do."""
+"""The error messages that users meet most, word for word: what is wrong, where, and what to do."""
 
 import re
 from pathlib import Path
@@ -8,6 +8,7 @@ import torch
 
 import warp_resphys as wr
 from support.configured import check, composed
+from warp_resphys.dynamics.statics import find_equilibrium
 
 BOX = wr.box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))
 FREE, CLAMPED = wr.Body(BOX), wr.Body(BOX, fixed=wr.select_vertices(BOX, x=0.0))
@@ -27,6 +28,12 @@ def collapsed():
     return beam(wr.Body(wr.Mesh(vertices, BOX.cells)))
 
 
+def buckling(share, x):
+    if share > 0.3:
+        raise wr.ConvergenceError("", x, None)
+    return x, None
+
+
 MESSAGES = {
     "unknown key 'sed', did you mean 'seed'?": lambda: check({**composed(), "sed": 1}),
     "Unknown input presure. This body accepts external_force, fixed_positions, attached_mass.": (
@@ -35,8 +42,10 @@ MESSAGES = {
     "arm.vtu: there is no such mesh file": lambda: wr.read_mesh(Path("arm.vtu")),
     "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
     "them": collapsed,
-    "no equilibrium was found: under growing loads it is lost beyond 0 % of them; lower the loads, or take a stiffer "
-    "material.": lambda: beam().static_equilibrium(pushed(1e4)),
+    "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the loads, "
+    "or take a stiffer material.": lambda: beam().static_equilibrium(pushed(1e3)),
+    "no equilibrium was found: under growing loads it is lost beyond 30 % of them; lower the loads, or take a stiffer "
+    "material.": lambda: find_equilibrium(buckling, torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), limited=False),
     "the quasi_newton solver stopped after 1 iterations with a relative residual of SIZE in environment 0 of 1: take a "
     "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.": (
         lambda: beam(max_iterations=1).step(beam().rest_state(), pushed(0.1))

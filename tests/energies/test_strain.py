@@ -1,0 +1,53 @@
+"""Green strain at the points of a solid, of which the last results serve again."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra
+from warp_resphys.energies.strain import GreenStrain, StrainTerm
+
+MESH = box_hexahedra((0.1, 0.02, 0.02), (3, 1, 1))
+
+
+@pytest.fixture
+def term():
+    simulator = Simulator(Body(MESH), Corotated(1e5, 0.45, stiffness_damping=0.01))
+    (found,) = (t for t in simulator.workspace(1).potential.energies if isinstance(t, StrainTerm))
+    return found
+
+
+def stretched(factor):
+    return torch.as_tensor(MESH.vertices * np.array([factor, 1.0, 1.0]))[None]
+
+
+def strained(factor):
+    return 0.5 * (factor**2 - 1.0)
+
+
+def test_a_stretched_bar_has_its_strain_however_often_it_is_asked_for(term):
+    one, two = stretched(1.1), stretched(1.2)
+    for q, factor in ((one, 1.1), (two, 1.2), (one, 1.1), (stretched(1.3), 1.3), (two, 1.2), (one, 1.1)):
+        strain = GreenStrain.apply(term, q)
+        np.testing.assert_allclose(strain[..., 0, 0], strained(factor), rtol=1e-12)
+        assert float(strain[..., 1:, :].abs().max()) < 1e-12
+        strain.zero_()  # of its caller alone
+
+
+def test_positions_that_changed_in_place_have_another_strain(term):
+    q = stretched(1.1)
+    GreenStrain.apply(term, q)
+    q.copy_(stretched(1.4))
+    np.testing.assert_allclose(GreenStrain.apply(term, q)[..., 0, 0], strained(1.4), rtol=1e-12)
+    with torch.inference_mode():
+        q = stretched(1.1)
+        GreenStrain.apply(term, q)
+        q.copy_(stretched(1.4))
+        np.testing.assert_allclose(GreenStrain.apply(term, q)[..., 0, 0], strained(1.4), rtol=1e-12)
+
+
+def test_a_strain_that_is_asked_for_again_has_its_gradient(term):
+    q = stretched(1.1).requires_grad_()
+    gradients = [torch.autograd.grad(GreenStrain.apply(term, q).square().sum(), q)[0] for _ in range(2)]
+    assert float(gradients[0].abs().max()) > 0.0
+    torch.testing.assert_close(*gradients, rtol=0.0, atol=0.0)

@@ -42,8 +42,8 @@ MESSAGES = {
     "arm.vtu: there is no such mesh file": lambda: wr.read_mesh(Path("arm.vtu")),
     "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
     "them": collapsed,
-    "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the loads, "
-    "or take a stiffer material.": lambda: beam().static_equilibrium(pushed(1e3)),
+    "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the "
+    "loads, or take a stiffer material.": lambda: beam().static_equilibrium(pushed(1e3)),
     "no equilibrium was found: under growing loads it is lost beyond 30 % of them; lower the loads, or take a stiffer "
     "material.": lambda: find_equilibrium(buckling, torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), limited=False),
     "the quasi_newton solver stopped after 1 iterations with a relative residual of SIZE in environment 0 of 1: take a "

@@ -10,7 +10,7 @@ and volume terms may be integrated at different points, so that a modulus may be
 - ``slopes(f, df, m, carried) -> dP/dm_t : df`` for every t; undefined where the volume ``carried`` is zero,
 - ``tangent(f, m, clamp, out)``: the blocks of dP/dF; with ``clamp``, without negative eigenvalues.
 
-A law whose first modulus alone has the shape term ``m_0 ||F - R||^2`` may set ``TOGETHER`` (`kernels.lanes`).
+A law whose first modulus alone has the shape term ``m_0 ||F - R||^2`` may set ``LANES`` (`kernels.lanes`).
 
 A law with values that all points of an environment share, such as the weights of a network, has their number
 ``SHARED``. Then ``response`` and ``tangent`` take these values after the moduli, and

@@ -11,7 +11,7 @@ from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
 from ..unimodular import unimodular_offset
 
 NAME, LAME = "corotated", ((1.0, 0.0), (0.0, 1.0 / 3.0))
-TOGETHER = True  # the shape term is that of `kernels.lanes`
+LANES = True  # `kernels.lanes` has the shape term
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 
 moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)

@@ -285,7 +285,7 @@ class SolidTerm(StrainTerm):
 
     @override
     def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
-        if self.launcher.by_cells or not getattr(self._law, "TOGETHER", False):
+        if self.launcher.by_cells or not getattr(self._law, "LANES", False):
             return None
         if s not in self._lanes:
             self._lanes[s] = self._lane_arrays(s)

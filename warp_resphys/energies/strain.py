@@ -28,7 +28,8 @@ class StrainTerm(Term):
     def _strain(self) -> Callable[[torch.Tensor], torch.Tensor]:
         """`strain`, recorded at its first use.
 
-        The last results serve again: a step ends where the next one begins, and both need the strain there.
+        The last results serve again: a step ends where the next one begins, and both need the strain there. So results
+        must not be changed in place.
         """
         own = self.launcher
         at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
@@ -50,11 +51,11 @@ class StrainTerm(Term):
             version = -1 if positions.is_inference() else positions._version
             for earlier, its_version, strains in known:
                 if earlier() is positions and its_version == version >= 0:
-                    return strains.clone()
+                    return strains.detach()
             at.copy_(positions)
             own.launch(recorded)
             known.append((weakref.ref(positions), version, out.clone()))
-            return out.clone()
+            return known[-1][-1].detach()
 
         return strain
 

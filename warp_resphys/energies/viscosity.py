@@ -56,21 +56,24 @@ class Viscosity:
         """
         batch = len(q)
         both = (self.damping / stage.step).expand(batch, 2)
-        c, d = both.unbind(1)
         offset = dilation = None
         if self.damped:
-            reference = reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights])
-            offset, dilation = _scale(c, reference), d[:, None] * reference.diagonal(dim1=-2, dim2=-1).sum(-1)
+            strains = [(w, strain(x)) for x, w in stage.strain_weights]
+            offset = reduce(torch.add, [_scale(w * both[:, 0], own) for w, own in strains])
+            traces = [w * own.diagonal(dim1=-2, dim2=-1).sum(-1) for w, own in strains]
+            dilation = both[:, 1:] * reduce(torch.add, traces)
         if self.ratio is None or self.time is None:
             return both, offset, dilation
         decay, gamma = relaxation(self.time, stage.end * time_step)
         added = (self.ratio * gamma).expand(batch, -1).sum(1)
         branches = _scale(added, strain(q))
+        offset = branches if offset is None else offset + branches
         if carried is not None:
-            branches = branches - torch.einsum("bk,bkpij->bpij", (self.ratio * decay).expand(batch, -1), carried)
-        c, offset = c + added, branches if offset is None else offset + branches
+            shares = (self.ratio * decay).expand(batch, -1)[:, None].to(offset)  # (B, 1, K)
+            flat = torch.baddbmm(offset.flatten(1)[:, None], shares, carried.flatten(2).to(offset), alpha=-1.0)
+            offset = flat.view_as(offset)
         dilation = branches.new_zeros(branches.shape[:2]) if dilation is None else dilation
-        return torch.stack([c, d], 1), offset, dilation
+        return torch.stack([both[:, 0] + added, both[:, 1]], 1), offset, dilation
 
     def relax(
         self, strain: Strain, q: torch.Tensor, carried: torch.Tensor | None, end: torch.Tensor, seconds: float
@@ -86,8 +89,8 @@ class Viscosity:
         """
         assert self.time is not None
         decay, gamma = (x[..., None, None, None] for x in relaxation(self.time, seconds))
-        strained = gamma * (strain(end) - strain(q))[:, None].to(gamma.dtype)
-        return strained if carried is None else strained + decay * carried
+        strained = (strain(end) - strain(q))[:, None].to(gamma.dtype)
+        return gamma * strained if carried is None else torch.addcmul(decay * carried, gamma, strained)
 
 
 def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,8 +13,8 @@ of which x is the largest root. With s = x - y + z and g = (3 + x) (3 + y) - J, 
     g (U - I)      = s (4 + x) I + ((3 + x)^2 - y - 5) e - e^2
     J (I - U^-1)   = s I + (3 + x) (U - I) - e
 
-and F - R = F (I - U^-1). All terms are small with the strain, so that their rounding errors are, too. By the same
-theorem, the matrix of `kernels.materials.corotated.turning` is (F F^T + (3 + y) I) / g.
+and F - R = F (I - U^-1). All terms are small with the strain, so that they add no error to those of e and z. By the
+same theorem, the matrix of `kernels.materials.corotated.turning` is (F F^T + (3 + y) I) / g.
 """
 
 import functools
@@ -23,14 +23,13 @@ from types import ModuleType, SimpleNamespace
 import warp as wp
 
 from .materials.corotated import rotation_blocks
+from .matrices import HALLEY_ITERATIONS, HALLEY_TOLERANCE, LARGEST_TRACE
 from .modules import named_module
 from .points import deformation_gradient
 from .solid import add_viscous_tangent, viscous_response
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
-ITERATIONS = 12
-TOLERANCE = wp.float64(1.0e-11)  # of the trace's last squared change: Halley's iteration, of third order, is exact then
-FLATTEST = wp.float64(0.05)  # smallest J of points that are taken together
+FLATTEST = wp.float64(0.2)  # smallest J of points that are taken together; the others' errors would grow with 1 / J
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR, FIVE, SIX = wp.float64(3.0), wp.float64(4.0), wp.float64(5.0), wp.float64(6.0)
 EIGHT, TWELVE = wp.float64(8.0), wp.float64(12.0)
@@ -87,13 +86,13 @@ def metric(f00: lanes, f01: lanes, f02: lanes, f10: lanes, f11: lanes, f12: lane
 
 @wp.func
 def stretch(j: lanes, e00: lanes, e11: lanes, e22: lanes, e12: lanes, e02: lanes, e01: lanes):
-    """Returns 1 / g, 3 + y, |U - I|^2, the components of I - U^-1, and whether all are exact."""
+    """Returns 1 / g, 3 + y, |U - I|^2, the components of I - U^-1, and whether they are as exact as F."""
     one = lanes(ONE)
     e1, z = e00 + e11 + e22, j - one
     e2 = minor(e00, e11, e01, e01) + minor(e00, e22, e02, e02) + minor(e11, e22, e12, e12)
     x = HALF * e1  # not below the root, to which Halley's iteration falls
     change = ONE
-    for _ in range(ITERATIONS):
+    for _ in range(HALLEY_ITERATIONS):
         p = wp.cw_mul(x, lanes(SIX) + x) - e1
         q, trace = lanes(SIX) + p, lanes(THREE) + x
         value = TWELVE * p + wp.cw_mul(p, p) - EIGHT * (x + e1 + wp.cw_mul(z, trace)) - FOUR * e2
@@ -102,7 +101,7 @@ def stretch(j: lanes, e00: lanes, e11: lanes, e22: lanes, e12: lanes, e02: lanes
         step = wp.cw_div(TWO * wp.cw_mul(value, slope), TWO * wp.cw_mul(slope, slope) - wp.cw_mul(value, bend))
         x -= step
         change = wp.dot(step, step)
-        if change < TOLERANCE:
+        if change < HALLEY_TOLERANCE:
             break
     y = HALF * (wp.cw_mul(x, lanes(SIX) + x) - e1)
     s, i = x - y + z, lanes(THREE) + x
@@ -126,7 +125,7 @@ def stretch(j: lanes, e00: lanes, e11: lanes, e22: lanes, e12: lanes, e02: lanes
         wp.cw_mul(k, wp.cw_mul(i, h12) - e12),
         wp.cw_mul(k, wp.cw_mul(i, h02) - e02),
         wp.cw_mul(k, wp.cw_mul(i, h01) - e01),
-        change < TOLERANCE and wp.min(j) > FLATTEST,
+        change < HALLEY_TOLERANCE and wp.min(j) > FLATTEST and wp.max(e1) < LARGEST_TRACE - THREE,
     )
 
 
@@ -172,12 +171,12 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         if active[b] == 0:
             return
         damping, begin = viscosity[b], cell * points_per_cell
-        alone = wp.int32(0)  # first point of those that are taken one by one
+        first_alone = wp.int32(0)  # of the points that are taken one by one
         for group in range(together.shape[1]):
             f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
             j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
             e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
-            _g, _y, energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
+            _g, _i2, energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
             if not exact:
                 break
             first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
@@ -233,8 +232,8 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
                     y += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
                     z += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
                 scatter(x, y, z, nodes[cell], part, force_out[b])
-            alone = wp.min((group + 1) * WIDTH, shape_points)
-        for p in range(begin + alone, begin + points_per_cell):
+            first_alone = wp.min((group + 1) * WIDTH, shape_points)
+        for p in range(begin + first_alone, begin + points_per_cell):
             f_one = deformation_gradient(positions, nodes, gradients, b, p, cell)
             m = stiffness[b, p]
             energy_one, stress_one = respond(f_one, m)
@@ -271,14 +270,16 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         if active[b] == 0:
             return
         c, begin, clamped = viscosity[b], cell * points_per_cell, clamp[b] != 0
-        damped = c[0] + c[1] > ZERO
-        alone = wp.int32(0)
-        for group in range(together.shape[1]):
+        groups = together.shape[1]
+        if clamped:
+            groups = 0
+        first_alone = wp.int32(0)
+        for group in range(groups):
             f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
             j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
             e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
-            g, y, _energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
-            if clamped or not exact:
+            g, i2, _energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
+            if not exact:
                 break
             r00, r01, r02 = (
                 f00 - dot(f00, f01, f02, t00, t01, t02),
@@ -296,9 +297,9 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
                 f22 - dot(f20, f21, f22, t02, t12, t22),
             )
             a00, a11, a22 = (
-                wp.cw_mul(g, y + dot(f00, f01, f02, f00, f01, f02)),
-                wp.cw_mul(g, y + dot(f10, f11, f12, f10, f11, f12)),
-                wp.cw_mul(g, y + dot(f20, f21, f22, f20, f21, f22)),
+                wp.cw_mul(g, i2 + dot(f00, f01, f02, f00, f01, f02)),
+                wp.cw_mul(g, i2 + dot(f10, f11, f12, f10, f11, f12)),
+                wp.cw_mul(g, i2 + dot(f20, f21, f22, f20, f21, f22)),
             )
             a12, a02, a01 = (
                 wp.cw_mul(g, dot(f10, f11, f12, f20, f21, f22)),
@@ -312,16 +313,16 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
                 r = wp.mat33d(r00[n], r01[n], r02[n], r10[n], r11[n], r12[n], r20[n], r21[n], r22[n])
                 a = wp.mat33d(a00[n], a01[n], a02[n], a01[n], a11[n], a12[n], a02[n], a12[n], a22[n])
                 rotation_blocks(r, (TWO * mu) * a, mu, tangent_out[b, p])
-                if damped:
+                if c[0] > ZERO:
                     f = wp.mat33d(f00[n], f01[n], f02[n], f10[n], f11[n], f12[n], f20[n], f21[n], f22[n])
                     add_viscous_tangent(f, wp.vec2d(mu, ZERO), c, strain_offset[b, p], ZERO, False, tangent_out[b, p])
-            alone = wp.min((group + 1) * WIDTH, shape_points)
-        for p_one in range(begin + alone, begin + points_per_cell):
+            first_alone = wp.min((group + 1) * WIDTH, shape_points)
+        for p_one in range(begin + first_alone, begin + points_per_cell):
             f_one = deformation_gradient(positions, nodes, gradients, b, p_one, cell)
             m = stiffness[b, p_one]
             out = tangent_out[b, p_one]
             elastic_tangent(f_one, m, clamped, out)
-            if damped:
+            if c[0] + c[1] > ZERO:
                 lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
                 offset, dilation = strain_offset[b, p_one], dilation_offset[b, p_one]
                 add_viscous_tangent(f_one, lame, c, offset, dilation, clamped, out)

@@ -2,8 +2,13 @@
 
 import warp as wp
 
-# Squared norm of the last update at which an iteration has converged to rounding; Newton's converges quadratically.
-NEWTON_TOLERANCE = wp.float64(1.0e-16)
+# Squared norms of the last update at which an iteration has converged to rounding: Newton's is of second order,
+# Halley's of third.
+NEWTON_TOLERANCE, HALLEY_TOLERANCE = wp.float64(1.0e-16), wp.float64(1.0e-11)
+HALLEY_ITERATIONS = 12
+LARGEST_TRACE = wp.float64(
+    12.0
+)  # of F^T F, up to which invariants give rotations as exact as iterations of matrices do
 SINGULAR, ROUNDING = wp.float64(1.0e-12), wp.float64(1.0e-32)
 ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 

@@ -44,6 +44,7 @@ def masked_norm(
 
 @wp.kernel
 def totals(
+    active: wp.array[int],  # (B) zero: the environment keeps its sums
     free: wp.array[wp.float64],
     vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]
     point_energy: wp.array2d[wp.float64],  # (B, P) [J]
@@ -65,7 +66,7 @@ def totals(
         energy += point_energy[b, p]
         size += wp.abs(point_energy[b, p])
     energy, size, square = block_sum(energy), block_sum(size), block_sum(square)
-    if lane == 0:
+    if lane == 0 and active[b] != 0:
         energy_out[b] = energy
         size_out[b] = size
         norm_out[b] = wp.sqrt(square)

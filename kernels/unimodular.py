@@ -17,13 +17,20 @@ U follows from C as in `kernels.lanes`.
 
 import warp as wp
 
-from .matrices import SINGULAR, cofactor, polar_rotation
+from .matrices import (
+    HALLEY_ITERATIONS,
+    HALLEY_TOLERANCE,
+    LARGEST_TRACE,
+    NEWTON_TOLERANCE,
+    SINGULAR,
+    cofactor,
+    polar_rotation,
+)
 
-# Squared last changes at which an iteration has converged to rounding: of first order, of Newton's and of Halley's.
-UPDATE_TOLERANCE, NEWTON_TOLERANCE = wp.float64(1.0e-30), wp.float64(1.0e-16)
-HALLEY_TOLERANCE = wp.float64(1.0e-11)
+UPDATE_TOLERANCE = wp.float64(1.0e-30)  # squared norm of the last projection's update, which converges linearly
 NEARLY_A_LINE = wp.float64(1.0e-3)
-LARGEST_GROWTH = wp.float64(0.3)  # of J from one, within which the root that Newton's iteration finds is the nearest D
+LARGEST_GROWTH = wp.float64(0.4)  # |J - 1| up to which Newton's iteration converges, and to the nearest D
+NEWTON_ITERATIONS, PROJECTIONS = 8, 60
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR, EIGHT, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
 
@@ -33,7 +40,7 @@ def trace_of_stretch(c1: wp.float64, c2: wp.float64, j: wp.float64):
     """Returns the trace of U, and whether the iteration converged (`kernels.lanes`)."""
     i = HALF * (c1 + THREE)
     change = ONE
-    for _ in range(12):
+    for _ in range(HALLEY_ITERATIONS):
         q = i * i - c1
         value, slope = q * q - EIGHT * j * i - FOUR * c2, FOUR * i * q - EIGHT * j
         step = TWO * value * slope / (TWO * slope * slope - value * (TWELVE * i * i - FOUR * c1))
@@ -47,10 +54,10 @@ def trace_of_stretch(c1: wp.float64, c2: wp.float64, j: wp.float64):
 @wp.func
 def multiplier(i1: wp.float64, i2: wp.float64, growth: wp.float64):
     """Returns m, t_2 and whether the iteration converged, for J = 1 + growth."""
-    m = growth / (i2 * i2 - TWO * i1)
+    m = growth / (i2 * i2 - TWO * i1 * (ONE + growth))  # to first order: that is |cof U|^2
     t2 = i2 - m * (i1 * i2 - THREE)
     change = ONE
-    for _ in range(8):
+    for _ in range(NEWTON_ITERATIONS):
         t1 = i1 - m * t2
         p, a, b = t1 * t2 - THREE, t2 * t2 - TWO * t1, t1 * t1 - TWO * t2
         first = t2 + m * (p + m * t1) - i2
@@ -82,7 +89,7 @@ def projected(f: wp.mat33d) -> wp.mat33d:
     c = cofactor(f)
     if wp.ddot(c, c) < NEARLY_A_LINE:
         d = polar_rotation(f)
-    for _ in range(60):
+    for _ in range(PROJECTIONS):
         c = cofactor(d)
         offset = wp.ddot(c, d - f) - (wp.ddot(c, d) / THREE - ONE)
         step = (f - d) + (offset / (wp.ddot(c, c) + SINGULAR)) * c
@@ -96,10 +103,9 @@ def projected(f: wp.mat33d) -> wp.mat33d:
 @wp.func
 def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
     """Returns F - D."""
-    j = wp.determinant(f)
-    if wp.abs(j - ONE) < LARGEST_GROWTH:
-        c = wp.transpose(f) * f
-        c1 = wp.trace(c)
+    j, c = wp.determinant(f), wp.transpose(f) * f
+    c1 = wp.trace(c)
+    if wp.abs(j - ONE) < LARGEST_GROWTH and c1 < LARGEST_TRACE:
         c2 = c[0, 0] * c[1, 1] - c[0, 1] * c[0, 1]
         c2 += c[0, 0] * c[2, 2] - c[0, 2] * c[0, 2] + c[1, 1] * c[2, 2] - c[1, 2] * c[1, 2]
         i1, has_trace = trace_of_stretch(c1, c2, j)

@@ -235,3 +235,18 @@ def test_single_precision_keeps_its_type():
     torch.testing.assert_close(
         final.memory["viscous_strain"].double(), exact.memory["viscous_strain"], rtol=0.0, atol=1e-5
     )
+
+
+def test_a_simulator_that_was_first_used_in_inference_mode_has_gradients():
+    gradients = []
+    for first in (False, True):
+        simulator = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
+        if first:
+            with torch.inference_mode():
+                simulator.rollout(simulator.rest_state(), 2, pull(0.2))
+        start = pose(simulator, "bent", 1)
+        q = start.q.clone().requires_grad_()
+        final = simulator.rollout(State(q, start.v), 2, pull(0.2)).final
+        gradients.append(torch.autograd.grad(sag(final.q).sum(), q)[0])
+    assert float(gradients[0].abs().max()) > 0.0
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-12)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -31,49 +32,117 @@ def positions(mesh):
     )
 
 
-def evaluated(mesh, viscous):
-    """A potential after an evaluation and a tangent, of which one environment has clamped eigenvalues."""
-    body, batch = Body(mesh), len(STRAINS)
+def potential_of(mesh, batch, **options):
+    body, none = Body(mesh, **options), torch.zeros(0, dtype=torch.int64)
     solid = Solid(body.discretisation, MATERIALS["corotated"]())
-    none = torch.zeros(0, dtype=torch.int64)
-    p = IncrementalPotential(
-        [PlacedEnergy(solid, solid.points(mesh))], body.coordinates, none, batch, torch.device("cpu")
-    )
+    placed = [PlacedEnergy(solid, solid.points(mesh))]
+    return IncrementalPotential(placed, body.coordinates, none, batch, torch.device("cpu"))
+
+
+def whole_cells(p):
+    """Whether each set of points is taken cell by cell."""
+    return [p.energies[0].whole_cells(s, p.own_values[0], p._position_view) is not None for s in p.sets]
+
+
+def evaluated(mesh, viscosity, q, bulk=1.0):
+    """A potential after an evaluation and a tangent, of which the second environment has clamped eigenvalues."""
+    batch = len(q)
+    p = potential_of(mesh, batch)
     random = torch.Generator().manual_seed(0)
     (term,) = p.energies
     carried = torch.as_tensor(term._carried / term._carried.max())
     offset = 0.1 * torch.randn(batch, term.n_points, 3, 3, generator=random, dtype=torch.float64)
     values = {
-        "stiffness": carried * (1.0 + torch.rand(batch, term.n_points, 2, generator=random, dtype=torch.float64)),
-        "viscosity": torch.tensor([[2.0, 0.5]] if viscous else [[0.0, 0.0]]).double().expand(batch, 2),
-        "strain_offset": offset + offset.mT,
+        "stiffness": carried
+        * (1.0 + torch.rand(batch, term.n_points, 2, generator=random, dtype=torch.float64))
+        * torch.tensor([1.0, bulk]),
+        "viscosity": torch.tensor([viscosity]).double().expand(batch, 2),
+        "strain_offset": viscosity[0] * (offset + offset.mT),
         "dilation_offset": 0.1 * torch.randn(batch, term.n_points, generator=random, dtype=torch.float64),
     }
     n = len(mesh.vertices)
     p.set_terms(StepTerms(p.zeros(n, 3), p.zeros(n), p.zeros(n, 3), values))
-    p.positions.copy_(torch.as_tensor(positions(mesh)))
+    p.positions.copy_(torch.as_tensor(q))
     p.evaluate()
     p.update_tangent(torch.arange(batch) == 1)
     return p
 
 
-@pytest.mark.parametrize("viscous", [False, True])
-@pytest.mark.parametrize("mesh", MESHES)
-def test_cells_as_a_whole_equal_their_points(mesh, viscous, monkeypatch):
-    whole = evaluated(MESHES[mesh], viscous)
-    assert all(whole.energies[0].whole_cells(s, whole.own_values[0], whole._position_view) for s in whole.sets)
-    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
-    single = evaluated(MESHES[mesh], viscous)
-    for points in whole.sets:
-        own = points.source
-        f = np.einsum("bcai,cqaj->bcqij", positions(MESHES[mesh])[:, own.nodes], own.gradients)
-        growth = np.linalg.det(f).min((1, 2))
-        assert growth[:-1].min() > 0.1
-        assert growth[-1] < 0.0
+def gradients_of(p, q):
+    """Deformation gradients (B, C, Q, 3, 3) of all points."""
+    (points,) = (s.source for s in p.sets)
+    return np.einsum("bcai,cqaj->bcqij", q[:, points.nodes], points.gradients)
+
+
+def check_equal(whole, single):
     for one, other in zip(whole.residual, single.residual, strict=True):
         size = float(other.abs().max())
         torch.testing.assert_close(one, other, rtol=0.0, atol=1e-13 * (size + 1.0) / SIZE[1])
     torch.testing.assert_close(whole.energy, single.energy, rtol=1e-9, atol=1e-14)
+    torch.testing.assert_close(whole._point_energy, single._point_energy, rtol=1e-9, atol=1e-14)
     for one, other in zip(whole.tangents, single.tangents, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(whole._point_energy, single._point_energy, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("viscosity", [(0.0, 0.0), (2.0, 0.5), (2.0, 0.0), (0.0, 0.5)], ids=str)
+@pytest.mark.parametrize("mesh", MESHES)
+def test_cells_as_a_whole_equal_their_points(mesh, viscosity, monkeypatch):
+    q = positions(MESHES[mesh])
+    whole = evaluated(MESHES[mesh], viscosity, q)
+    assert all(whole_cells(whole))
+    growth = np.linalg.det(gradients_of(whole, q)).min((1, 2))
+    assert growth[:-1].min() > 0.1
+    assert growth[-1] < 0.0
+    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
+    check_equal(whole, evaluated(MESHES[mesh], viscosity, q))
+
+
+@pytest.mark.parametrize("flattest", [0.1, 0.19, 0.21, 0.3])
+def test_a_flat_point_leaves_the_others_of_its_cell_as_they_are(flattest, monkeypatch):
+    """One corner of a cell of 27 nodes is pushed in until the flattest point has a given J: some groups are taken."""
+    mesh = box_hexahedra(SIZE, (1, 1, 1), nodes=27)
+    p, way = potential_of(mesh, 1), np.zeros_like(mesh.vertices)
+    way[7] = -mesh.vertices[7]  # the corner opposite to the origin
+
+    def growth(share):
+        return np.linalg.det(gradients_of(p, (mesh.vertices + share * way)[None]))[0, 0, :27]
+
+    shares = np.linspace(0.0, 0.5, 2001)
+    share = shares[np.argmax([growth(s).min() < flattest for s in shares])]
+    assert growth(share).min() == pytest.approx(flattest, abs=0.01)
+    groups = [growth(share)[k : k + 8].min() for k in range(0, 27, 8)]
+    assert max(groups) > 0.5
+    q = np.repeat((mesh.vertices + share * way)[None], 2, 0)
+    whole = evaluated(mesh, (2.0, 0.5), q)
+    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
+    check_equal(whole, evaluated(mesh, (2.0, 0.5), q))
+
+
+def test_the_energy_of_a_point_is_the_distance_from_its_rotation():
+    q = positions(MESHES["8 nodes"])[:-1]
+    p = evaluated(MESHES["8 nodes"], (0.0, 0.0), q, bulk=0.0)
+    f = gradients_of(p, q).reshape(len(q), -1, 3, 3)
+    distance = [[np.square(m - scipy.linalg.polar(m)[0]).sum() for m in own] for own in f]
+    expected = p.own_values[0]["stiffness"][..., 0].numpy() * distance
+    np.testing.assert_allclose(p._point_energy, expected, rtol=1e-8, atol=1e-28)
+
+
+def test_an_environment_that_is_done_keeps_its_sums_and_its_tangent():
+    q = positions(MESHES["8 nodes"])[1:3]
+    p = evaluated(MESHES["8 nodes"], (2.0, 0.5), q)
+    before = [getattr(p, name).clone() for name in ("energy", "energy_size", "residual_norm")]
+    tangent = p.tangents[0].clone()
+    p.active[1] = 0
+    p.positions.mul_(1.1)
+    p.evaluate()
+    p.update_tangent(active=torch.tensor([True, False]))
+    for name, own in zip(("energy", "energy_size", "residual_norm"), before, strict=True):
+        assert float(getattr(p, name)[0]) != float(own[0])
+        assert float(getattr(p, name)[1]) == float(own[1])
+    assert bool(p.tangents[0][0].ne(tangent[0]).any())
+    torch.testing.assert_close(p.tangents[0][1], tangent[1], rtol=0.0, atol=0.0)
+
+
+def test_cells_whose_points_have_both_terms_or_none_to_share_are_not_taken():
+    assert not any(whole_cells(potential_of(MESHES["8 nodes"], 1, volume_integration="full")))
+    assert not any(whole_cells(potential_of(box_tetrahedra(SIZE, (3, 1, 1)), 1)))

@@ -45,6 +45,24 @@ def test_positions_that_changed_in_place_have_another_strain(term):
         np.testing.assert_allclose(GreenStrain.apply(term, q)[..., 0, 0], strained(1.4), rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "change", [lambda q: q.numpy().__imul__(2.0), lambda q: q.data.mul_(2.0)], ids=["numpy", "data"]
+)
+def test_positions_that_changed_unseen_have_another_strain(term, change):
+    q = stretched(1.1)
+    GreenStrain.apply(term, q)
+    change(q)
+    np.testing.assert_allclose(GreenStrain.apply(term, q)[..., 0, 0], strained(2.2), rtol=1e-12)
+
+
+def test_strains_of_inference_mode_do_not_reach_gradients(term):
+    q = stretched(1.1)
+    with torch.inference_mode():
+        GreenStrain.apply(term, q)
+    (gradient,) = torch.autograd.grad(GreenStrain.apply(term, q.requires_grad_()).square().sum(), q)
+    assert float(gradient.abs().max()) > 0.0
+
+
 def test_a_strain_that_is_asked_for_again_has_its_gradient(term):
     q = stretched(1.1).requires_grad_()
     gradients = [torch.autograd.grad(GreenStrain.apply(term, q).square().sum(), q)[0] for _ in range(2)]

@@ -102,6 +102,23 @@ def test_the_nearest_unimodular_matrix():
         assert (distance <= np.linalg.norm(f - other, axis=(1, 2)) + 1e-12).all()
 
 
+def test_the_nearest_unimodular_matrix_is_continuous_where_its_algorithm_changes():
+    """On both sides of the largest |J - 1| and trace for which invariants are used: D changes as much as F."""
+    turn = np.linalg.qr(RANDOM.normal(size=(3, 3)))[0]
+    shapes = [(1.0, 1.0, 1.0), (1.1, 1.0, 0.9), (1.3, 1.0, 0.8)]
+    near = [np.diag(s) * np.cbrt(j / np.prod(s)) for s in shapes for j in (0.6, 0.66, 0.67, 0.72, 1.4)]
+    near += [np.diag([a, 1.0 / np.sqrt(a), 1.0 / np.sqrt(a)]) for a in (3.362,)]  # trace of C about 12
+    pairs = np.array([[(1.0 - 1e-7) * f, (1.0 + 1e-7) * f] for f in near]) @ turn
+    nearest = decomposed(pairs.reshape(-1, 3, 3))[2]
+    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-13)
+    inverse = np.linalg.inv(nearest).transpose(0, 2, 1)
+    offset = pairs.reshape(-1, 3, 3) - nearest
+    share = np.einsum("nij,nij->n", offset, inverse) / np.square(inverse).sum((1, 2))
+    np.testing.assert_allclose(offset, share[:, None, None] * inverse, atol=1e-12)
+    one, other = nearest.reshape(-1, 2, 3, 3).swapaxes(0, 1)
+    assert np.abs(other - one).max() < 1e-6
+
+
 @wp.kernel
 def quartic_blocks(f: wp.array[wp.mat33d], shift: wp.float64, clamp: bool, blocks_out: wp.array2d[wp.mat33d]):
     """The tangent of ||F F^T||^2 / 4 + shift / 2 ||F||^2, whose principal stresses are s^3 + shift s."""

@@ -107,9 +107,8 @@ def test_reductions_leave_fixed_vertices_out():
     options = {"block_dim": 64, "device": "cpu"}
     masked, residual = array(vectors, VEC), array(vectors, VEC)
     wp.launch_tiled(masked_norm, dim=[B], inputs=[array(free), masked, results[0]], **options)
-    wp.launch_tiled(
-        totals, dim=[B], inputs=[array(free), array(energies), array(own), residual, *results[1:]], **options
-    )
+    fields = [array(free), array(energies), array(own), residual, *results[1:]]
+    wp.launch_tiled(totals, dim=[B], inputs=[array([1] * B, int), *fields], **options)
     norm, energy, size, other = (result.numpy() for result in results)
     np.testing.assert_allclose(norm, np.linalg.norm(vectors[:, free > 0.0], axis=(1, 2)), rtol=1e-13)
     np.testing.assert_allclose(other, norm, rtol=1e-15)
@@ -117,6 +116,12 @@ def test_reductions_leave_fixed_vertices_out():
     np.testing.assert_allclose(size, np.abs(energies).sum(1) + np.abs(own).sum(1), rtol=1e-12)
     for field in (masked, residual):
         np.testing.assert_array_equal(field.numpy(), vectors * free[:, None])
+    before = [result.numpy().copy() for result in results[1:]]
+    fields[1:3] = array(2.0 * energies), array(2.0 * own)
+    wp.launch_tiled(totals, dim=[B], inputs=[array([1] * (B - 1) + [0], int), *fields], **options)
+    for one, other in zip(before[:2], results[1:3], strict=True):  # The last environment keeps its sums.
+        np.testing.assert_allclose(other.numpy()[:-1], 2.0 * one[:-1], rtol=1e-12)
+        np.testing.assert_array_equal(other.numpy()[-1], one[-1])
 
 
 values3 = wp.types.vector(3, wp.float64)

@@ -76,6 +76,20 @@ def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(stat
     torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))
 
 
+def test_points_of_many_steps_are_those_of_one_step_after_another():
+    """Observed in calls for several steps, of which the last one has fewer."""
+    replay, start = replayed(21)
+    sets = {name: torch.tensor([value, 1.01 * value]).double() for name, value in VALUES.items()}
+    ends: list[torch.Tensor] = []
+    with torch.no_grad():
+        series = replay.varied_series(start, sets, record=lambda *q: ends.append(torch.cat(q)))
+        states = replay.states(start, {name: values[:1] for name, values in sets.items()})
+        seen = replay.seen(start, states)
+    assert series.shape[:2] == (4, 21)
+    torch.testing.assert_close(series[:, 1:], torch.stack(ends, 1), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(seen[0], torch.stack([state.q for state in states], 1), rtol=0.0, atol=1e-12)
+
+
 def test_the_error_of_a_prediction_is_of_second_order():
     misfit = Misfit([replayed(10)], RANGES)
     unit, direction = np.array([0.5, 0.5]), np.array([0.7, -0.7])

@@ -26,7 +26,10 @@ class Observation(ABC):
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the predicted measurement (B, M, D) [unit] at positions (B, N, 3) of the vertices [m]."""
+        """Returns the predicted measurement (B, M, D) [unit] at positions (B, N, 3) of the vertices [m].
+
+        The B bodies may be several trials, sets of parameters and times; all are observed alike.
+        """
 
     def residual(self, predicted: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
         """Returns predicted less measured points, (..., M, D) [unit], zero where a point was not measured (NaN)."""

@@ -89,9 +89,10 @@ class Workspace:
         return whole
 
     def cached(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Returns an object of this batch, made at the first use of its key."""
+        """Returns an object of this batch, made at the first use of its key, for use outside of inference mode too."""
         if key not in self._cache:
-            self._cache[key] = make()
+            with torch.inference_mode(False):
+                self._cache[key] = make()
         value: T = self._cache[key]
         return value
 

@@ -199,11 +199,12 @@ class Simulator:
         return Constants(inertia, weight, tensors["gravity"], mass.damping, values)
 
     def workspace(self, batch: int) -> Workspace:
-        """Returns the buffers for a batch size, made at their first use."""
+        """Returns the buffers for a batch size, made at their first use, also for use outside of inference mode."""
         if batch not in self._workspaces:
-            workspace = self._make_workspace(batch=batch)
-            shards = shards_of(batch, workspace.potential.device)
-            workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]
+            with torch.inference_mode(False):
+                workspace = self._make_workspace(batch=batch)
+                shards = shards_of(batch, workspace.potential.device)
+                workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]
             self._workspaces[batch] = workspace
         return self._workspaces[batch]
 

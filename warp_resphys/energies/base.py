@@ -452,7 +452,10 @@ class Term(ABC):
         return self._kernels.tangent, self._arguments(s, values, positions)
 
     def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
-        """Returns kernels with one thread per cell, in place of those of `step` and `tangent`, or None."""
+        """Returns kernels with one thread per cell, in place of those of `step` and `tangent`, or None.
+
+        They add forces directly, so that there is no stress of the points.
+        """
         del s, values, positions
         return None
 

@@ -45,8 +45,9 @@ class Launcher:
         self.active = torch.ones(batch, device=device, dtype=torch.int32)
 
     def zeros(self, *shape: int) -> torch.Tensor:
-        """Returns zeros (B, *shape) on the launcher's device."""
-        return torch.zeros(self.batch, *shape, device=self.device, dtype=torch.float64)
+        """Returns zeros (B, *shape) on the launcher's device, which serve outside of inference mode, too."""
+        with torch.inference_mode(False):
+            return torch.zeros(self.batch, *shape, device=self.device, dtype=torch.float64)
 
     def upload(self, values: NDArray[Any], dtype: Any) -> Any:
         """Returns a Warp array with a copy of the values."""

@@ -59,7 +59,8 @@ class IncrementalPotential(Launcher):
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
-        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
+        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums, of which
+            environments that are not ``active`` keep theirs but for ``balance``, and no residual.
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
@@ -169,7 +170,9 @@ class IncrementalPotential(Launcher):
         energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
         sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
         self._internal_commands += project
-        self._internal_commands.append(self.record_blocks(reductions.totals, b, [free, *energies, residual], sums))
+        self._internal_commands.append(
+            self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
+        )
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)
 

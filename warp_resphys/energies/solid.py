@@ -300,14 +300,16 @@ class SolidTerm(StrainTerm):
 
         None where cells have less than two points without a volume term before the others.
         """
-        with_volume = (self._carried[s.own].reshape(s.cells, s.points_per_cell, -1)[..., 1:] > 0.0).any((0, 2))
+        carried = self._carried[s.own].reshape(s.cells, s.points_per_cell, self._moduli)
+        with_volume = (carried[..., 1:] != 0.0).any((0, 2))
         count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
         if count < 2:
             return None
         gradients, width, nodes = s.source.gradients, lanes.WIDTH, s.nodes_per_cell
-        chosen = np.minimum(np.arange(-(-count // width) * width), count - 1)
+        groups = -(-count // width)
+        chosen = np.minimum(np.arange(groups * width), count - 1)
         # (C, Q, K, 3) to (C, G, K, 3, points of a group)
-        together = gradients[:, chosen].reshape(s.cells, -1, width, nodes, 3).transpose(0, 1, 3, 4, 2)
+        together = gradients[:, chosen].reshape(s.cells, groups, width, nodes, 3).transpose(0, 1, 3, 4, 2)
         by_nodes = np.pad(gradients.reshape(-1, nodes, 3), ((0, 0), (0, -nodes % width), (0, 0)))
         by_nodes = by_nodes.reshape(s.n_points, -1, width, 3).swapaxes(2, 3)
         return self.launcher.upload(together, lanes.lanes), self.launcher.upload(by_nodes, lanes.lanes), count

@@ -1,7 +1,5 @@
 """Green strain at the points of a solid, and its derivative by the positions."""
 
-import weakref
-from collections import deque
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -14,7 +12,7 @@ from ..kernels import solid as kernels
 from .base import Term
 from .launcher import warp_view
 
-_KEPT = 2  # strains: integrators look back by as many states
+_KEPT = 3  # strains
 
 
 class StrainTerm(Term):
@@ -28,8 +26,8 @@ class StrainTerm(Term):
     def _strain(self) -> Callable[[torch.Tensor], torch.Tensor]:
         """`strain`, recorded at its first use.
 
-        The last results serve again: a step ends where the next one begins, and both need the strain there. So results
-        must not be changed in place.
+        On a CPU, the last results serve again, and must not be changed in place: with branches of Prony, a step needs
+        the strain at its end, where the next one begins, and BDF2 looks back by two steps.
         """
         own = self.launcher
         at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
@@ -45,17 +43,21 @@ class StrainTerm(Term):
         ]
         recorded = own.capture(*commands)
 
-        known = deque[tuple[weakref.ref[torch.Tensor], int, torch.Tensor]](maxlen=_KEPT)
+        known = list[tuple[torch.Tensor, torch.Tensor]]()
 
         def strain(positions: torch.Tensor) -> torch.Tensor:
-            version = -1 if positions.is_inference() else positions._version
-            for earlier, its_version, strains in known:
-                if earlier() is positions and its_version == version >= 0:
-                    return strains.detach()
             at.copy_(positions)
+            # A comparison waits for a GPU, and tensors of inference mode would have no gradient later.
+            keeps = at.device.type == "cpu" and not torch.is_inference_mode_enabled()
+            for number, (place, strains) in enumerate(known if keeps else ()):
+                if torch.equal(place, at):
+                    known.append(known.pop(number))
+                    return strains.detach()
             own.launch(recorded)
-            known.append((weakref.ref(positions), version, out.clone()))
-            return known[-1][-1].detach()
+            if keeps:
+                known[:] = [*known[1 - _KEPT :], (at.clone(), out.clone())]
+                return known[-1][1].detach()
+            return out.clone()
 
         return strain
 

@@ -261,7 +261,7 @@ class Replay:
         return self.simulator.step(state, inputs, constants)[0]
 
     def _observed(self, positions: Iterable[torch.Tensor]) -> torch.Tensor:
-        """(B, K, M, 3) points at K positions (B, N, 3) [m], some at once: for few, most time is overhead."""
+        """(B, K, M, 3) points at K positions (B, N, 3) [m], `_AT_ONCE` in a call, which is mostly overhead."""
         series, rest = list[torch.Tensor](), iter(positions)
         while some := list(itertools.islice(rest, _AT_ONCE)):
             series.append(self.observe(torch.cat(some)).unflatten(0, (len(some), -1)).transpose(0, 1))

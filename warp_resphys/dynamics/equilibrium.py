@@ -9,6 +9,7 @@ import torch
 from torch.autograd import forward_ad
 from typing_extensions import override
 
+from ..energies.launcher import lasting
 from ..energies.placed import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..fem.coordinates import Coordinates
@@ -91,7 +92,7 @@ class Workspace:
     def cached(self, key: Hashable, make: Callable[[], T]) -> T:
         """Returns an object of this batch, made at the first use of its key, for use outside of inference mode too."""
         if key not in self._cache:
-            with torch.inference_mode(False):
+            with lasting():
                 self._cache[key] = make()
         value: T = self._cache[key]
         return value

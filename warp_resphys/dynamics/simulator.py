@@ -10,6 +10,7 @@ import torch
 
 from ..energies.contact import ContactForces
 from ..energies.explicit import ExplicitEnergy
+from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
 from ..energies.obstacle_surfaces import ObstacleMotion
 from ..energies.placement import Materials, joined_names, place_energies
@@ -201,7 +202,7 @@ class Simulator:
     def workspace(self, batch: int) -> Workspace:
         """Returns the buffers for a batch size, made at their first use, also for use outside of inference mode."""
         if batch not in self._workspaces:
-            with torch.inference_mode(False):
+            with lasting():
                 workspace = self._make_workspace(batch=batch)
                 shards = shards_of(batch, workspace.potential.device)
                 workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]

@@ -1,7 +1,8 @@
 """Recorded Warp launches on torch's memory."""
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from threading import Lock
 from typing import Any
 
@@ -26,6 +27,16 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+@contextmanager
+def lasting() -> Iterator[None]:
+    """Makes tensors that serve outside of ``torch.inference_mode`` too, without gradient if made there."""
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(False), torch.no_grad():
+        yield
+
+
 class Launcher:
     """Buffers of float64 and kernel launches for a batch, on one device.
 
@@ -46,7 +57,7 @@ class Launcher:
 
     def zeros(self, *shape: int) -> torch.Tensor:
         """Returns zeros (B, *shape) on the launcher's device, which serve outside of inference mode, too."""
-        with torch.inference_mode(False):
+        with lasting():
             return torch.zeros(self.batch, *shape, device=self.device, dtype=torch.float64)
 
     def upload(self, values: NDArray[Any], dtype: Any) -> Any:

@@ -38,7 +38,7 @@ def turned(points, angle):
     return np.asarray(points) @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).T
 
 
-def beam(half, angle=0.0, rigid=False, tendon=False):
+def beam(half, angle=0.0, rigid=False, tendon=False, stiffness=1e9):
     """A beam of four cells across, or its half y < 15 mm behind a symmetry plane, turned about its axis."""
     size, cells = ((SIZE[0], 0.015, SIZE[2]), (6, 2, 2)) if half else (SIZE, (6, 4, 2))
     mesh = box_hexahedra(size, cells)
@@ -49,7 +49,7 @@ def beam(half, angle=0.0, rigid=False, tendon=False):
     return Body(
         mesh,
         fixed=select_vertices(mesh, x=0.0),
-        rigid={"cap": Rigid(1200.0)} if rigid else {},
+        rigid={"cap": Rigid(1200.0, stiffness)} if rigid else {},
         energies=(Tendons([line], stiffness=2e3),) if tendon else (),
         symmetry=planes,
     )
@@ -124,10 +124,11 @@ def test_three_planes_leave_a_block_a_uniform_stretch(linear):
 
 
 def test_gradients_of_half_a_beam():
-    rows = check_gradients(simulator(beam(True, TURN, rigid=True)), POSES[-1])
+    # Differences are less exact by rounding, the stiffer the cap.
+    rows = check_gradients(simulator(beam(True, TURN, rigid=True, stiffness=1e6)), POSES[-1])
     names = {row.parameter for row in rows}
     assert {"q", "v", "external_force", "youngs_modulus", "cap_density, each environment"} <= names
-    assert {row.parameter: row.relative_error for row in rows if not row.relative_error < 1e-6} == {}
+    assert {row.parameter: row.relative_error for row in rows if not row.relative_error < 1e-7} == {}
 
 
 def test_gradient_by_modulus_is_that_of_the_whole_beam():

@@ -71,10 +71,11 @@ def deformation(nodes: wp.array[int], together: wp.array2d[lanes], positions: wp
 
 
 @wp.func
-def metric(f00: lanes, f01: lanes, f02: lanes, f10: lanes, f11: lanes, f12: lanes, f20: lanes, f21: lanes, f22: lanes):
-    """Returns e = F^T F - I: components 00, 11, 22, 12, 02 and 01."""
+def strain(f00: lanes, f01: lanes, f02: lanes, f10: lanes, f11: lanes, f12: lanes, f20: lanes, f21: lanes, f22: lanes):
+    """Returns J, and e = F^T F - I: components 00, 11, 22, 12, 02 and 01."""
     one = lanes(ONE)
     return (
+        dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20)),
         dot(f00, f10, f20, f00, f10, f20) - one,
         dot(f01, f11, f21, f01, f11, f21) - one,
         dot(f02, f12, f22, f02, f12, f22) - one,
@@ -86,7 +87,7 @@ def metric(f00: lanes, f01: lanes, f02: lanes, f10: lanes, f11: lanes, f12: lane
 
 @wp.func
 def stretch(j: lanes, e00: lanes, e11: lanes, e22: lanes, e12: lanes, e02: lanes, e01: lanes):
-    """Returns 1 / g, 3 + y, |U - I|^2, the components of I - U^-1, and whether they are as exact as F."""
+    """Returns 1 / g, 3 + y, |U - I|^2, the components of I - U^-1, and whether all are as exact as of single points."""
     one = lanes(ONE)
     e1, z = e00 + e11 + e22, j - one
     e2 = minor(e00, e11, e01, e01) + minor(e00, e22, e02, e02) + minor(e11, e22, e12, e12)
@@ -174,8 +175,7 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         first_alone = wp.int32(0)  # of the points that are taken one by one
         for group in range(together.shape[1]):
             f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
-            j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
-            e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
+            j, e00, e11, e22, e12, e02, e01 = strain(f00, f01, f02, f10, f11, f12, f20, f21, f22)
             _g, _i2, energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
             if not exact:
                 break
@@ -208,22 +208,14 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
             for n in range(count):
                 energy_out[b, first + n] = energy[n]
             mu = TWO * mu
-            p00, p01 = (
-                wp.cw_mul(mu, dot(f00, f01, f02, t00, t01, t02)),
-                wp.cw_mul(mu, dot(f00, f01, f02, t01, t11, t12)),
-            )
-            p02, p10 = (
-                wp.cw_mul(mu, dot(f00, f01, f02, t02, t12, t22)),
-                wp.cw_mul(mu, dot(f10, f11, f12, t00, t01, t02)),
-            )
-            p11, p12 = (
-                wp.cw_mul(mu, dot(f10, f11, f12, t01, t11, t12)),
-                wp.cw_mul(mu, dot(f10, f11, f12, t02, t12, t22)),
-            )
-            p20, p21 = (
-                wp.cw_mul(mu, dot(f20, f21, f22, t00, t01, t02)),
-                wp.cw_mul(mu, dot(f20, f21, f22, t01, t11, t12)),
-            )
+            p00 = wp.cw_mul(mu, dot(f00, f01, f02, t00, t01, t02))
+            p01 = wp.cw_mul(mu, dot(f00, f01, f02, t01, t11, t12))
+            p02 = wp.cw_mul(mu, dot(f00, f01, f02, t02, t12, t22))
+            p10 = wp.cw_mul(mu, dot(f10, f11, f12, t00, t01, t02))
+            p11 = wp.cw_mul(mu, dot(f10, f11, f12, t01, t11, t12))
+            p12 = wp.cw_mul(mu, dot(f10, f11, f12, t02, t12, t22))
+            p20 = wp.cw_mul(mu, dot(f20, f21, f22, t00, t01, t02))
+            p21 = wp.cw_mul(mu, dot(f20, f21, f22, t01, t11, t12))
             p22 = wp.cw_mul(mu, dot(f20, f21, f22, t02, t12, t22))
             for part in range(by_nodes.shape[1]):
                 x, y, z = lanes(), lanes(), lanes()
@@ -276,36 +268,25 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
         first_alone = wp.int32(0)
         for group in range(groups):
             f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
-            j = dot(f00, f01, f02, minor(f11, f22, f12, f21), minor(f12, f20, f10, f22), minor(f10, f21, f11, f20))
-            e00, e11, e22, e12, e02, e01 = metric(f00, f01, f02, f10, f11, f12, f20, f21, f22)
+            j, e00, e11, e22, e12, e02, e01 = strain(f00, f01, f02, f10, f11, f12, f20, f21, f22)
             g, i2, _energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
             if not exact:
                 break
-            r00, r01, r02 = (
-                f00 - dot(f00, f01, f02, t00, t01, t02),
-                f01 - dot(f00, f01, f02, t01, t11, t12),
-                f02 - dot(f00, f01, f02, t02, t12, t22),
-            )
-            r10, r11, r12 = (
-                f10 - dot(f10, f11, f12, t00, t01, t02),
-                f11 - dot(f10, f11, f12, t01, t11, t12),
-                f12 - dot(f10, f11, f12, t02, t12, t22),
-            )
-            r20, r21, r22 = (
-                f20 - dot(f20, f21, f22, t00, t01, t02),
-                f21 - dot(f20, f21, f22, t01, t11, t12),
-                f22 - dot(f20, f21, f22, t02, t12, t22),
-            )
-            a00, a11, a22 = (
-                wp.cw_mul(g, i2 + dot(f00, f01, f02, f00, f01, f02)),
-                wp.cw_mul(g, i2 + dot(f10, f11, f12, f10, f11, f12)),
-                wp.cw_mul(g, i2 + dot(f20, f21, f22, f20, f21, f22)),
-            )
-            a12, a02, a01 = (
-                wp.cw_mul(g, dot(f10, f11, f12, f20, f21, f22)),
-                wp.cw_mul(g, dot(f00, f01, f02, f20, f21, f22)),
-                wp.cw_mul(g, dot(f00, f01, f02, f10, f11, f12)),
-            )
+            r00 = f00 - dot(f00, f01, f02, t00, t01, t02)
+            r01 = f01 - dot(f00, f01, f02, t01, t11, t12)
+            r02 = f02 - dot(f00, f01, f02, t02, t12, t22)
+            r10 = f10 - dot(f10, f11, f12, t00, t01, t02)
+            r11 = f11 - dot(f10, f11, f12, t01, t11, t12)
+            r12 = f12 - dot(f10, f11, f12, t02, t12, t22)
+            r20 = f20 - dot(f20, f21, f22, t00, t01, t02)
+            r21 = f21 - dot(f20, f21, f22, t01, t11, t12)
+            r22 = f22 - dot(f20, f21, f22, t02, t12, t22)
+            a00 = wp.cw_mul(g, i2 + dot(f00, f01, f02, f00, f01, f02))
+            a11 = wp.cw_mul(g, i2 + dot(f10, f11, f12, f10, f11, f12))
+            a22 = wp.cw_mul(g, i2 + dot(f20, f21, f22, f20, f21, f22))
+            a12 = wp.cw_mul(g, dot(f10, f11, f12, f20, f21, f22))
+            a02 = wp.cw_mul(g, dot(f00, f01, f02, f20, f21, f22))
+            a01 = wp.cw_mul(g, dot(f00, f01, f02, f10, f11, f12))
             first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
             for n in range(count):
                 p = first + n

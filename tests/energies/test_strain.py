@@ -13,8 +13,8 @@ MESH = box_hexahedra((0.1, 0.02, 0.02), (3, 1, 1))
 @pytest.fixture
 def term():
     simulator = Simulator(Body(MESH), Corotated(1e5, 0.45, stiffness_damping=0.01))
-    (found,) = (t for t in simulator.workspace(1).potential.energies if isinstance(t, StrainTerm))
-    return found
+    (solid,) = (t for t in simulator.workspace(1).potential.energies if isinstance(t, StrainTerm))
+    return solid
 
 
 def stretched(factor):

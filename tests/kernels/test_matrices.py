@@ -105,10 +105,15 @@ def test_the_nearest_unimodular_matrix():
 def test_the_nearest_unimodular_matrix_is_continuous_where_its_algorithm_changes():
     """On both sides of the largest |J - 1| and trace for which invariants are used: D changes as much as F."""
     turn = np.linalg.qr(RANDOM.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
     shapes = [(1.0, 1.0, 1.0), (1.1, 1.0, 0.9), (1.3, 1.0, 0.8)]
     near = [np.diag(s) * np.cbrt(j / np.prod(s)) for s in shapes for j in (0.6, 0.66, 0.67, 0.72, 1.4)]
-    near += [np.diag([a, 1.0 / np.sqrt(a), 1.0 / np.sqrt(a)]) for a in (3.362,)]  # trace of C about 12
+    long = np.roots([1.0, 0.0, -12.0, 2.0]).real.max()  # det F = 1 and the largest trace, long^2 + 2 / long
+    near.append(np.diag([long, long**-0.5, long**-0.5]))
     pairs = np.array([[(1.0 - 1e-7) * f, (1.0 + 1e-7) * f] for f in near]) @ turn
+    growth, trace = np.abs(np.linalg.det(pairs) - 1.0), np.square(pairs).sum((2, 3))
+    assert ((growth[:, 0] < 0.4) != (growth[:, 1] < 0.4)).sum() == 6
+    assert ((trace[:, 0] < 12.0) != (trace[:, 1] < 12.0)).sum() == 1
     nearest = decomposed(pairs.reshape(-1, 3, 3))[2]
     np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-13)
     inverse = np.linalg.inv(nearest).transpose(0, 2, 1)

@@ -59,8 +59,8 @@ class IncrementalPotential(Launcher):
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
-        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums, of which
-            environments that are not ``active`` keep theirs but for ``balance``, and no residual.
+        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
+            Environments that are not ``active`` keep energies and norm of the residual, and have no valid ``residual``.
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].

@@ -81,7 +81,7 @@ def test_the_default_study_can_be_extrapolated_and_takes_a_file():
 
 
 def test_quadratic_hexahedra_are_nearer_to_the_converged_deflection_than_linear_ones():
-    """31.63 mm under gravity, of docs/results/2026-11-20-arm-mesh.md."""
+    """31.63 mm under gravity, of docs/results/elements.md#the-arm."""
     deflection = {}
     for nodes in (8, 20, 27):
         mesh = LockingCase(f"hexahedron{nodes}", 0.01, 0.06).mesh(settings_of(LockingRun, "benchmark_locking").mesh)

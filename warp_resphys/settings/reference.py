@@ -8,106 +8,148 @@ The first is the page of all keys. With the second, an editor completes and chec
 """
 
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from ..io.files import write_text
-from ..io.setting_errors import Schema, in_words, options
+from ..io.setting_errors import Schema, options
 from .body import BodySettings, TargetSettings
 from .run import RunSettings
 
 _HEAD: Final = """# Settings
 
-This page lists every key of a run, for looking up names, units and ranges; [Bring your robot](bring_your_robot.md)
-shows the few that a configuration needs. Units are SI. `warp-resphys --cfg job` shows the
-values of a run, and `key=value` on the command line or in a file of `configs/experiment` sets one. `NAME` stands for
-any name. In `simfree`, keys that are left out are as in the groups `network` and `trainer`.
+All keys of a run, with their values, units [in brackets] and defaults; [Bring your robot](bring_your_robot.md) shows
+the few that a configuration needs. Set one with `key=value` on the command line, or in a file of `configs/experiment`;
+`warp-resphys --cfg job` shows the values of a run. `NAME` stands for any name. A key without a default is required.
+Keys of `simfree` that are left out are as in `network` and `trainer`.
 
 `python -m warp_resphys.settings.reference configs/settings.schema.json` writes a JSON Schema, with which editors
 complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`.
 `python -m warp_resphys.settings.reference docs/settings.md` writes this page.
 """
 
-_TARGETS: Final = {
-    "target": " Constants and `model` of the material may stand directly in `target`.",
-    "laboratory": "",
-}
-_LEFT_OUT: Final = (
-    "Any of the keys {} of the run, and `material` with the keys of `simulation`, replaces that of the simulator as a "
-    "whole, and those that are left out are those of the simulator that is corrected."
+_REPLACED: Final = (
+    "It may have the keys {} of the run, and `material` with the keys of `simulation`: each replaces the simulator's "
+    "as a whole."
 )
-_SHAPE: Final = "shapes.NAME"
-_OF_SHAPE: Final = "It has the keys {} of a body, of which `mesh` and `fixed` are required.\n"
+_OF_SHAPE: Final = "It has the keys {} of a body, of which `mesh` and `fixed` are required."
+_TYPES: Final = {"object": "group", "boolean": "true/false", "string": "word"}
 
 
 def page() -> str:
     """Returns the page of all keys, in Markdown."""
     schema = RunSettings.model_json_schema()
-    return "\n".join([_HEAD, *_sections(schema, schema, "", {})])
+    return "\n".join([_HEAD, *_sections(schema, schema, "", "", {})])
 
 
-def _sections(schema: Schema, node: Schema, path: str, shown: dict[str, str]) -> Iterator[str]:
-    """Yields a section for each kind of a group and for the groups in it, after the keys of the group.
+def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict[str, str]) -> Iterator[str]:
+    """Yields a section for a group, one for each of its kinds, and those of the groups in it.
 
     Args:
         schema: JSON Schema of the run.
         node: JSON Schema of the group.
         path: dotted key of the group.
-        shown: keys of the groups with a section, by their content.
+        default: sentence about the group where it is left out.
+        shown: paths of the groups with a section, by their content.
     """
     kinds = [kind for kind in options(schema, node) if "properties" in kind]
-    for kind in kinds:
-        words = [
-            f"`{name}: {key['const']}`" for name, key in kind["properties"].items() if "const" in key and kinds[1:]
-        ]
-        yield f"## {' '.join([f'`{path}`' if path else 'The run', *words])}\n"
-        if path:
-            yield f"{kind.get('description', '')}\n"
-        shared = [name for name in TargetSettings.model_fields if path in _TARGETS]
-        if path == _SHAPE:
-            shared = [*BodySettings.model_fields]
-        if shared:
-            names = ", ".join(f"`{name}`" for name in shared if name != "material")
-            yield _OF_SHAPE.format(names) if path == _SHAPE else f"{_LEFT_OUT.format(names)}{_TARGETS[path]}\n"
-        own = {name: key for name, key in kind["properties"].items() if name not in shared}
-        groups = {name: key for name, key in own.items() if _groups_of(schema, key)}
-        rows = [_row(schema, kind, name, key) for name, key in own.items() if name not in groups]
-        if rows:
-            yield "\n".join(["| key | it must be | default | meaning |", "|---|---|---|---|", *rows, ""])
-        for name, group in groups.items():
-            at = f"{path}.{name}" if path else name
-            null = "null" if group.get("default", {}) is None else "default" if "default" in group else "required"
-            keys = _groups_of(schema, group)
-            assert keys is not None
-            inner, suffix = keys
-            if path or null != "default":
-                meaning = group.get("description", "")
-                yield f"`{at}` is a group, {null}{f': {meaning}' if meaning else ''}.\n"
-            content = json.dumps([option["title"] for option in options(schema, inner) if "title" in option])
-            if shown.setdefault(content, f"{at}{suffix}") != f"{at}{suffix}":
-                yield f"`{at}{suffix}` has the keys of `{shown[content]}`.\n"
+    every = [kind["properties"] for kind in kinds]
+    common = {name: key for name, key in every[0].items() if all(other.get(name) == key for other in every)}
+    inherited = _inherited(path)
+    below: list[tuple[Schema, str, str]] = []
+
+    def rows(members: Mapping[str, Schema], required: list[str]) -> Iterator[str]:
+        lines = []
+        for name, key in members.items():
+            if name in inherited or ("const" in key and kinds[1:]):
                 continue
-            yield from _sections(schema, inner, f"{at}{suffix}", shown)
+            values, group = _values(key, schema), _group(schema, key, f"{path}.{name}".removeprefix("."))
+            if group is not None:
+                inner, at = group
+                content = json.dumps([option["title"] for option in options(schema, inner) if "title" in option])
+                if content not in shown:
+                    shown[content] = at
+                    below.append((inner, at, "Required. " if name in required else _omitted(key)))
+                    continue
+                values = f"{'by name, ' if at.endswith('.NAME') else ''}as `{shown[content]}`"
+            default = "" if name in required else f"`{json.dumps(key.get('default'), separators=(',', ':'))}`"
+            cells = (f"`{name}`", values, default, key.get("description", ""))
+            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+        if lines:
+            yield "\n".join(["| key | values | default | meaning |", "|---|---|---|---|", *lines, ""])
+
+    yield f"## {f'`{path}`' if path else 'The run'}\n"
+    about = kinds[0].get("description", "") if len(kinds) == 1 and path else ""
+    if default or about:
+        yield f"{default}{about}".rstrip() + "\n"
+    if inherited:
+        names = ", ".join(f"`{name}`" for name in inherited if name != "material")
+        yield f"{(_OF_SHAPE if path.startswith('shapes') else _REPLACED).format(names)}\n"
+    yield from rows(common, kinds[0].get("required", []))
+    for kind in kinds if kinds[1:] else []:
+        own = {name: key for name, key in kind["properties"].items() if name not in common}
+        words = [f"`{name}: {key['const']}`" for name, key in own.items() if "const" in key]
+        yield f"### {' '.join(words)}\n"
+        yield f"{kind.get('description', '')}\n"
+        yield from rows(own, kind.get("required", []))
+    for inner, at, note in below:
+        yield from _sections(schema, inner, at, note, shown)
 
 
-def _groups_of(schema: Schema, node: Schema) -> tuple[Schema, str] | None:
-    """The part of a JSON Schema with keys, and a suffix of the key of the group: .NAME for groups by name."""
+def _omitted(node: Schema) -> str:
+    """Says that a group is null by default, and what null means."""
+    if node.get("default", {}) is not None:
+        return ""
+    meaning = str(node.get("description", "")).partition("null: ")[2]
+    return f"Default `null`{f': {meaning}' if meaning else ''}. "
+
+
+def _inherited(path: str) -> list[str]:
+    """Keys of a group that are those of the run."""
+    if path == "shapes.NAME":
+        return [*BodySettings.model_fields]
+    return [*TargetSettings.model_fields] if path in ("target", "laboratory") else []
+
+
+def _group(schema: Schema, node: Schema, path: str) -> tuple[Schema, str] | None:
+    """The part of a JSON Schema with keys, and its dotted key, with .NAME for groups by name."""
     choices = options(schema, node)
     if any("properties" in choice for choice in choices):
-        return node, ""
-    for choice in choices:
-        inner = choice.get("additionalProperties")
-        if isinstance(inner, Mapping) and _groups_of(schema, inner):
-            return inner, ".NAME"
-    return None
+        return node, path
+    inner = (choice.get("additionalProperties") for choice in choices)
+    found = (_group(schema, value, f"{path}.NAME") for value in inner if isinstance(value, Mapping))
+    return next((group for group in found if group is not None), None)
 
 
-def _row(schema: Schema, kind: Schema, name: str, node: Schema) -> str:
-    default = "" if name in kind.get("required", ()) else f"`{json.dumps(node.get('default'))}`"
-    cells = (f"`{name}`", in_words(node, schema), default, node.get("description", ""))
-    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+def _values(node: Schema, schema: Schema) -> str:
+    """Describes the values of a key briefly, as in ">0 [m]"."""
+    choices = [option for option in options(schema, node) if option.get("type") != "null"]
+    unit = f" [{node['unit']}]" if "unit" in node else ""
+    null = ", null" if len(choices) < len(options(schema, node)) and node.get("default") is not None else ""
+    return " or ".join(dict.fromkeys(_type(option, schema) for option in choices)) + unit + null
+
+
+def _type(node: Schema, schema: Schema) -> str:
+    """Describes the values of one type, without their unit."""
+    if "wanted" in node:
+        return str(node["wanted"])
+    if words := [node["const"]] if "const" in node else node.get("enum", []):
+        return ", ".join(map(str, words))
+    kind = node.get("type", "")
+    if kind == "array":
+        first = node.get("prefixItems", [node.get("items", {})])[0]
+        members = _values(first, schema)
+        members = re.sub(r"^(number|integer|word|group|list)\b", r"\1s", re.sub(r"^(\d)", r"lists of \1", members))
+        members = f"numbers {members}" if members[0] in "<>≤≥" else members
+        members = f"of {members}" if "enum" in first and "minItems" in node else members
+        return f"{node['minItems'] if node.get('minItems') == node.get('maxItems', 0) else 'list of'} {members}"
+    limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    given = [f"{sign}{node[key]:,g}" for key, sign in limits.items() if key in node]
+    name = "" if kind == "number" and given else _TYPES.get(kind, kind)
+    return f"{name} {', '.join(given)}".strip()
 
 
 def editor_schema() -> dict[str, Any]:

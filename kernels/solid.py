@@ -110,8 +110,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
-    shares = bool(getattr(law, "SHARED", 0))  # then the law has its own dissipation too
-    dissipation = getattr(law, "dissipation", None)
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.kernel(module=module, launch_bounds=BOUNDS)
@@ -120,7 +118,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
-        shared: wp.array2d[wp.float64],  # (B, S) values of the law that all points share; (B, 0) for most laws
         viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
         strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
         dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
@@ -134,19 +131,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             return
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
-        if wp.static(shares):
-            energy, stress = response(f, m, shared[b])
-        else:
-            energy, stress = response(f, m)
+        energy, stress = response(f, m)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-            if wp.static(shares):
-                left = c[0] * green_strain(f) - strain_offset[b, p]
-                phi = dissipation(wp.ddot(left, left), shared[b])
-                energy += lame[0] * phi[0] / c[0]
-                stress += f * ((TWO * lame[0] * phi[1]) * left)
-                lame[0] = ZERO
             added = viscous_response(f, lame, c, strain_offset[b, p], dilation_offset[b, p])
             energy += added[0]
             stress += added[1]
@@ -160,7 +148,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
-        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -174,18 +161,10 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
         m = stiffness[b, p]
         out = tangent_out[b, p]
-        if wp.static(shares):
-            elastic_tangent(f, m, shared[b], clamp[b] != 0, out)
-        else:
-            elastic_tangent(f, m, clamp[b] != 0, out)
+        elastic_tangent(f, m, clamp[b] != 0, out)
         c = viscosity[b]
         if c[0] + c[1] > ZERO:
             lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-            if wp.static(shares):
-                left = c[0] * green_strain(f) - strain_offset[b, p]
-                phi = dissipation(wp.ddot(left, left), shared[b])
-                add_square(f * left, FOUR * c[0] * lame[0] * phi[2], out)
-                lame[0] = phi[1] * lame[0]
             add_viscous_tangent(f, lame, c, strain_offset[b, p], dilation_offset[b, p], clamp[b] != 0, out)
 
     @wp.kernel(module=module)
@@ -193,7 +172,6 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         gradients: wp.array2d[wp.vec3d],
         stiffness: wp.array2d[moduli],
-        shared: wp.array2d[wp.float64],
         viscosity: wp.array[wp.vec2d],
         strain_offset: wp.array2d[wp.mat33d],
         dilation_offset: wp.array2d[wp.float64],
@@ -227,45 +205,9 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
             left = c[0] * strain - strain_offset[b, p]
             by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
         by_shape = TWO * wp.ddot(left, rise)
-        if wp.static(shares):  # S = 2 mu phi'(A : A) A with A = c E - W; `rise` becomes dS/dA : rise / (2 mu)
-            phi = dissipation(wp.ddot(left, left), shared[b])
-            rise = phi[1] * rise + (phi[2] * by_shape) * left
-            by_shape = phi[1] * by_shape
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
         stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
         strain_out[b, p] = (TWO * shape) * rise
         dilation_out[b, p] = bulk * swelling
 
-    made = SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
-    if not shares:
-        return made
-    add_slopes, add_dissipation_slopes = law.shared_slopes, law.dissipation_slopes
-
-    @wp.kernel(module=module)
-    def shared_adjoint(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[wp.vec3d],
-        stiffness: wp.array2d[moduli],
-        shared: wp.array2d[wp.float64],
-        viscosity: wp.array[wp.vec2d],
-        strain_offset: wp.array2d[wp.mat33d],
-        dilation_offset: wp.array2d[wp.float64],
-        points_per_cell: int,
-        positions: wp.array2d[wp.vec3d],
-        direction: wp.array2d[wp.vec3d],  # (B, N) z [m]
-        shared_out: wp.array3d[wp.float64],  # (B, G, S) parts of dL/d shared, zero before: point p adds to part p mod G
-    ):
-        b, first = wp.tid()
-        for p in range(first, stiffness.shape[1], shared_out.shape[1]):
-            cell = p / points_per_cell
-            f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-            dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
-            m, c = stiffness[b, p], viscosity[b]
-            add_slopes(f, dz, m, shared[b], shared_out[b, first])
-            if c[0] > ZERO:
-                left = c[0] * green_strain(f) - strain_offset[b, p]
-                along = TWO * wp.dot(mu_of, m) * wp.ddot(f * left, dz)
-                add_dissipation_slopes(wp.ddot(left, left), along, shared[b], shared_out[b, first])
-
-    made.shared_adjoint = shared_adjoint
-    return made
+    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)

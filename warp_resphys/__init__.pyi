@@ -27,7 +27,6 @@ from .energies.materials import StableNeoHookean as StableNeoHookean
 from .energies.medium import Medium as Medium
 from .energies.muscles import Muscle as Muscle
 from .energies.muscles import Muscles as Muscles
-from .energies.neural import NeuralMaterial as NeuralMaterial
 from .energies.obstacles import Box as Box
 from .energies.obstacles import Capsule as Capsule
 from .energies.obstacles import Cylinder as Cylinder

@@ -11,11 +11,4 @@ and volume terms may be integrated at different points, so that a modulus may be
 - ``tangent(f, m, clamp, out)``: the blocks of dP/dF; with ``clamp``, without negative eigenvalues.
 
 A law whose first modulus alone has the shape term ``m_0 ||F - R||^2`` may set ``LANES`` (`kernels.lanes`).
-
-A law with values that all points of an environment share, such as the weights of a network, has their number
-``SHARED``. Then ``response`` and ``tangent`` take these values after the moduli, and
-``shared_slopes(f, df, m, shared, out)`` subtracts the derivatives of P : df by them from an array. Such a law also has
-``dissipation(p, shared)``, phi and its first two derivatives in the viscous potential mu / c phi(|c E - W|^2), in place
-of phi = p (`energies.viscosity`), and ``dissipation_slopes(p, factor, shared, out)``, which subtracts those of
-factor phi'.
 """

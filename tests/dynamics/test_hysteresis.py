@@ -17,7 +17,6 @@ from warp_resphys import (
     Inputs,
     Mesh,
     MooneyRivlin,
-    NeuralMaterial,
     Simulator,
     SolverSettings,
     StableNeoHookean,
@@ -315,7 +314,6 @@ class TestGradients:
             MooneyRivlin(3e3, 1e3, 1e5, density=1000.0, hysteresis=[(0.5, 0.01)]),
             Gent(8e3, 30.0, 1e5, density=1000.0, hysteresis=[(0.5, 0.01)]),
             ConvexMaterial(c10=4e3, bulk_1=5e4, density=1000.0, hysteresis=[(4e3, 0.01)]),
-            NeuralMaterial.from_lame(8e3, 1e5, density=1000.0, hysteresis=[(0.5, 0.01)]),
         ],
         ids=lambda material: material.model,
     )

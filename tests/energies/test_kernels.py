@@ -9,7 +9,6 @@ from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_verti
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
 from warp_resphys.energies.catalogue import MATERIALS as ALL_MATERIALS
 from warp_resphys.energies.materials import ConvexMaterial, DensityMaterial
-from warp_resphys.energies.neural import NeuralMaterial
 from warp_resphys.energies.placed import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
@@ -18,7 +17,7 @@ from warp_resphys.linalg.choice import make_linear_solver
 UNIT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TETRAHEDRON = Body(Mesh(UNIT, np.array([[0, 1, 2, 3]])), volume_integration="full")
 SHAPE, VOLUME = 3.0, 7.0
-OWN = (DensityMaterial, ConvexMaterial, NeuralMaterial)  # whose moduli have tests of their own
+OWN = (DensityMaterial, ConvexMaterial)  # whose moduli have tests of their own
 MATERIALS = {name: kind for name, kind in ALL_MATERIALS.items() if not issubclass(kind, OWN)}
 
 

@@ -182,8 +182,10 @@ class TestALawThatDoesNotHelp:
         (["law.terms=[c20,c50]"], r"^law\.terms names c50: choose from c20, c30, "),
         (["law.terms=[c10]"], r"^law\.terms names c10: choose from c20, c30, "),
         (
-            ["simulation={model:neural_law}", "~simulation.youngs_modulus", "~simulation.poissons_ratio"],
-            r"^law: simulation\.model is neural_law already: ",
+            [
+                "simulation={model:law,bulk_1:1e6,c10:1e4,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}"
+            ],
+            r"^law: simulation\.model is law already: ",
         ),
         (
             ["simulation={model:law,bulk_1:1e6,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}"],

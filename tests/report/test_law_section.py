@@ -11,7 +11,6 @@ import warp as wp
 from support.report_page import report
 from support.vertex_run import settings, write_run
 from warp_resphys.energies.materials import ConvexMaterial
-from warp_resphys.energies.neural import initial_weights, weight_constants
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.report.conclusions import conclusions, errors_by_load, law_text
 from warp_resphys.report.law_figure import drawn_stretches
@@ -209,20 +208,6 @@ def test_moduli_at_small_strains():
     x = drawn_stretches({"all trials": (0.8, 1.3)})
     assert x[0] < 0.8 < 1.3 < x[-1]
     assert 1.0 in x
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_network_is_shown_without_its_weights(tmp_path):
-    weights = weight_constants(initial_weights(80e3, 40e6))
-    own = {"model": "neural_law", "groups": [], "units": {"bulk_1": "Pa"}, "deviation": {}, "at_bounds": []}
-    own |= {"constants": {"density": 1070.0, "bulk_1": 20e6, **weights}, "classes": []}
-    page = run(tmp_path, law(**own, history=[{"loss": 1.0, "validation": 0.1}] * 31))
-    assert (
-        "a convex network of invariants with 163 weights, trained through the simulator in 30 iterations" in page.text
-    )
-    assert "weight_1" not in page.text
-    assert "Shear modulus [kPa]80.0" in page.text or "Shear modulus [kPa]80" in page.text
-    assert not (tmp_path / "figures" / "law.png").is_file()
 
 
 def test_test_trials_beyond_the_stretches_of_the_training_are_said():

@@ -5,10 +5,9 @@ from typing import Any, Final
 from ..io.entry_points import extension
 from ..io.errors import InputError
 from .materials import ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
-from .neural import NeuralMaterial
 
 MATERIALS: Final[dict[str, type[Material]]] = {
-    kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial, NeuralMaterial)
+    kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial)
 }
 
 

@@ -164,11 +164,6 @@ class Material(ABC):
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns the law's moduli [Pa], (1 or B, 1 or M) each, from constants of that shape."""
 
-    def shared(self, constants: Mapping[str, torch.Tensor]) -> torch.Tensor | None:
-        """Returns the values (1 or B, S) that the law has for all points of an environment; None without any."""
-        del constants
-        return None
-
 
 @dataclass(frozen=True)
 class _Hookean(Material):

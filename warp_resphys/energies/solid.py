@@ -38,8 +38,6 @@ from .strain import GreenStrain, StrainTerm
 from .viscosity import Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
-SHARED: Final = "shared"
-PARTS: Final = 256  # of the sum over points for the derivatives by shared values, at most
 VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step (`energies.viscosity`)
 
 
@@ -72,7 +70,7 @@ class Solid(Energy):
 
     Values of a step are ``stiffness`` (B, P, T), the moduli times the points' volumes [J], and those of
     `energies.viscosity`: ``viscosity`` (B, 2), c and d; ``strain_offset`` (B, P, 3, 3), W; ``dilation_offset`` (B, P),
-    w. A law with values that all points share has ``shared`` (B, S). Memory is ``viscous_strain`` (B, K, P, 3, 3), the
+    w. Memory is ``viscous_strain`` (B, K, P, 3, 3), the
     strain in each Prony branch.
 
     Args:
@@ -208,7 +206,6 @@ class BoundSolid(BoundEnergy):
             "damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,
-            **({} if (shared := material.shared(parameters)) is None else {SHARED: shared}),
         }
 
     @override
@@ -252,7 +249,7 @@ class SolidTerm(StrainTerm):
         super().__init__(launcher, sets)
         self._law = law = material.law
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
-        self._moduli, self._shared = len(material.rules), int(getattr(law, "SHARED", 0))
+        self._moduli = len(material.rules)
         self._carried = carried
         self._lanes = dict[PointSet, tuple[Any, Any, int] | None]()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
@@ -264,19 +261,13 @@ class SolidTerm(StrainTerm):
     def shapes(self) -> Mapping[str, tuple[int, ...]]:
         points = self.n_points
         shapes = ((points, self._moduli), (2,), (points, 3, 3), (points,))
-        own = dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
-        return {**own, SHARED: (self._shared,)} if self._shared else own
-
-    def _shared_view(self, values: Values) -> Any:
-        """Returns the values that all points share (B, S), (B, 0) without any."""
-        return warp_view(value_of(values, SHARED) if self._shared else self.launcher.zeros(0), wp.float64)
+        return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         stiffness, viscosity, strain, dilation = (value_of(values, name) for name in ("stiffness", *VISCOUS))
         views = [
             warp_view(stiffness[:, s.own], self._vector),
-            self._shared_view(values),
             warp_view(viscosity, wp.vec2d),
             warp_view(strain[:, s.own], wp.mat33d),
             warp_view(dilation[:, s.own], wp.float64),
@@ -292,8 +283,7 @@ class SolidTerm(StrainTerm):
         if (arrays := self._lanes[s]) is None:
             return None
         own = lanes.cell_kernels(self._law)
-        nodes, gradients, stiffness, _, *rest = self._arguments(s, values, positions)
-        return WholeCells(own.step, own.tangent, [nodes, gradients, stiffness, *rest, *arrays])
+        return WholeCells(own.step, own.tangent, [*self._arguments(s, values, positions), *arrays])
 
     def _lane_arrays(self, s: PointSet) -> tuple[Any, Any, int] | None:
         """Returns the last inputs of `kernels.lanes` for a set.
@@ -325,9 +315,7 @@ class SolidTerm(StrainTerm):
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, shapes = self.launcher, self.shapes
-        parts = min(self.n_points, PARTS)
-        sums = {"viscosity": (self.n_points, 2), **({SHARED: (parts, self._shared)} if self._shared else {})}
-        out = {name: own.zeros(*shape) for name, shape in {**shapes, **sums}.items()}
+        out = {name: own.zeros(*shape) for name, shape in {**shapes, "viscosity": (self.n_points, 2)}.items()}
         types = dict(zip(("stiffness", *VISCOUS), (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))
         commands = []
         for s in self.sets:
@@ -337,14 +325,9 @@ class SolidTerm(StrainTerm):
             commands.append(
                 own.record(self._kernels.adjoint, (own.batch, s.n_points), [*inputs, carried, along], outputs)
             )
-            if self._shared:
-                view = [warp_view(out[SHARED], wp.float64)]
-                commands.append(own.record(self._kernels.shared_adjoint, (own.batch, parts), [*inputs, along], view))
 
         def differentiate() -> dict[str, torch.Tensor]:
-            if self._shared:
-                out[SHARED].zero_()
             own.launch(*commands)
-            return {name: slope.sum(1) if name in sums else slope.clone() for name, slope in out.items()}
+            return {name: slope.sum(1) if name == "viscosity" else slope.clone() for name, slope in out.items()}
 
         return differentiate

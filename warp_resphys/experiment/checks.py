@@ -19,7 +19,6 @@ from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.law_files import read_law
 from ..energies.materials import ConvexMaterial
-from ..energies.neural import NeuralMaterial
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
@@ -99,10 +98,10 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
             )
     with naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
-    if run.simulation.model in (LAW, NeuralMaterial.model) and law.file is None:
+    if run.simulation.model == LAW and law.file is None:
         raise InputError(
-            f"law: simulation.model is {run.simulation.model} already: identify its constants in identify.parameters, "
-            "or take another one."
+            f"law: simulation.model is {LAW} already: identify its constants in identify.parameters, or take another "
+            "one."
         )
     if law.file is not None:
         given = read_law(law.file)

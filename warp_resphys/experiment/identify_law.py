@@ -33,10 +33,8 @@ from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, again_of, changes
 from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names
-from .neural_law import train_law
 from .trials import evenly
 
-_EVALUATIONS: Final = 10
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
@@ -54,9 +52,6 @@ def identify_law(context: StageContext) -> None:
     """
     settings: IdentifyLawStage = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    if settings.law.kind == "network" and settings.law.file is None:
-        write_json(context.run_dir / LAW_FILE, train_law(context, experiment))
-        return
     search = _LawSearch(context, experiment)
     content = search.run() if settings.law.file is None else search.given(settings.law.file)
     write_json(context.run_dir / LAW_FILE, content)
@@ -289,8 +284,7 @@ class _LawSearch:
         shares = independent(self.experiment.dataset.labels)
         replays = self.trials.replays(simulator, self._names(whole or given))
         identifier = Identifier(replays, bounds, seconds, shares=shares)
-        most = wanted.max_evaluations or _EVALUATIONS
-        with Progress(self.context.name, most, "evaluations at most") as progress:
+        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
 
             def report(_: int, loss: float, values: Mapping[str, float]) -> None:
                 name, value = next(iter(values.items()))
@@ -301,7 +295,7 @@ class _LawSearch:
 
             start = {name: {**self.trials.sysid, **(others or {}), **guess}[name] for name in bounds}
             done = finished.get(key, ())
-            return identifier.run([start], most, report, done, keep, wanted.tolerance)
+            return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
 
 
 def _refined_groups(law: LawClass) -> set[str]:

@@ -18,8 +18,7 @@ from .page import NONE, Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, 
 from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_strain, uniaxial_stress
 from .verdict import unbroken
 
-NETWORK: Final = "neural_law"  # Model of a material whose law is a network.
-_NOT_OF_A_LAW: Final = ("weight_", "density", "mass_damping")  # Of its constants, not shown one by one.
+_NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
 _BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _KPA: Final = ("kPa", 1e-3)
 _STRAIN: Final = ("%", 1e2)
@@ -65,21 +64,15 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     law, settings = data.law, data.settings.law
     if not law or settings is None:
         return None
-    network = law["model"] == NETWORK
     constants = {name: value for name, value in law["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
     law = {**law, "constants": constants}
     blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
-    if network:
-        blocks.append(Text(unbroken(_network_text(data.law)), note=True))
-        return Part(
-            "Law of the material", [*blocks, _moduli_table(data, _small_strain_of_network(data.law), constants)]
-        )
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     notes += [f"The target is simulated, with the material {data.target}."] if data.target else []
     blocks += [Text(" ".join(notes if law.get("deviation") else notes[1:]), note=True)]
     said = (open_text(law), not_needed_text(law, settings), outside_text(data))
     blocks += [Text(unbroken(text)) for text in said if text]
-    blocks += [_moduli_table(data, small_strain(constants), constants), *_curve(data, constants, canvas)]
+    blocks += [_moduli_table(data, constants), *_curve(data, constants, canvas)]
     return Part("Law of the material", [*blocks, *_classes(law)])
 
 
@@ -177,22 +170,10 @@ def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
     return f"Terms of the library that the data did not need: {in_a_row(absent)}." if absent else ""
 
 
-def _network_text(law: Mapping[str, Any]) -> str:
-    """Return a sentence on the network and its training."""
-    weights = sum(name.startswith("weight_") for name in law["constants"])
-    return (
-        f"Beside these constants the law is a convex network of invariants with {weights} weights, trained through the "
-        f"simulator in {max(len(law.get('history', ())) - 1, 0)} iterations."
-    )
-
-
-def _small_strain_of_network(law: Mapping[str, Any]) -> SmallStrain | None:
-    return small_strain_of(MaterialSettings.model_validate({"model": law["model"], **law["constants"]}))
-
-
-def _moduli_table(data: RunReport, own: SmallStrain | None, constants: Mapping[str, float]) -> PageTable:
+def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
     """Moduli at small strains: of the law, of the simulator that it replaces, and of a simulated target."""
-    columns: dict[str, SmallStrain | None] = {"Law": own}
+    law = small_strain(constants)
+    columns: dict[str, SmallStrain | None] = {"Law": law}
     below = data.identification.get("sysid", {}).get("parameters", {})
     start = data.settings.simulation
     if "youngs_modulus" in below or "poissons_ratio" in below:
@@ -214,7 +195,7 @@ def _moduli_table(data: RunReport, own: SmallStrain | None, constants: Mapping[s
     ]
     notes = ["Of slow motions: viscosity and relaxing branches left out."]
     if branches := sum(value for name, value in constants.items() if name.startswith("prony_modulus")):
-        fast = 1e-3 * (columns["Law"].mu + branches) if columns["Law"] is not None else 0.0
+        fast = 1e-3 * (law.mu + branches)
         notes.append(f"With the relaxing branches, in fast motions, the shear modulus of the law is {fast:.4g} kPa.")
     notes += ["Fibres are left out too."] if families(constants) else []
     if "corotated" in (start.model, *(target.material.model for target in data.settings.targets.values())):

@@ -146,9 +146,6 @@ class LawSettings(Settings):
     """
 
     file: Word | None = setting(None, "law of another run, or a silicone's name, in place of an identification")
-    kind: Literal["terms", "network"] = setting(
-        "terms", "a sum of terms, or a convex network of invariants, trained through the simulator"
-    )
     terms: Many[Word] = setting(
         ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
@@ -161,9 +158,7 @@ class LawSettings(Settings):
     stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
     seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")
-    max_evaluations: Natural | None = setting(
-        None, "evaluations of the loss and its gradient in a search; null: 10, and 60 for a network"
-    )
+    max_evaluations: Natural = setting(10, "evaluations of the loss and its derivatives in a search")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which the search ends")
 
 

@@ -23,7 +23,7 @@ class Quantity:
     upper: float = np.inf  # exclusive upper bound
     closed: bool = False  # whether `lower` itself is allowed
     per: str = ""  # ``element``, ``chamber`` and the like, if there may be one value for each; empty: one per body
-    shape: tuple[int, ...] = ()  # shape of an array-valued quantity, such as a network's weights; excludes `per`
+    shape: tuple[int, ...] = ()  # shape of an array-valued quantity, such as a direction; excludes `per`
     typical: float = 1.0  # order of magnitude of an input, or of a parameter without bounds
     words: str = ""  # name of an input in a sentence
     shown_unit: str = ""  # unit of displayed values

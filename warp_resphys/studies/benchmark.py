@@ -46,7 +46,6 @@ ByRefinement = Annotated[dict[Natural, Natural], Field(min_length=1)]
 
 
 _MODULI: Final = ("youngs_modulus", "c10", "bulk_1")  # by the first of which gradients are taken
-_SHORT: Final = {"neural_law": "net"}
 _FASTEST: Final = "quasi_newton"  # solver with which laws are timed, in the smallest batch, and contact
 
 
@@ -417,7 +416,7 @@ def benchmark_sheets(result: Mapping[str, Any]) -> list[Sheet]:
             **row,
             "relative": row["forward_ms"] / yardstick,
             "steps_s": 1e3 * row["batch"] / row["plain_ms"],
-            "material": row["poissons_ratio"] or _SHORT.get(row["model"], row["model"]),
+            "material": row["poissons_ratio"] or row["model"],
             "touches": "yes" if row["contact"] else "",
         }
         for row in result["steps"]

@@ -92,9 +92,6 @@ from .robot.robot_scene import SceneState as SceneState
 from .robot.state import RobotState as RobotState
 from .robot.twin.estimator import TwinNoise as TwinNoise
 from .robot.twin.twin import Twin as Twin
-from .settings.extensions import CoreSettings as CoreSettings
-from .settings.extensions import EnergySettings as EnergySettings
-from .settings.extensions import ObservationSettings as ObservationSettings
 from .stepping.inputs import Inputs as Inputs
 from .stepping.quantity import Quantity as Quantity
 from .stepping.state import State as State

@@ -58,10 +58,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             word="recording.path",
         ),
         "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.mesh_inspection:make_arm"),
-        "inspect extensions": Command(
-            "materials, energies, observations and networks of installed packages",
-            "studies.extension_list:list_extensions",
-        ),
         "convert": Command(
             "recordings, such as bags, MCAP files and exported tables, to HDF5",
             "studies.conversion:convert",

@@ -4,29 +4,27 @@ import importlib.util
 import json
 import re
 import sys
-import tomllib
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torch import nn
 
 import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, without_reports
 from support.template import TEMPLATE, install
-from warp_resphys import box_hexahedra
 from warp_resphys.energies.base import Energy
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.experiment.build import build_body, build_simulator
+from warp_resphys.io.classes import ClassSettings, check_packages
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_checkpoint
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import Stage, fingerprint
 from warp_resphys.learning.networks import OwnNetwork
 from warp_resphys.robot.description import describe
-from warp_resphys.settings.extensions import built
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.studies.extension_list import listing
 from warp_resphys.studies.gradient_check import check_gradients
 
 OPTIONS = [
@@ -65,6 +63,7 @@ def folder(site, tmp_path_factory):
     return place / "run"
 
 
+@pytest.mark.slow
 def test_its_parameters_are_identified_by_name(folder):
     """Weight and magnet bend the beam of the laboratory, of 50 kPa and 24 kA/m, from 40 kPa and 30 kA/m."""
     found = json.loads((folder / "identification.json").read_text())["sysid"]["parameters"]
@@ -74,22 +73,25 @@ def test_its_parameters_are_identified_by_name(folder):
     assert errors["sysid"]["mean"] < 0.1 * errors["simulation"]["mean"]
 
 
+@pytest.mark.slow
 def test_its_network_is_trained_and_saved(folder, installed):
     description = describe(folder, "resphys")
     network = description.learned.network
     assert isinstance(network.network, OwnNetwork)
-    assert network.architecture["core"] == {"sines": {"width": 8, "frequency": 1.0}}
+    assert network.architecture["core"] == {"_target_": "my_robot_physics.sines.Sines", "width": 8}
     assert sorted(name for name, _ in network.network.core.named_parameters()) == [
         *("first.bias", "first.weight", "last.bias", "last.weight")
     ]
     assert float(network.network.gain.detach().abs().max()) > 0.0
 
 
+@pytest.mark.slow
 def test_the_stages_name_the_package(folder):
     records = {path.stem: json.loads(path.read_text()) for path in (folder / "stages").glob("*.json")}
     assert {name for name, own in records.items() if own["packages"] != {"my-robot-physics": "0.1.0"}} == set()
 
 
+@pytest.mark.slow
 def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_path, monkeypatch):
     robot = warp_resphys.load(folder)
     file = tmp_path / "robot.safetensors"
@@ -103,16 +105,19 @@ def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_pat
             warp_resphys.load(place)
 
 
-def test_another_version_is_told_and_runs_stages_again(folder, installed, tmp_path, monkeypatch):
+def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monkeypatch):
     def stage():
         return fingerprint(Stage("evaluate", print, (), settings(*OPTIONS)), {})
 
-    before = stage()
-    assert before == stage()
+    before, packages = stage(), settings(*OPTIONS).packages()
+    assert packages == {"my-robot-physics": "0.1.0"}
+    check_packages(packages, "run")
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
+    with pytest.raises(DataFileError, match=r"run was made with my-robot-physics 0\.1\.0, a package that is not inst"):
+        check_packages(packages, "run")
     monkeypatch.syspath_prepend(str(install(tmp_path / "site", version="0.2.0")))
     with pytest.raises(DataFileError, match=r"made with my-robot-physics 0\.1\.0, and this is .* 0\.2\.0"):
-        warp_resphys.load(folder)
+        check_packages(packages, "run")
     assert settings(*OPTIONS).packages() == {"my-robot-physics": "0.2.0"}
     assert stage() != before
 
@@ -120,20 +125,21 @@ def test_another_version_is_told_and_runs_stages_again(folder, installed, tmp_pa
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("simulation.model=arruda", r"simulation: material model is 'arruda': .*gent, .*arruda_boyce \(of my-robot-ph"),
-        ("simulation.locking=3", r"arruda_boyce of the package my-robot-physics 0\.1\.0: .* no constant 'locking'"),
-        ("simulation.locking_stretch=0.5", r"package my-robot-physics 0\.1\.0: locking_stretch is 0\.5"),
-        (
-            "energies.magnet.magnetisatoin=3",
-            r"energies\.magnet of the package my-robot-physics 0\.1\.0: unknown key 'magnetisatoin', did you mean",
-        ),
-        ("energies.magnet.magnetisation=-3", r"0\.1\.0: magnetisation is -3: it must be a positive number, in A/m"),
-        (
-            "+energies.fan={}",
-            r"energies\.fan: no installed package has this energy: choose one of magnet \(of my-robot",
-        ),
-        ("+network.core.sine={}", r"network\.core\.sines and sine are given: choose one"),
-        ("network.core.sines.width=0", r"0\.1\.0: width is 0: it must be a whole number, one or more"),
+        ("simulation.model=arruda", r"model and _target_ are both given"),
+        ("simulation._target_=arruda", r"material model is 'arruda': choose one of corotated, .* class as _target_"),
+        ("simulation._target_=os.system", r"simulation: os\.system cannot be imported .*module of Python itself"),
+        ("simulation._target_=my_robot_physics.sines.Sines", r"Sines is no subclass of .*materials\.Material"),
+        ("simulation.locking=3", r"simulation: arruda_boyce has no constant 'locking'"),
+        ("simulation.locking_stretch=0.5", r"simulation: locking_stretch is 0\.5"),
+        ("energies.magnet._target_=null", r"energies\.magnet\._target_ is null: it must be a word"),
+        ("energies.magnet._target_=my_robot.Magnet", r"energies\.magnet: .* cannot be imported .*No module named"),
+        ("energies.magnet._target_=my_robot_physics.magnet.Coil", r"magnet\.Coil cannot be imported .*no attribute"),
+        ("energies.magnet._target_=torch.nn.Linear", r"Linear is no subclass of warp_resphys\.energies\.base\.Energy"),
+        ("energies.magnet.magnetisatoin=3", r"unknown key 'energies\.magnet\.magnetisatoin', did you mean 'magnetisat"),
+        ("energies.magnet.magnetisation=null", r"energies\.magnet\.magnetisation is missing: it must be a positive"),
+        ("energies.magnet.magnetisation=-3", r"energies\.magnet\.magnetisation is -3: it must be a positive number"),
+        ("energies.magnet.along=[1,0]", r"energies\.magnet\.along is \[1, 0\]: it must be three numbers"),
+        ("network.core.width=0", r"network\.core\.width is 0: it must be a whole number, one or more"),
         ("network.recurrent=4", r"network\.core has no hidden state, but recurrent is its size"),
         ("markers.bind=frame", r"markers\.observation takes the place of bind and bind_to"),
         ("energies.magnet=null", r"simulator takes no input: give both the same inputs, by .* or energies"),
@@ -154,9 +160,9 @@ def test_an_actuator_drives_the_body_as_its_energy_says(installed):
     run = settings(*OPTIONS)
     energy = build_body(run).energies[0]
     assert [quantity.name for quantity in energy.inputs] == ["magnetic_field"]
-    twice = settings(*OPTIONS, "energies.magnet.magnetisation=60e3")
+    twice = settings(*OPTIONS, "energies.magnet.magnetisation=60.0e3")
     assert build_body(twice).energies[0].magnetisation == 2.0 * energy.magnetisation
-    rubber = make_material("arruda_boyce", shear_modulus=50e3)
+    rubber = make_material("my_robot_physics.material.ArrudaBoyce", shear_modulus=50e3)
     simulator = warp_resphys.Simulator(build_body(run), rubber, gravity=(0.0, 0.0, 0.0))
     tip = simulator.body.mesh.vertices[:, 0] > 0.059
 
@@ -173,74 +179,57 @@ def test_an_actuator_drives_the_body_as_its_energy_says(installed):
         assert float(end) > float(height(value, -0.01)) + 1e-3
 
 
-def broken(tmp_path, monkeypatch, text, **points):
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "bad_physics.py").write_text(text)
-    monkeypatch.syspath_prepend(str(install(tmp_path / "bad", points, "bad-physics", "3.1")))
-
-
-def test_a_package_that_cannot_be_imported_matters_only_where_it_is_named(tmp_path, monkeypatch):
-    broken(
-        tmp_path, monkeypatch, "import numpy_of_the_future", **{"warp_resphys.materials": {"bad": "bad_physics:Bad"}}
-    )
-    assert "bad_physics" not in sys.modules
-    assert make_material("gent").model == "gent"
-    assert settings("budget=quick").packages() == {}
-    message = r"the material 'bad' of the package bad-physics 3\.1 cannot be imported .*ModuleNotFoundError: .*_future"
-    with pytest.raises(InputError, match=message):
-        make_material("bad")
-    lines = list(listing("materials"))
-    assert "  bad (of bad-physics 3.1)" in lines
-    assert any("ModuleNotFoundError" in line for line in lines)
-
-
-def test_other_classes_are_refused(tmp_path, monkeypatch):
-    points = {
-        "warp_resphys.materials": {"dict": "builtins:dict"},
-        "warp_resphys.energies": {
-            "dict": "builtins:dict",
-            "nothing": "bad_physics:Nothing",
-            "unfinished": "bad_physics:Unfinished",
-        },
-        "warp_resphys.networks": {"wide": "bad_physics:Wide"},
-    }
-    text = (
+@pytest.mark.parametrize(
+    ("target", "base", "message"),
+    [
+        ("bad_physics.Unfinished", Energy, r"here: bad_physics\.Unfinished has no method points and no term: add it"),
+        ("bad_physics.Arrays", nn.Module, r"arguments of Arrays cannot be given in a configuration .*ndarray"),
+        (
+            "worse_physics.Any",
+            nn.Module,
+            r"worse_physics\.Any cannot be imported \(ZeroDivisionError: division by",
+        ),
+    ],
+)
+def test_other_classes_are_refused(tmp_path, monkeypatch, target, base, message):
+    (tmp_path / "bad_physics.py").write_text(
+        "import numpy as np\n"
         "from torch import nn\n"
-        "from warp_resphys.settings.extensions import CoreSettings, EnergySettings\n"
-        "class Nothing(EnergySettings):\n    def build(self, mesh): return 3\n"
-        "class Unfinished(EnergySettings):\n    pass\n"
-        "class Wide(CoreSettings):\n    def build(self, inputs, outputs): return nn.Linear(inputs, 7)\n"
+        "from warp_resphys import Energy\n"
+        "class Unfinished(Energy):\n    pass\n"
+        "class Arrays(nn.Module):\n    def __init__(self, x: np.ndarray): pass\n"
     )
-    broken(tmp_path, monkeypatch, text, **points)
-    with pytest.raises(
-        InputError, match=r"dict of the package bad-physics 3\.1 is <class 'dict'>: its entry point must"
-    ):
-        make_material("dict")
-    with pytest.raises(InputError, match=r"must name a subclass of warp_resphys\.settings\.extensions\.EnergySettings"):
-        settings("+energies.dict={}")
-    with pytest.raises(InputError, match=r"unfinished of the package bad-physics 3\.1: Unfinished has no method build"):
-        settings("+energies.unfinished={}")
-    mesh = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
-    with pytest.raises(InputError, match=r"nothing of the package bad-physics 3\.1 builds int: .*base\.Energy"):
-        built("energies", "nothing", {}, Energy, mesh)
-    with pytest.raises(InputError, match=r"network\.core\.wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
-        OwnNetwork({"wide": {}}, 3, 2)
+    (tmp_path / "worse_physics.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(InputError, match=message):
+        ClassSettings(target=target).factory(base, "here")
 
 
-def test_two_packages_with_one_name_are_refused(installed, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(install(tmp_path / "other", name="other-physics")))
-    with pytest.raises(InputError, match=r"'arruda_boyce' is in my-robot-physics 0\.1\.0 and other-physics 0\.1\.0"):
-        make_material("arruda_boyce")
+class Wide(nn.Linear):
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, 7)
+
+
+def test_a_network_of_another_shape_is_refused():
+    core = ClassSettings(target=f"{__name__}.Wide")
+    with pytest.raises(InputError, match=r"network\.core: \S*Wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
+        OwnNetwork(core, 3, 2)
+
+
+def test_no_class_is_imported_or_called_that_is_not_expected(tmp_path):
+    """A robot's file may name anything; nothing of Python itself is imported, and no other class is called."""
+    file = tmp_path / "written"
+    for target in ("subprocess.Popen", "pathlib.Path", "numpy.memmap"):
+        with pytest.raises(InputError, match=target):
+            ClassSettings(target=target, filename=str(file), mode="w+", shape=3).factory(nn.Module, "here")
+    assert not file.exists()
 
 
 def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
     page = (TEMPLATE.parents[1] / "extending.md").read_text(encoding="utf-8")
-    toml, python, yaml = (
-        re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)[0] for kind in ("toml", "python", "yaml")
-    )
-    site = install(tmp_path / "page", tomllib.loads(toml)["project"]["entry-points"], "my-physics")
-    (site / "my_physics.py").write_text(python)
-    monkeypatch.syspath_prepend(str(site))
+    python, yaml = (re.findall(rf"```{kind}\n(.*?)```", page, re.DOTALL)[0] for kind in ("python", "yaml"))
+    (tmp_path / "my_physics.py").write_text(python)
+    monkeypatch.syspath_prepend(str(tmp_path))
     own = OmegaConf.to_container(OmegaConf.create(yaml))
     own["identify"]["parameters"] |= {"poissons_ratio": None, "youngs_modulus": None}
     config = composed("experiment=beam_real", "mesh.divisions=[4,1,1]")

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
@@ -34,6 +34,20 @@ class Markers(Observation):
     """A map from the vertices of a body to M markers."""
 
     vertices: torch.Tensor  # indices of the vertices that the markers depend on, in any shape
+
+    @classmethod
+    def bind(cls, mesh: Mesh, places: NDArray[np.float64], labels: Sequence[str]) -> "Markers":
+        """Returns markers at places (m, 3) on the undeformed body [m], for classes that a configuration names.
+
+        Args:
+            mesh: of the body.
+            places: of the markers.
+            labels: their m names.
+
+        Raises:
+            InputError: the class cannot be used in a configuration.
+        """
+        raise InputError(f"{cls.__name__} has no class method bind(mesh, places, labels), which makes it: add it.")
 
     def moved(self, by: torch.Tensor) -> "Markers":
         """Returns the markers with an offset on the body.

@@ -2,7 +2,7 @@
 
 from typing import Any, Final
 
-from ..io.entry_points import extension
+from ..io.classes import imported
 from ..io.errors import InputError
 from .materials import ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 
@@ -12,18 +12,20 @@ MATERIALS: Final[dict[str, type[Material]]] = {
 
 
 def make_material(model: str = "corotated", **constants: Any) -> Material:
-    """Returns the named material, of this package or of another one with an entry point in ``warp_resphys.materials``.
+    """Returns the named material.
+
+    Args:
+        model: its name, or for one of another package module and class, such as ``my_physics.Fung``.
+        constants: by name.
 
     Raises:
         InputError: an unknown name, a constant that the material does not have, or a value out of range.
     """
     if model in MATERIALS:
         return MATERIALS[model].from_constants(constants)
-    source = extension("materials", model, MATERIALS, f"material model is {model!r}")
-    kind = source.load()
-    if not (isinstance(kind, type) and issubclass(kind, Material)):
-        raise InputError(f"{model} of the package {source} is {kind!r}: its entry point must name a Material.")
-    try:
-        return kind.from_constants(constants)
-    except InputError as error:
-        raise InputError(f"{model} of the package {source}: {error}") from error
+    if "." not in model:
+        raise InputError(
+            f"material model is {model!r}: choose one of {', '.join(MATERIALS)}, or give your own class as _target_."
+        )
+    material: Material = imported(model, Material).from_constants(constants)
+    return material

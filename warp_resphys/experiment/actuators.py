@@ -24,7 +24,6 @@ from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.mesh import Mesh, select_cells, select_vertices
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
-from ..settings.extensions import built, driving_settings
 from ..settings.mesh import PlaceSettings
 from ..stepping.quantity import Quantity
 
@@ -81,8 +80,16 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     if settings.self_contact is not None:
         pairs = {name: FrictionPair(**dict(pair)) for name, pair in settings.self_contact.pairs.items()}
         energies.append(SurfaceContact(**dict(settings.self_contact) | {"pairs": pairs}))
-    energies += [built("energies", name, own, Energy, mesh) for name, own in settings.energies.items()]
-    return energies
+    return energies + list(own_energies(settings).values())
+
+
+def own_energies(settings: BodySettings) -> dict[str, Energy]:
+    """Builds the ``energies`` of other packages, by name.
+
+    Raises:
+        InputError: see `ClassSettings.factory`.
+    """
+    return {name: own.factory(Energy, f"energies.{name}")() for name, own in settings.energies.items()}
 
 
 def build_chambers(settings: ChamberSettings | None, mesh: Mesh) -> tuple[Chamber, ...]:
@@ -115,28 +122,42 @@ class Drive:
         return self.quantity.per
 
 
+def _driving(settings: BodySettings) -> dict[str, tuple[Quantity, int]]:
+    """Inputs of a body with their number of values, by key; of energies of other packages, the first input."""
+    driving: dict[str, tuple[Quantity, int]] = {}
+    if settings.chambers is not None:
+        driving["chambers"] = PRESSURE, settings.chambers.count
+    if settings.tendons is not None:
+        driving["tendons"] = _COMMANDED["tendons"][settings.tendons.commanded], len(settings.tendons.routes)
+    if settings.muscles is not None and settings.muscles.commanded is not None:
+        driving["muscles"] = _COMMANDED["muscles"][settings.muscles.commanded], len(settings.muscles.bundles)
+    for name, energy in own_energies(settings).items():
+        if energy.inputs:
+            driving[f"energies.{name}"] = energy.inputs[0], energy.count
+    return driving
+
+
+def check_drive(settings: BodySettings) -> None:
+    """Checks that a body has one input at most.
+
+    Raises:
+        InputError: it has several.
+    """
+    driving = [*_driving(settings)]
+    if len(driving) > 1:
+        raise InputError(
+            f"{driving[0]} and {driving[1]} are two inputs of the body, but recordings have one: take one out."
+        )
+
+
 def driving_quantity(settings: BodySettings) -> Quantity | None:
     """Quantity that drives the body; None without actuators."""
-    if settings.chambers is not None:
-        return PRESSURE
-    for group, quantities in _COMMANDED.items():
-        own = getattr(settings, group)
-        if own is not None and own.commanded is not None:
-            return quantities[own.commanded]
-    own = driving_settings(settings.energies)
-    return None if own is None else cast(Quantity, own.drive)
+    return next((quantity for quantity, _ in _driving(settings).values()), None)
 
 
 def driven_parts(settings: BodySettings) -> int:
     """Number of values of the driving input."""
-    if settings.chambers is not None:
-        return settings.chambers.count
-    if settings.tendons is not None:
-        return len(settings.tendons.routes)
-    if (own := driving_settings(settings.energies)) is not None:
-        return own.driven_parts
-    assert settings.muscles is not None
-    return len(settings.muscles.bundles)
+    return next(count for _, count in _driving(settings).values())
 
 
 def drive_of(settings: BodySettings, body: Body) -> Drive | None:

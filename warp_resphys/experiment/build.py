@@ -37,7 +37,6 @@ from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
-from ..settings.extensions import built
 from ..settings.mesh import (
     BoxesMesh,
     FileMesh,
@@ -282,12 +281,11 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
         rows.append(list(range(own.start, own.stop)))
     if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
         tracked = mesh, points[marked], [labels[row] for row in marked]
-        if settings.observation:
-            ((name, keys),) = settings.observation.items()
-            markers = built("observations", name, keys, Markers, *tracked)
+        if settings.observation is not None:
+            markers = settings.observation.factory(Markers, "markers.observation", len(tracked), "bind")(*tracked)
             if type(markers).moved is Markers.moved:
                 raise InputError(
-                    f"markers.observation.{name}: {type(markers).__name__} has no method moved, which identification "
+                    f"markers.observation: {type(markers).__name__} has no method moved, which identification "
                     "and prediction intervals need, as places of markers are not exact: add it, as in Markers."
                 )
         else:

@@ -23,6 +23,7 @@ from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.memory import available_memory_gib
+from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
@@ -31,7 +32,7 @@ from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from ..settings.trials import RecordedData
-from .actuators import drive_of
+from .actuators import check_drive, drive_of
 from .body_checks import check_size, check_target, naming
 from .build import build_body, build_material, build_simulator, finer
 from .experiment import LAW
@@ -54,6 +55,12 @@ def check_run(run: RunSettings) -> None:
         DataFileError: the folder has no recordings.
     """
     _check_memory(run)
+    for prefix, settings in run.bodies.items():
+        with naming(prefix):
+            check_drive(settings)
+    for network in (run.network, run.simfree.network):
+        if network.core is not None:
+            core_factory(network.core)
     body = build_body(run, run.payload_at)
     assert run.tip is not None
     select_vertices(body.mesh, **run.tip.arguments())
@@ -130,8 +137,8 @@ def _check_control(run: RunSettings, body: Body) -> None:
     """Checks that the robot can be controlled."""
     if find_spec("piqp") is None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
-    if run.network.core:
-        raise InputError("control evaluates perceptrons alone: set control=none, or network.core={}.")
+    if run.network.core is not None:
+        raise InputError("control evaluates perceptrons alone: set control=none, or network.core=null.")
     if drive_of(run, body) is None:
         raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
     if run.obstacles or run.self_contact:

@@ -15,13 +15,12 @@ dotted key.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic_core import PydanticUndefined
 
-from .entry_points import extensions
 from .errors import InputError
 from .setting_errors import sentence
 
@@ -49,21 +48,16 @@ class Settings(BaseModel):
 
     def plain(self) -> dict[str, Any]:
         """Returns nested data of JSON types."""
-        return self.model_dump(mode="json")
+        return self.model_dump(mode="json", by_alias=True)
 
     def fingerprint(self) -> str:
         """SHA-256 of the content in hexadecimal, independent of the order of keys."""
         text = json.dumps(self.plain(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        """Yields the kind and the name of what the keys of this class, but not its groups, name in other packages."""
-        yield from ()
-
     def packages(self) -> dict[str, str]:
         """Returns the versions of the other packages whose classes these settings and all their groups name."""
-        own = [own for kind, name in self.named_extensions() for own in extensions(kind) if own.point.name == name]
-        return {one.package: one.version for one in own} | packages_of(dict(self))
+        return packages_of(dict(self))
 
     def changed(self, **values: Any) -> Self:
         """Returns a copy with other values of some keys.
@@ -78,6 +72,11 @@ class Settings(BaseModel):
         """Returns settings of this class with the keys that another object shares, and ``values`` for the others."""
         shared = {name: getattr(source, name) for name in cls.model_fields if hasattr(source, name)}
         return cls(**{**shared, **values})
+
+
+def without_null(values: Any) -> Any:
+    """Returns a mapping without the keys that are null; other values unchanged."""
+    return {key: value for key, value in values.items() if value is not None} if isinstance(values, dict) else values
 
 
 def packages_of(value: Any) -> dict[str, str]:

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 from filelock import FileLock, Timeout
 
 from .atomic import digest
-from .entry_points import check_packages
+from .classes import check_packages
 from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .memory import WorkersMemory, peak_memory_gib

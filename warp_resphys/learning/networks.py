@@ -5,7 +5,7 @@ standardised outputs into forces. Their constants come from the training split a
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -13,8 +13,8 @@ from torch import nn
 from typing_extensions import override
 
 from ..dynamics.modes import RestStiffness
+from ..io.classes import ClassSettings
 from ..io.errors import InputError
-from ..settings.extensions import built
 from ..settings.learning import NetworkSettings
 from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
@@ -92,11 +92,20 @@ def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str)
     return nn.Sequential(*modules, nn.Linear(width if layers else n_in, n_out))
 
 
+def core_factory(core: ClassSettings) -> Callable[[int, int], nn.Module]:
+    """Returns the map from numbers of inputs and outputs to a network of another package.
+
+    Raises:
+        InputError: see `ClassSettings.factory`.
+    """
+    return core.factory(nn.Module, "network.core", 2)
+
+
 class OwnNetwork(nn.Module):
     """The network of another package, with a factor on each output.
 
     Args:
-        core: its name with its keys, as in `NetworkSettings`.
+        core: its class with arguments; the first two are the numbers of inputs and outputs.
         n_in: inputs.
         n_out: outputs.
 
@@ -104,16 +113,15 @@ class OwnNetwork(nn.Module):
         InputError: it cannot be built, or maps to another shape.
     """
 
-    def __init__(self, core: Mapping[str, Mapping[str, Any]], n_in: int, n_out: int) -> None:
+    def __init__(self, core: ClassSettings, n_in: int, n_out: int) -> None:
         super().__init__()
-        ((name, keys),) = core.items()
-        self.core: nn.Module = built("networks", name, keys, nn.Module, n_in, n_out)
+        self.core: nn.Module = core_factory(core)(n_in, n_out)
         self.gain = nn.Parameter(torch.ones(n_out))
         with torch.no_grad():
             shape = tuple(self.core.eval()(torch.zeros(2, n_in)).shape)
         self.core.train()
         if shape != (2, n_out):
-            raise InputError(f"network.core.{name} maps (2, {n_in}) to {shape}: it must map to (2, {n_out}).")
+            raise InputError(f"network.core: {core.target} maps (2, {n_in}) to {shape}: it must map to (2, {n_out}).")
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Maps (S, n_in) to (S, n_out)."""
@@ -156,12 +164,12 @@ class StateMap(nn.Module):
         self.outputs = nn.ModuleDict(outputs)
         self.recurrent = architecture.recurrent
         keys = (*_ARCHITECTURE, *(key for key in ("recurrent", "core") if getattr(architecture, key)))
-        self.architecture = {key: getattr(architecture, key) for key in keys}
+        self.architecture = {key: value for key, value in architecture.plain().items() if key in keys}
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
         network: SkipMLP | RecurrentMLP | OwnNetwork
-        if architecture.core:
+        if architecture.core is not None:
             network = OwnNetwork(architecture.core, n_in, n_out)
         else:
             network = (SkipMLP if self.recurrent is None else RecurrentMLP)(n_in, n_out, **self.architecture)

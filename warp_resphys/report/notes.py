@@ -123,7 +123,7 @@ def network_note(settings: RunSettings, on_law: bool = False) -> str:
             f"{network.force_modes} force modes"
         )
     blocks = f"{network.blocks} block{'s' if network.blocks > 1 else ''} of {network.layers} hidden layers of "
-    core = f"{blocks}{network.width}" if not network.core else f"the core {next(iter(network.core))}"
+    core = f"{blocks}{network.width}" if network.core is None else f"the core {network.core.target.rpartition('.')[2]}"
     how = "as published" if dict(trainer).items() >= _PUBLISHED_TRAINER.items() else "our way"
     linear = "" if trainer.linear_noise is None else ", with a linear part from ridge regression"
     text = (

@@ -16,7 +16,7 @@ from ..experiment.build import bound_markers, build_body, build_simulator, marke
 from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
 from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
-from ..io.entry_points import check_packages
+from ..io.classes import check_packages
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse

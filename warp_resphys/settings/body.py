@@ -1,19 +1,22 @@
 """Settings of a body (material, parts, actuators, loads) and of its simulator."""
 
-from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from typing_extensions import override
 
+from ..io.classes import ClassSettings, package_of
 from ..io.errors import listed
-from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting
-from .extensions import OwnEnergies
+from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
 from .obstacles import ContactSettings, ObstacleSettings, SurfaceContactSettings
 
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
+OwnEnergies = Annotated[
+    dict[str, ClassSettings],
+    BeforeValidator(without_null, json_schema_input_type=dict[str, ClassSettings | None]),
+]
 
 
 class PhysicsSettings(Settings):
@@ -33,20 +36,36 @@ class _Constants(Settings):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_other_package(cls, values: Any) -> Any:
+        """Takes Hydra's ``_target_``, a class of another package, as the model."""
+        if not isinstance(values, dict) or values.get("_target_") is None:
+            return values
+        if values.get("model") is not None:
+            raise ValueError("model and _target_ are both given: set one of them to null.")
+        return {key: value for key, value in values.items() if key != "_target_"} | {"model": values["_target_"]}
+
+    @override
+    def packages(self) -> dict[str, str]:
+        model = str(dict(self)["model"])
+        return (package_of(model) if "." in model else {}) | super().packages()
+
     @property
     def constants(self) -> dict[str, float]:
         """Constants by name, such as ``youngs_modulus`` [Pa]."""
         return dict(self.__pydantic_extra__)
 
 
+def _without_default(schema: dict[str, Any]) -> None:
+    """Takes the default out of a key's schema, so that it is not shown beside ``_target_``."""
+    del schema["default"]
+
+
 class RegionMaterialSettings(_Constants):
     """The material of a region; constants that are left out are those of the group around it."""
 
     model: Word | None = setting(None, "constitutive model; a different one has its own constants alone")
-
-    @override
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        yield from () if self.model is None else (("materials", self.model),)
 
 
 class MaterialSettings(_Constants):
@@ -56,19 +75,17 @@ class MaterialSettings(_Constants):
         json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]}}
     )
 
-    model: Word = setting("corotated", "constitutive model")
+    model: Word = Field(
+        "corotated",
+        description="constitutive model, corotated by default; _target_ instead: a class of another package",
+        json_schema_extra=_without_default,
+    )
     regions: dict[str, RegionMaterialSettings] = setting({}, "materials of regions of the mesh, by name")
-
-    @override
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        yield "materials", self.model
 
     @model_validator(mode="before")
     @classmethod
     def _without_null(cls, values: Any) -> Any:
-        return (
-            {key: value for key, value in values.items() if value is not None} if isinstance(values, dict) else values
-        )
+        return without_null(values)
 
     @property
     def by_region(self) -> "dict[str, MaterialSettings]":
@@ -271,14 +288,12 @@ class BodySettings(Settings):
     )
     obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
     contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
-    energies: OwnEnergies = setting({}, "energies and actuators of other packages, by name, with their own keys")
+    energies: OwnEnergies = setting(
+        {}, "energies and actuators of other packages, by name, with their arguments; null: none"
+    )
     self_contact: SurfaceContactSettings | None = setting(
         None, "contact of the body with itself and of its parts with one another; null: they pass through one another"
     )
-
-    @override
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        yield from (("energies", name) for name in self.energies)
 
     @model_validator(mode="after")
     def _touches(self) -> Self:

@@ -1,14 +1,25 @@
 """Settings of identification, reconstruction of forces, networks and their training."""
 
-from collections.abc import Iterator
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
-from typing_extensions import override
 
-from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Share, Some, Word, setting
+from ..io.classes import ClassSettings
+from ..io.settings import (
+    Count,
+    Many,
+    Natural,
+    NotNegative,
+    Pair,
+    Positive,
+    Settings,
+    Share,
+    Some,
+    Word,
+    setting,
+    without_null,
+)
 from .body import Integrator
-from .extensions import OwnCore
 from .trials import different, rising
 
 Size = Annotated[int, Field(ge=1, le=16_384)]
@@ -88,16 +99,11 @@ class PlacementSettings(Settings):
     between_sessions: Positive = setting(0.5, "deviations between sessions, relative to those above")
 
 
-def _without_null(values: Any) -> Any:
-    """Removes the parameters whose range or first guess is null."""
-    return {key: value for key, value in values.items() if value is not None} if isinstance(values, dict) else values
-
-
 Ranges = Annotated[
     dict[str, RangeSettings],
-    BeforeValidator(_without_null, json_schema_input_type=dict[str, RangeSettings | None]),
+    BeforeValidator(without_null, json_schema_input_type=dict[str, RangeSettings | None]),
 ]
-Guesses = Annotated[dict[str, float], BeforeValidator(_without_null, json_schema_input_type=dict[str, float | None])]
+Guesses = Annotated[dict[str, float], BeforeValidator(without_null, json_schema_input_type=dict[str, float | None])]
 
 
 class IdentifiedSettings(Settings):
@@ -197,17 +203,13 @@ class NetworkSettings(Settings):
     recurrent: Annotated[int, Field(ge=1, le=1_024)] | None = setting(
         None, "size of a hidden state that is kept over the roll-out; it needs trainer=sequences"
     )
-    core: OwnCore = setting(
-        {}, "map between the coders by another package, in place of blocks and layers: its name with its own keys"
+    core: ClassSettings | None = setting(
+        None, "map between the coders by a class of another package, in place of blocks and layers"
     )
-
-    @override
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        yield from (("networks", name) for name in self.core)
 
     @model_validator(mode="after")
     def _keeps_nothing(self) -> Self:
-        if self.core and self.recurrent is not None:
+        if self.core is not None and self.recurrent is not None:
             raise ValueError("core has no hidden state, but recurrent is its size: leave one of them out.")
         return self
 

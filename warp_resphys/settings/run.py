@@ -12,7 +12,6 @@ from ..io.errors import InputError, listed
 from ..io.settings import Natural, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
-from .extensions import own_settings
 from .learning import (
     AblationSettings,
     ActuationSettings,
@@ -291,22 +290,8 @@ class RunSettings(SimulatorSettings):
         return self
 
     @model_validator(mode="after")
-    def _drives(self) -> Self:
+    def _carries(self) -> Self:
         for key, body in self.bodies.items():
-            commanded = {
-                "chambers": body.chambers is not None,
-                "tendons": body.tendons is not None,
-                "muscles": body.muscles is not None and body.muscles.commanded is not None,
-            }
-            commanded |= {
-                f"energies.{name}": own_settings("energies", name, values).drive is not None
-                for name, values in body.energies.items()
-            }
-            driven = [f"{key}{group}" for group, is_driven in commanded.items() if is_driven]
-            if len(driven) > 1:
-                raise ValueError(
-                    f"{driven[0]} and {driven[1]} are two inputs of the body, but recordings have one: take one out."
-                )
             if body.fibres is not None and body.chambers is None:
                 raise ValueError(
                     f"{key}fibres are wound around chambers, but {key}chambers is null: leave the fibres out."

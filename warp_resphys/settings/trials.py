@@ -1,15 +1,13 @@
 """Settings of trials: their source, how they begin, their markers, and their split."""
 
 import math
-from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
-from typing_extensions import override
 
+from ..io.classes import ClassSettings
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
 from .body import TargetSettings
-from .extensions import OwnObservation
 from .mesh import Direction, LengthUnit, PlaceSettings
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; at rest under the
@@ -407,17 +405,13 @@ class BindingSettings(Settings):
     bind_to: PlaceSettings | None = setting(None, "vertices that rigid markers follow")
     patch: Positive = setting(0.02, "radius of the patch of vertices that a patch marker follows", "m")
     largest_distance: Positive = setting(0.02, "largest distance from the surface of the body", "m")
-    observation: OwnObservation = setting(
-        {}, "observation of tracked markers by another package, in place of bind: its name with its own keys"
+    observation: ClassSettings | None = setting(
+        None, "observation of tracked markers by a class of another package, in place of bind"
     )
-
-    @override
-    def named_extensions(self) -> Iterator[tuple[str, str]]:
-        yield from (("observations", name) for name in self.observation)
 
     @model_validator(mode="after")
     def _binds_once(self) -> Self:
-        if self.observation and (self.bind != "normal" or self.bind_to is not None):
+        if self.observation is not None and (self.bind != "normal" or self.bind_to is not None):
             raise ValueError("observation takes the place of bind and bind_to: leave these two out.")
         return self
 

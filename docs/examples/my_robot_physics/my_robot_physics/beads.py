@@ -1,5 +1,6 @@
 """Beads in transparent silicone as markers: each moves with the point of the cell that it is cast into."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,10 +8,9 @@ import torch
 
 from warp_resphys.data.markers import Markers
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.settings import Positive, setting
+from warp_resphys.io.settings import Positive
 from warp_resphys.mesh.location import locate
 from warp_resphys.mesh.mesh import Mesh
-from warp_resphys.settings.extensions import ObservationSettings
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,25 @@ class Beads(Markers):
     weights: torch.Tensor  # (m, K) with sum one
     gradients: torch.Tensor  # (m, K, 3) derivatives of the weights by the place of the bead [1/m]
 
+    @classmethod
+    def bind(cls, mesh: Mesh, places: np.ndarray, labels: Sequence[str], largest_outside: Positive = 5e-4) -> "Beads":
+        """Returns beads at places (m, 3) on the undeformed body [m].
+
+        Args:
+            mesh: of the body.
+            places: of the beads.
+            labels: their m names.
+            largest_outside: distance from the body up to which a bead is extrapolated [m].
+
+        Raises:
+            InputError: a bead is outside of the body.
+        """
+        found = locate(mesh, places)
+        far = int(np.argmax(found.outside))
+        if found.outside[far] > largest_outside:
+            raise InputError(f"{labels[far]} is {1e3 * found.distance[far]:.2g} mm outside of the body: move the bead.")
+        return cls(*map(torch.from_numpy, (mesh.cells[found.cells], found.weights, found.gradients)))
+
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns the beads (B, m, 3) for positions (B, N, 3) of the vertices [m]."""
         return torch.einsum("bmki,mk->bmi", positions[:, self.vertices], self.weights)
@@ -29,21 +48,3 @@ class Beads(Markers):
         """Returns beads that were cast elsewhere by (m, 3) [m], since nobody knows their places exactly."""
         weights = self.weights + torch.einsum("mkj,mj->mk", self.gradients, by.to(self.weights))
         return replace(self, weights=weights)
-
-
-class BeadSettings(ObservationSettings):
-    """Markers inside the body."""
-
-    largest_outside: Positive = setting(5e-4, "distance from the body up to which a bead is extrapolated", "m")
-
-    def build(self, mesh: Mesh, places: np.ndarray, labels: list[str]) -> Beads:
-        """Returns beads at places (m, 3) on the undeformed body [m].
-
-        Raises:
-            InputError: a bead is outside of the body.
-        """
-        found = locate(mesh, places)
-        far = int(np.argmax(found.outside))
-        if found.outside[far] > self.largest_outside:
-            raise InputError(f"{labels[far]} is {1e3 * found.distance[far]:.2g} mm outside of the body: move the bead.")
-        return Beads(*map(torch.from_numpy, (mesh.cells[found.cells], found.weights, found.gradients)))

@@ -13,9 +13,8 @@ import numpy as np
 import warp as wp
 
 from warp_resphys.energies.pointwise import PointwiseEnergy, in_cells
-from warp_resphys.io.settings import Positive, setting
-from warp_resphys.mesh.mesh import Mesh, select_cells
-from warp_resphys.settings.extensions import EnergySettings
+from warp_resphys.io.settings import Positive
+from warp_resphys.mesh.mesh import select_cells
 from warp_resphys.settings.mesh import BoxSettings, Direction
 from warp_resphys.stepping.quantity import Quantity
 
@@ -41,31 +40,19 @@ class Magnet(PointwiseEnergy):
     )
     inputs: ClassVar = (FIELD,)
     density: ClassVar = magnetic_energy
-    cells: np.ndarray  # (M',) magnetised cells
-    along: tuple[float, float, float]  # d, of length one
-    field_direction: tuple[float, float, float]  # b, of length one
-    magnetisation: float  # M [A/m]
+    magnetisation: Positive  # M [A/m]
+    along: Direction = (1.0, 0.0, 0.0)  # d, at rest; it is scaled to length one
+    field_direction: Direction = (0.0, 0.0, 1.0)  # b, in the world; it is scaled to length one
+    within: BoxSettings | None = None  # the cells that are magnetised; None: all
+
+    def __post_init__(self):
+        """Scales both directions to length one."""
+        for name in ("along", "field_direction"):
+            direction = np.array(getattr(self, name))
+            object.__setattr__(self, name, tuple(direction / np.linalg.norm(direction)))
 
     def points(self, mesh):
         """Returns the quadrature points of the cells, with F d as the variable of the energy."""
-        points = in_cells(mesh, self.cells)
+        within = {} if self.within is None else self.within.arguments()
+        points = in_cells(mesh, select_cells(mesh, **within))
         return (replace(points, gradients=points.gradients @ np.array(self.along)[:, None]),)
-
-
-class MagnetSettings(EnergySettings):
-    """A magnetised body in the field of a coil."""
-
-    magnetisation: Positive = setting(description="M", unit="A/m")
-    along: Direction = setting((1.0, 0.0, 0.0), "direction of the magnetisation at rest")
-    field: Direction = setting((0.0, 0.0, 1.0), "direction of the coil's field in the world")
-    within: BoxSettings = setting(BoxSettings(), "cells that are magnetised")
-
-    def build(self, mesh: Mesh) -> Magnet:
-        """Returns the energy of a body."""
-        along, field = (tuple(np.asarray(d) / np.linalg.norm(d)) for d in (self.along, self.field))
-        return Magnet(select_cells(mesh, **self.within.arguments()), along, field, self.magnetisation)
-
-    @property
-    def drive(self) -> Quantity:
-        """Input that drives the body in recordings and laboratories."""
-        return FIELD

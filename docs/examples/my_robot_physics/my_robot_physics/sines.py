@@ -3,28 +3,23 @@
 import torch
 from torch import nn
 
-from warp_resphys.io.settings import Natural, Positive, setting
-from warp_resphys.settings.extensions import CoreSettings
+from warp_resphys.io.settings import Natural, Positive
 
 
 class Sines(nn.Module):
-    """Maps (S, inputs) to (S, outputs) by one hidden layer of sines."""
+    """Maps (S, inputs) to (S, outputs) by one hidden layer of sines.
 
-    def __init__(self, inputs: int, outputs: int, width: int, frequency: float) -> None:
+    Args:
+        inputs: of a sample.
+        outputs: of a sample.
+        width: of the layer.
+        frequency: factor of the inputs of the sines.
+    """
+
+    def __init__(self, inputs: int, outputs: int, width: Natural = 16, frequency: Positive = 1.0) -> None:
         super().__init__()
         self.first, self.last, self.frequency = nn.Linear(inputs, width), nn.Linear(width, outputs), frequency
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Maps standardised inputs to standardised outputs."""
         return self.last(torch.sin(self.frequency * self.first(x)))
-
-
-class SineSettings(CoreSettings):
-    """A hidden layer of sines."""
-
-    width: Natural = setting(16, "of the layer")
-    frequency: Positive = setting(1.0, "factor of the inputs of the sines")
-
-    def build(self, inputs: int, outputs: int) -> Sines:
-        """Returns an untrained network."""
-        return Sines(inputs, outputs, self.width, self.frequency)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from my_robot_physics.magnet import MagnetSettings
+from my_robot_physics.magnet import Magnet
 
 from warp_resphys import Body, Inputs, Simulator, SolverSettings, StableNeoHookean, box_hexahedra, select_vertices
 from warp_resphys.studies.gradient_check import check_gradients
@@ -12,8 +12,7 @@ MESH = box_hexahedra((LENGTH, SIDE, SIDE), (12, 1, 1), nodes=27)
 
 
 def simulator(mesh):
-    energy = MagnetSettings(magnetisation=MAGNETISATION).build(mesh)
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[energy])
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[Magnet(MAGNETISATION)])
     rubber = StableNeoHookean(300e3, 0.3, density=1000.0, mass_damping=0.5, stiffness_damping=2e-3)
     return Simulator(body, rubber, gravity=(0.0, 0.0, 0.0), solver=SolverSettings("newton", 1e-12))
 

@@ -144,8 +144,9 @@ def _type(node: Schema, schema: Schema) -> str:
         members = _values(first, schema)
         members = re.sub(r"^(number|integer|word|group|list)\b", r"\1s", re.sub(r"^(\d)", r"lists of \1", members))
         members = f"numbers {members}" if members[0] in "<>≤≥" else members
-        members = f"of {members}" if "enum" in first and "minItems" in node else members
-        return f"{node['minItems'] if node.get('minItems') == node.get('maxItems', 0) else 'list of'} {members}"
+        if node.get("minItems") != node.get("maxItems", 0):
+            return f"list of {members}"
+        return f"{node['minItems']} {'of ' if 'enum' in first else ''}{members}"
     limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
     given = [f"{sign}{node[key]:,g}" for key, sign in limits.items() if key in node]
     name = "" if kind == "number" and given else _TYPES.get(kind, kind)

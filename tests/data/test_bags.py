@@ -105,11 +105,14 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
     return path
 
 
-@pytest.mark.parametrize(("kind", "late"), [("sqlite3", 0.0), ("mcap", 30.0), ("bag", 0.0)])
-def test_topics_are_brought_to_common_frames(kind, late, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "late", "file"),
+    [("sqlite3", 0.0, ""), ("mcap", 30.0, ""), ("mcap", 0.0, "trial.mcap"), ("bag", 0.0, "")],
+)
+def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
     """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
     path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind, late=late)
-    read = read_recording(path, bag=Bag(MARKERS, INPUTS))
+    read = read_recording(path / file, bag=Bag(MARKERS, INPUTS))
     assert read.rate == RATE
     assert read.labels == ("tip", "plate", "second", "plate +x", "plate +y", "plate +z")
     times = 0.3 / RATE + np.arange(len(read.positions)) / RATE  # from the first message of the rigid body on
@@ -193,6 +196,15 @@ def test_what_cannot_be_read_is_said(bag, error, words, tmp_path):
 def test_files_that_are_no_bags_are_said(tmp_path):
     with pytest.raises(DataFileError, match="there is no such file or folder"):
         read_recording(tmp_path / "trial.bag", bag=Bag(MARKERS))
-    (tmp_path / "broken.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
-    with pytest.raises(DataFileError, match="is damaged, or no bag"):
-        read_recording(tmp_path / "broken.bag", bag=Bag(MARKERS))
+    whole = (written(tmp_path / "trial", "mcap") / "trial.mcap").read_bytes()
+    contents = {
+        "a.bag": b"#ROSBAG V2.0\n" + bytes(100),
+        "cut.mcap": whole[:200],
+        "text.mcap": b"none",
+        "empty.mcap": b"",
+    }
+    contents["other.mcap"] = whole.replace(b"ros2", b"json", 1)  # the profile of another recorder
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataFileError, match=rf"{name} is damaged, or no bag of ROS .*: record it with ROS again"):
+            read_recording(tmp_path / name, bag=Bag(MARKERS))

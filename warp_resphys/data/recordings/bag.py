@@ -1,4 +1,4 @@
-"""Recordings in ROS 1 and 2 bags, read without ROS by the package rosbags, and MCAP files, also with JSON.
+"""Recordings in ROS 1 and 2 bags, also as single MCAP files, read without ROS by the package rosbags.
 
 Every topic has messages at its own times: those of its headers or, without headers, those at which it was recorded, on
 the clock of the headers. Markers and inputs are brought to common frames: markers by linear interpolation, rotations by
@@ -16,14 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ...io.errors import DataFileError, InputError, ResphysError, did_you_mean
-from .mcap_file import JsonMessage, McapFile, is_foreign
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
 _GAP = 2.5  # frames: a marker without messages for longer is not seen
 _SOURCE = re.compile(r"(?P<topic>[^#\s]+)(?:#(?P<member>\S+))?(?:\s*\[(?P<unit>[^\]]+)\])?")
 _CLOUD_TYPES = {7: "f4", 8: "f8"}  # of the fields of a PointCloud2
-_LACKING: Final = "bags need a package that is not installed: pip install 'warp-resphys[bags]'."
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
@@ -33,7 +31,7 @@ class Bag:
 
     A source is a topic, with a member after # where a message has several: the child frame of a transform
     (``/tf#tip``), the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a
-    joint (``/joint_states#finger.effort``). A member of a message in JSON is a path of keys (``/robot#tips.2``).
+    joint (``/joint_states#finger.effort``).
 
     Attributes:
         markers: sources by the name of the marker; those with a rotation are rigid bodies.
@@ -159,31 +157,26 @@ def _messages(path: Path, topics: set[str]) -> Iterator[tuple[str, Any, int, str
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Opens a bag; errors of rosbags, of many kinds for damaged files, become a DataFileError."""
+    """Opens a bag; the errors of rosbags for damaged files, of many classes, become a DataFileError."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(_LACKING) from None
+        raise InputError("bags need a package that is not installed: pip install 'warp-resphys[bags]'.") from None
     if not path.exists():
         raise DataFileError(f"Cannot read {path}: there is no such file or folder; check the path of the recording.")
     try:
-        types = get_typestore(Stores.LATEST)
-        with McapFile(path, types) if is_foreign(path) else AnyReader([path], default_typestore=types) as reader:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield reader
-    except ImportError:
-        raise InputError(_LACKING) from None
     except ResphysError:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {error}"
-        raise DataFileError(f"{path} is damaged, or no bag ({what}); record it again.") from error
+        raise DataFileError(f"{path} is damaged, or no bag of ROS ({what}): record it with ROS again.") from error
 
 
 def _stamp_of(message: Any, source: _Source) -> float:
     """Time of a message [s] by its header, NaN without one."""
-    if isinstance(message, JsonMessage):
-        return message.stamp
     if hasattr(message, "transforms"):
         message = next((own for own in message.transforms if own.child_frame_id == source.member), message)
     header = getattr(message, "header", None)
@@ -193,8 +186,6 @@ def _stamp_of(message: Any, source: _Source) -> float:
 
 def _pose(kind: str, message: Any, source: _Source, path: Path) -> Sequence[float] | None:
     """Place [m] and quaternion, w first, of a message, NaN without a rotation; None where it lacks the member."""
-    if isinstance(message, JsonMessage):
-        return message.pose(source.member)
     if kind in _IMAGES:
         raise DataFileError(
             f"{path}: {source.topic} has images: track the markers in them by another program, and give its table."
@@ -261,8 +252,6 @@ def _cloud(message: Any, number: int, path: Path, source: _Source) -> tuple[floa
 
 def _number(kind: str, message: Any, source: _Source, path: Path) -> Sequence[float] | None:
     """An input in a message, in its own unit."""
-    if isinstance(message, JsonMessage):
-        return message.number(source.member)
     if kind == "sensor_msgs/msg/JointState":
         joint, _, quantity = (source.member or "").rpartition(".")
         if quantity not in ("position", "velocity", "effort"):

@@ -204,7 +204,6 @@ class TestUserErrors:
             ("run seed", "cannot read the override 'seed'"),
             ("seed", "unknown command 'seed' (--help lists all)"),
             ("seed=1 inspct", "unknown command 'inspct', did you mean 'inspect'?"),
-            ("benchmark size", "benchmark has no part 'size', did you mean 'sizes'?"),
             ("gradcheck seed=1", "'gradcheck' is now part of verify: warp-resphys verify gradients --config-path"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
             ("+seed=1", "Could not append to config. An item is already at 'seed'."),

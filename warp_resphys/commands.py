@@ -1,6 +1,6 @@
 """The commands of `warp-resphys`: parsing of command lines, and help.
 
-A command is one word or two: ``benchmark``, ``benchmark sizes``. This module imports only what is fast to import.
+A command is one word or two: ``inspect``, ``inspect make-arm``. This module imports only what is fast to import.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Command:
 
     Attributes:
         purpose: one line for the help.
-        function: such as ``studies.sizes:size_study``, below this package. Its arguments are the settings, an object of
+        function: such as ``studies.film:film``, below this package. Its arguments are the settings, an object of
             the class that annotates this parameter, and the run folder.
         word: the configuration key that is set by one word after the command.
         words: the configuration key that is set by all words after the command, as a list.
@@ -65,30 +65,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         ),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
-        "benchmark": Command("time steps, forward and backward, and their parts", "studies.benchmark:benchmark"),
-        "benchmark sizes": Command("time and memory by linear solver and size of the body", "studies.sizes:size_study"),
-        "benchmark peers": Command("a step beside another simulator's, at equal error", "studies.peers:peer_study"),
-        "benchmark peers-contact": Command(
-            "a soft block that slides and one that is held, beside other simulators",
-            "studies.peer_contact:peers_contact",
-        ),
-        "benchmark gripper": Command(
-            "a step of grippers in a grasp, beside one without contact", "studies.gripper:gripper_study"
-        ),
-        "benchmark grasp": Command(
-            "two fingers of a run as a gripper, beside its laboratory's: errors in free air and in grasps",
-            "studies.grasp:grasp_study",
-            word="run",
-        ),
-        "benchmark elements": Command("sag of a beam, by element and refinement", "studies.elements:element_study"),
-        "benchmark locking": Command(
-            "deflection of an arm, by element and refinement", "studies.locking:locking_study"
-        ),
-        "benchmark twin": Command(
-            "a twin on a run's trials: computing times and errors of predictions",
-            "studies.twin_study:twin_study",
-            word="run",
-        ),
         "verify": Command(
             "simulate reference trajectories, and compare every vertex", "studies.verification:verify", words="files"
         ),
@@ -113,10 +89,6 @@ RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
         "compare": "inspect compare",
         "make-arm": "inspect make-arm",
         "film": "view film",
-        "size-study": "benchmark sizes",
-        "peer-study": "benchmark peers",
-        "element-study": "benchmark elements",
-        "locking-study": "benchmark locking",
         "gradcheck": "verify gradients",
         "check": "verify device",
     }
@@ -167,9 +139,6 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
     if len(words) > 1 and rest[words[1]] in parts:
         name, named = f"{name} {rest[words[1]]}", words[:2]
     after, command = words[len(named) :], COMMANDS[name]
-    if after and parts and not (command.word or command.words) and len(named) == 1:
-        hint = did_you_mean(rest[after[0]], parts)
-        raise InputError(f"{name} has no part '{rest[after[0]]}'{hint} (its parts are {', '.join(parts)})")
     quoted = [
         word if _PLAIN.fullmatch(word) else "'{}'".format(word.replace("'", r"\'"))
         for word in map(rest.__getitem__, after)

@@ -40,7 +40,7 @@ from .io.settings import parse
 
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
-TYPED: Final = ("run", "tune", "benchmark", "verify gradients", "verify device")
+TYPED: Final = ("run", "tune", "verify gradients", "verify device")
 _FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that replace the package's configuration
 # Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
@@ -52,7 +52,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
 
     Args:
         command: name of the command.
-        function: its module below this package and its function, such as "studies.sizes:size_study". The configuration
+        function: its module below this package and its function, such as "studies.film:film". The configuration
             is parsed into the class that annotates its first parameter.
         arguments: for Hydra.
     """

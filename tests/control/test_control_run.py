@@ -37,8 +37,6 @@ from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.studies.gradient_check import central_difference
 from warp_resphys.studies.live_twin import TwinSettings
-from warp_resphys.studies.run_speed import command_sheet, time_commands
-from warp_resphys.studies.twin_study import twin_sheet
 
 CONTROL = [
     "experiment=tendon_rod_control",
@@ -366,7 +364,6 @@ class TestReducedTwin:
         assert isinstance(twin.estimator, ReducedEstimator)
         assert make().estimator.model is twin.estimator.model
         assert ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet yet" in repr(twin)
-        assert "reduced model without markers, mm" in twin_sheet([], twin).headings
         with pytest.raises(InputError, match="no youngs_modulus to refine"):
             settings.changed(refine={"youngs_modulus": 1e3}).twins_of(twin.estimator.robot)
         with pytest.raises(InputError, match=r"robot is '.*': give the robot of a run, as warp_resphys\.load"):
@@ -540,17 +537,3 @@ def test_invalid_settings_of_control_are_refused(override, key):
     with pytest.raises(InputError) as caught:
         check(composed("experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20", *override.split(";")))
     assert key in (offending(str(caught.value)), str(caught.value)[: len(key)])
-
-
-def test_the_benchmark_times_the_receding_controllers(folder):
-    rows = time_commands(folder, 1)
-    assert [row["controller"] for row in rows] == ["resphys", "linear", "full simulator"]
-    assert all(row["horizon_s"] == 0.1 and 0.0 < row["ms"] <= row["largest_of_20_ms"] for row in rows)
-    sheet = command_sheet(rows)
-    assert [row[0] for row in sheet.rows] == [row["controller"] for row in rows]
-    assert "over 0.1 s" in sheet.title
-
-
-def test_only_a_run_can_be_timed(tmp_path):
-    with pytest.raises(DataFileError):
-        time_commands(tmp_path, 1)

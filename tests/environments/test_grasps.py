@@ -5,12 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from support.command_line import outcome
 from support.main_job import IN_RUN, run_without_report
 from warp_resphys.environments.making import make_vector, register
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_json
 
 BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
 RUN = [
@@ -66,25 +64,8 @@ def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
     np.testing.assert_array_equal(together.reset(seed=0)[0], first)
 
 
-def test_the_study_compares_models_with_the_laboratory(fingers, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    short = ["closing=0.15", "lifting=0.05", "shaking=0.05", "models=[simulation,resphys]", "things=[box]"]
-    out = outcome("benchmark", "grasp", f"run={fingers}", *short).out
-    assert "laboratory in free air" in out
-    (written,) = tmp_path.rglob("grasp_study.json")
-    rows = {(row["thing"], row["model"]): row for row in read_json(written)["rows"]}
-    assert set(rows) == {
-        *((("nothing", model)) for model in ("no tension", "simulation", "resphys")),
-        *((("box", model)) for model in ("laboratory in free air", "simulation", "resphys")),
-    }
-    # In the grasp the box stops the fingers, of the models too.
-    assert rows["box", "simulation"]["error_mm"] < 0.5 * rows["box", "laboratory in free air"]["error_mm"]
-    assert rows["nothing", "simulation"]["error_mm"] < 0.5 * rows["nothing", "no tension"]["error_mm"]
-
-
 def test_what_cannot_grasp_is_refused(fingers, folder):
     with pytest.raises(InputError, match="contact, which reduced models lack"):
         make_vector("grasp", fingers, 1, world="reduced")
     with pytest.raises(InputError, match="this robot has front, left, right"):
         make_vector("grasp", folder, 1)
-    assert "a finger of a gripper has one" in outcome("benchmark", "grasp", f"run={folder}").err

@@ -16,7 +16,6 @@ from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.policy import _text
-from warp_resphys.studies.run_speed import environment_sheet, time_environments
 
 
 def still(seen):
@@ -147,16 +146,3 @@ def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
     assert code == 2
     assert offending(err) == wrong.split("=")[0]
-
-
-def test_speeds_are_those_of_all_robots_and_worlds(folder):
-    rows = time_environments(folder, [1, 2], 1, "cpu")
-    assert [(row["world"], row["robots"]) for row in rows] == [
-        (world, count) for world in ("simulator", "laboratory") for count in (1, 2)
-    ]
-    for row in rows:
-        assert row["actions_s"] == pytest.approx(1e3 * row["robots"] / row["ms"])
-        assert row["steps_s"] == pytest.approx(5 * row["actions_s"])
-    sheet = environment_sheet(rows)
-    assert [row[0] for row in sheet.rows] == [row["world"] for row in rows]
-    assert {len(row) for row in sheet.rows} == {len(sheet.headings)}

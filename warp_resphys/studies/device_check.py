@@ -1,4 +1,4 @@
-"""Compares results and speed of a device with those of the CPU, and writes a page of results."""
+"""Compares results of a device with those of the CPU, and writes a page of results."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ from ..experiment.files import METRICS
 from ..fem.body import Body
 from ..fem.scene import Scene
 from ..io.errors import ResphysError
-from ..io.files import write_json
+from ..io.machine import hardware
 from ..io.settings import Many, Natural, Positive, Settings, Word
 from ..io.stages import run_lock
 from ..linalg.choice import LINEAR_SOLVERS
@@ -32,7 +32,6 @@ from ..mesh.mesh import Mesh, select_vertices
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .beam import ELEMENT_NAMES, Divisions, Element, beam_mesh, clamped
-from .benchmark import BenchmarkRun, benchmark_sheets, machine, run_benchmark
 from .gradient_check import check_gradients, pose
 from .runs import Results, Run, made, run_all
 from .tables import Sheet, show
@@ -58,9 +57,10 @@ class CheckSettings(Settings):
     results: Word | None
 
 
-class DeviceCheck(BenchmarkRun):
-    """The configuration ``verify_device``: checks and benchmark of a device."""
+class DeviceCheck(Settings):
+    """The configuration ``verify_device``: checks of a device."""
 
+    device: Word
     check: CheckSettings
 
 
@@ -104,7 +104,7 @@ def bounded(name: str, measure: Callable[[], float], bound: float, unit: str = "
 
 
 def check_device(settings: DeviceCheck, folder: Path) -> None:
-    """Prints the checks and the benchmark, and writes a page; exits with 1 where a check failed.
+    """Prints the checks, and writes a page; exits with 1 where a check failed.
 
     Raises:
         InputError: an unknown device.
@@ -124,16 +124,13 @@ def check_device(settings: DeviceCheck, folder: Path) -> None:
         work["Experiments, one epoch and their roll-outs"] = lambda: experiment_checks(check, str(device), folder)
     with run_lock(folder):
         sections = [run_checks(title, checks) for title, checks in work.items()]
-        measured = run_benchmark(settings)
-        write_json(folder / "benchmark.json", measured)
-        sheets = benchmark_sheets(measured)
-        show(*sheets)
-        place, count = machine(measured), sum(len(section.checks) for section in sections)
+        place = hardware()["GPU" if device.type == "cuda" else "processor"]
+        count = sum(len(section.checks) for section in sections)
         failed = sum(not check.passed for section in sections for check in section.checks)
         outcome = (
             f"{failed} of {count} checks on {place} failed." if failed else f"{count} checks on {place}: all passed."
         )
-        tables = [*(section.sheet(section.title) for section in sections), *sheets]
+        tables = [section.sheet(section.title) for section in sections]
         date = f"{datetime.now():%Y-%m-%d}"
         parts = [*(table.for_page() for table in tables), made("verify device")]
         results = Results("Check of a device", date, outcome, parts)

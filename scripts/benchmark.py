@@ -1,0 +1,138 @@
+"""Times the simulator on this machine: medians over repeats that take turns, beside a yardstick of LAPACK.
+
+    python scripts/benchmark.py step                                 one beam, by solver and Poisson's ratio
+    python scripts/benchmark.py batches --device cuda solver.factors=single
+    python scripts/benchmark.py step experiment=sopra --materials configured
+    python scripts/benchmark.py sizes mesh=beam_tetrahedra --linear-solvers multigrid pardiso
+    python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
+    python scripts/benchmark.py gripper
+    python scripts/benchmark.py peers --programs newton mujoco        a block in contact, at equal error
+
+Results are printed as tables, and added to a JSON file of the machine, where they replace those of the same subcommand.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
+
+import argparse
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from benchmarks import gripper, peers, steps, twin
+from rich.console import Console
+from rich.table import Table
+
+from warp_resphys.commands import USER_ERROR
+from warp_resphys.dynamics.nonlinear_solver import SOLVERS
+from warp_resphys.experiment.build import choose_device
+from warp_resphys.io.errors import ResphysError
+from warp_resphys.io.files import read_json, write_json
+from warp_resphys.io.machine import commit, hardware
+from warp_resphys.io.stages import package_versions
+from warp_resphys.linalg.choice import LINEAR_SOLVERS
+
+_LOG_WIDTH: Final = 180  # of tables that go to a file, in characters
+
+
+def main(words: Sequence[str]) -> int:
+    """Measures what the words of a command line ask for, and returns the exit code."""
+    parser = command_line()
+    arguments, arguments.settings = parser.parse_known_args(words)
+    for word in arguments.settings:
+        if word.startswith("-") or "=" not in word or arguments.subcommand in ("gripper", "peers"):
+            parser.error(f"unknown argument {word}")
+    try:
+        device = choose_device(arguments.device)
+        if device.type == "cpu":
+            torch.set_num_threads(1)  # as in runs
+        results = arguments.measure(arguments)
+    except ResphysError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return USER_ERROR
+    show(results)
+    machine = hardware()
+    place = machine["GPU" if device.type == "cuda" else "processor"]
+    path = arguments.output / (re.sub(r"[^a-z0-9]+", "-", place.lower()).strip("-") + ".json")
+    about = {
+        "command": shlex.join(["python", "scripts/benchmark.py", *words]),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit() or "not known",
+        "hardware": machine,
+        "versions": package_versions(),
+    }
+    write_json(path, {**(read_json(path) if path.is_file() else {}), arguments.subcommand: {**about, **results}})
+    print(f"Written: {path}")
+    return 0
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Returns the parser of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--device", default="cpu", help="cpu, cuda or cuda:1 (default: %(default)s)")
+    shared.add_argument("--repeats", type=int, default=5, help="of every case (default: %(default)s)")
+    shared.add_argument("--output", type=Path, default=Path("outputs/benchmark"), help="folder (default: %(default)s)")
+    body = argparse.ArgumentParser(add_help=False)
+    body.add_argument("--materials", nargs="+", choices=steps.MATERIALS, default=["0.45", "0.499"])
+    parts = parser.add_subparsers(dest="subcommand", required=True)
+    step = parts.add_parser("step", parents=[shared, body], help="one body, by solver")
+    batches = parts.add_parser("batches", parents=[shared, body], help="many bodies at once")
+    for part, solvers, sizes in ((step, ["quasi_newton", "newton"], (1,)), (batches, ["quasi_newton"], None)):
+        part.set_defaults(measure=steps.measure_steps, run=None)
+        part.add_argument("--solvers", nargs="+", choices=SOLVERS, default=solvers)
+        part.add_argument("--refinements", nargs="+", type=float, default=[1.0])
+        part.add_argument("--batches", nargs="+", type=int, default=sizes)
+        part.add_argument("--steps", type=int, default=60, help="of a roll-out (default: %(default)s)")
+        part.add_argument("--straight", action="store_true", help="the body starts from its shape at rest")
+        part.add_argument("--floor", action="store_true", help="the body is lifted, and falls on a floor")
+    batches.add_argument("--run", type=Path, help="a run folder, whose environments are timed, too")
+    sizes = parts.add_parser("sizes", parents=[shared, body], help="by size of the body and linear solver")
+    sizes.set_defaults(measure=steps.measure_sizes)
+    linear = ["banded", "sparse", "multigrid", "pardiso"]
+    sizes.add_argument("--linear-solvers", nargs="+", choices=LINEAR_SOLVERS, default=linear)
+    sizes.add_argument("--refinements", nargs="+", type=float, default=[1.0, 2.0, 3.0, 4.0, 5.0])
+    sizes.add_argument("--longest", type=float, default=150.0, help="time of a case [s]; larger ones are left out")
+    follow = parts.add_parser("twin", parents=[shared], help="a twin that follows the trials of a run")
+    follow.set_defaults(measure=twin.measure_twin)
+    follow.add_argument("run", type=Path)
+    follow.add_argument("--model", default="resphys")
+    follow.add_argument("--trials", nargs="+", help="of the run (default: all)")
+    follow.add_argument("--every", type=float, default=0.03, help="time between two predictions [s]")
+    grasp = parts.add_parser("gripper", parents=[shared], help="grippers that lift a soft ball")
+    grasp.set_defaults(measure=gripper.measure_grippers)
+    grasp.add_argument("--batches", nargs="+", type=int, help="numbers of grippers")
+    grasp.add_argument("--fingers", nargs=3, type=int, default=[2, 2, 10], help="bricks of a finger")
+    grasp.add_argument("--tensions", nargs=2, type=float, default=[1.2, 1.8], help="of the first and the last [N]")
+    grasp.add_argument("--factors", choices=["double", "single"], default="double")
+    other = parts.add_parser("peers", parents=[shared], help="beside Newton and MuJoCo, at equal error")
+    other.set_defaults(measure=peers.measure_peers)
+    other.add_argument("--programs", nargs="*", choices=["newton", "mujoco"], default=["newton", "mujoco"])
+    other.add_argument("--divisions", nargs=3, type=int, default=[8, 6, 5], help="bricks of the block")
+    other.add_argument("--finest", type=int, default=8, help="number of settings of every program")
+    return parser
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints lists of rows as tables, and single figures as lines."""
+    console = Console(width=None if sys.stdout.isatty() else _LOG_WIDTH)
+    for title, rows in results.items():
+        if not isinstance(rows, list):
+            console.print(f"{title}: {rows:.3g}", highlight=False)
+            continue
+        table = Table(title=title, title_justify="left")
+        for name in dict.fromkeys(name for row in rows for name in row):
+            table.add_column(name.replace("_", " "), justify="right")
+        for row in rows:
+            table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()))
+        console.print(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,105 @@
+"""A step of grippers in a grasp: two soft fingers with tendons close on a soft ball on a table, and lift it."""
+
+import argparse
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from warp_resphys.dynamics.nonlinear_solver import SolverSettings
+from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.energies.contact import Contact
+from warp_resphys.energies.launcher import Launcher
+from warp_resphys.energies.materials import Corotated
+from warp_resphys.energies.obstacles import HalfSpace
+from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.energies.surfaces import SurfaceContact
+from warp_resphys.energies.tendons import Tendons
+from warp_resphys.experiment.build import choose_device
+from warp_resphys.fem.body import Body
+from warp_resphys.fem.scene import Scene
+from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.robot.gripper import thing_mesh
+from warp_resphys.stepping.inputs import Inputs
+
+from .measuring import free_unknowns, now, solves, take_turns
+
+LENGTH, SIDE, RADIUS, TABLE, GAP = 0.08, 0.014, 0.012, -0.083, 1.5e-3  # [m]
+BALL: Final = 4  # bricks along the ball
+D: Final = 5e-4  # distance at which contact begins [m]
+STIFFNESS, FRICTION, SLIP_SPEED = 5e4, 0.5, 5e-3  # [Pa], 1, [m/s]
+CLOSED, LIFTED, RISE, TIME_STEP = 0.2, 0.5, 0.03, 0.01  # times [s] and height [m] of a grasp
+RUBBER: Final = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45, density=1070.0, stiffness_damping=4e-3)
+BATCHES: Final = {"cpu": (1, 16), "cuda": (1, 16, 256, 1024)}
+STEPS: Final = round(LIFTED / TIME_STEP)
+
+
+def finger(side: float, divisions: tuple[int, int, int]) -> Body:
+    """Returns a finger that hangs beside the ball, with a tendon 3 mm below its inner face."""
+    box, inner = box_hexahedra((SIDE, SIDE, LENGTH), divisions), RADIUS + GAP
+    mesh = replace(box, vertices=box.vertices - [SIDE / 2, SIDE / 2, LENGTH] + [0.0, side * (inner + SIDE / 2), 0.0])
+    tendon = Tendons([[[0.0, side * (inner + 0.003), z] for z in np.linspace(0.0, -LENGTH, 11)]])
+    return Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=[tendon])
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Grippers that close on a ball and lift it, one for every tension; without contact, fingers pass through it."""
+
+    scene: Scene
+    simulator: Simulator
+    inputs: Inputs
+    batch: int
+
+    @classmethod
+    def of(cls, arguments: argparse.Namespace, batch: int, device: torch.device, contact: bool) -> "Grasp":
+        """Returns grippers whose tensions are spread evenly; one alone has the largest."""
+        ball = thing_mesh("ball", RADIUS, BALL)
+        ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
+        table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
+        bodies = {name: finger(side, tuple(arguments.fingers)) for name, side in (("left", -1.0), ("right", 1.0))}
+        bodies["ball"] = Body(ball, energies=[table] if contact else [])
+        scene = Scene(bodies, SurfaceContact(STIFFNESS, FRICTION, D, SLIP_SPEED) if contact else None)
+        solver = SolverSettings(relative_tolerance=1e-6, factors=arguments.factors)
+        simulator = Simulator(scene, RUBBER, TIME_STEP, solver=solver, device=device)
+        least, most = arguments.tensions
+        tensions = simulator.tensor(np.linspace(most if batch == 1 else least, most, batch))
+        times = TIME_STEP * simulator.tensor(1 + np.arange(STEPS))
+        way = ((times - CLOSED) / (LIFTED - CLOSED)).clamp(0.0, 1.0)
+        base = simulator.rest_positions[simulator.fixed].repeat(STEPS, 1, 1, 1)
+        base[..., 2] += RISE * (0.5 - 0.5 * torch.cos(math.pi * way))[:, None, None]
+        pull = ((times / CLOSED).clamp_max(1.0)[:, None] * tensions)[..., None]
+        own = scene.inputs({name: Inputs(tendon_tension=pull) for name in ("left", "right")})
+        return cls(scene, simulator, Inputs(fixed_positions=base.expand(-1, batch, -1, -1), **own.fields), batch)
+
+    @torch.no_grad()
+    def measure(self) -> dict[str, float]:
+        """Lifts the ball once: time of a step of all grippers, and how many hold the ball."""
+        start = self.simulator.rest_state(self.batch)
+        began = now(start.q.device)
+        path = self.simulator.rollout(start, STEPS, self.inputs)
+        seconds = (now(start.q.device) - began) / STEPS
+        ball = self.scene.vertex_slice("ball")
+        height = path.q[-1, :, ball, 2].mean(1) - start.q[:, ball, 2].mean(1)
+        pairs = PairList(Launcher(self.batch, start.q.device), Surface.of(self.scene.mesh), D)
+        seen = path.q[:: max(STEPS // 10, 1)].double()
+        crossings = sum(int(pairs.crossings(q)[0].sum()) for q in seen)
+        held = int((height > 0.9 * RISE).sum())
+        return {"ms": 1e3 * seconds, "iterations": solves(path)["iterations"], "held": held, "crossings": crossings}
+
+
+def measure_grippers(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Times a step of grippers, with contact and without."""
+    device, rows, yardstick = choose_device(arguments.device), list[dict[str, Any]](), 0.0
+    for batch in arguments.batches or BATCHES[device.type]:
+        grasps = [Grasp.of(arguments, batch, device, contact) for contact in (True, False)]
+        for grasp in grasps:
+            grasp.measure()  # compiles kernels
+        (own, free), yardstick = take_turns(f"{batch} grippers", [g.measure for g in grasps], arguments.repeats)
+        head = {"grippers": batch, "unknowns": free_unknowns(grasps[0].simulator), "grasp_ms": own.pop("ms")}
+        speed = {"steps_per_s": 1e3 * batch / head["grasp_ms"], "without_contact_ms": free["ms"]}
+        share = {"iterations_without": free["iterations"], "speed_of_that_without": free["ms"] / head["grasp_ms"]}
+        rows.append({**head, **speed, **own, **share})
+    return {"yardstick_ms": yardstick, f"a step of {1e3 * TIME_STEP:g} ms of all grippers": rows}

@@ -1,0 +1,85 @@
+"""Timing in turns, beside a yardstick.
+
+The speed of a machine varies. Cases therefore take turns, medians are reported, and a fixed task of LAPACK, the
+yardstick, is timed with them, so that times over the yardstick can be compared between days and machines.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from statistics import median
+from typing import Final
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from threadpoolctl import threadpool_limits
+
+from warp_resphys.commands import CONFIG_PACKAGE
+from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.dynamics.trajectory import Trajectory
+from warp_resphys.io.progress import Progress
+from warp_resphys.io.settings import parse
+from warp_resphys.launch import freed
+from warp_resphys.settings.run import RunSettings
+
+CPU: Final = torch.device("cpu")
+_SIZE: Final = 480  # of the yardstick's matrices
+
+
+@cache
+def run_settings(overrides: tuple[str, ...]) -> RunSettings:
+    """Returns the settings of a run, as the command line composes them."""
+    with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
+        return parse(RunSettings, OmegaConf.to_container(compose("config", freed(overrides)), resolve=True))
+
+
+def now(device: torch.device = CPU) -> float:
+    """Returns the time [s] after the device has finished its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def median_ms(task: Callable[[], object], repeats: int, device: torch.device = CPU) -> float:
+    """Returns the median duration [ms] of a task on a device."""
+    durations = []
+    for _ in range(repeats):
+        began = now(device)
+        task()
+        durations.append(now(device) - began)
+    return 1e3 * median(durations)
+
+
+def yardstick_ms() -> float:
+    """Returns the median duration [ms] of a product and a Cholesky factor of 480 x 480 in NumPy, on one thread."""
+    random = np.random.default_rng(0).standard_normal((_SIZE, _SIZE))
+    with threadpool_limits(1):
+        return median_ms(lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5)
+
+
+def take_turns(
+    title: str, tasks: Sequence[Callable[[], Mapping[str, float]]], repeats: int
+) -> tuple[list[dict[str, float]], float]:
+    """Runs tasks in turns, and returns the medians of the figures that each returns, and of the yardstick [ms]."""
+    figures: list[list[Mapping[str, float]]] = [[] for _ in tasks]
+    yardsticks = []
+    with Progress(title, repeats * len(tasks), "runs") as progress:
+        for _ in range(repeats):
+            for task, own in zip(tasks, figures, strict=True):
+                own.append(task())
+                progress.advance()
+            yardsticks.append(yardstick_ms())
+    return [{name: median(row[name] for row in own) for name in own[0]} for own in figures], median(yardsticks)
+
+
+def solves(path: Trajectory) -> dict[str, float]:
+    """Returns the mean numbers of iterations and factorisations in a step of a roll-out."""
+    counts = ("iterations", "factorisations")
+    return {name: float(np.mean([getattr(r, name).double().mean().item() for r in path.reports])) for name in counts}
+
+
+def free_unknowns(simulator: Simulator) -> int:
+    """Returns the number of coordinates of the free vertices of one environment."""
+    return 3 * (simulator.body.n_vertices - len(simulator.fixed))

@@ -1,0 +1,258 @@
+"""A step of an experiment's body, forward and backward: by solver, material, refinement, batch and linear solver."""
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from warp_resphys.dynamics.assembly import HessianAssembly
+from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.experiment.build import build_body, build_simulator, choose_device, finer
+from warp_resphys.io.files import read_json
+from warp_resphys.io.memory import peak_memory_gib
+from warp_resphys.io.progress import Progress
+from warp_resphys.io.settings import parse
+from warp_resphys.linalg.threads import threads_for
+from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.state import State
+
+from .measuring import free_unknowns, median_ms, now, run_settings, solves, take_turns
+
+Rows = list[dict[str, Any]]
+MATERIALS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "0.45": {"poissons_ratio": 0.45, "youngs_modulus": 215e3},
+    "0.499": {"poissons_ratio": 0.499, "youngs_modulus": 264e3},
+    "law": {"model": "law", "c10": 24e3, "ogden_3": 40e3, "bulk_1": 22e6},
+    "configured": {},
+}
+BATCHES: Final[Mapping[str, Sequence[int]]] = {"cpu": (1, 4, 16), "cuda": (1, 16, 256, 1024, 4096)}
+FLOOR: Final = ("obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004]}", "contact.friction=0.3")
+STEPS: Final = "a step of the whole batch"
+_SCRIPT: Final = Path(__file__).parents[1] / "benchmark.py"
+_DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
+_MODULI: Final = ("youngs_modulus", "c10")  # by the first of which gradients are taken
+_TIP_MASS: Final = 0.1  # [kg]
+_PRESSURE: Final = 2e4  # [Pa]
+_FITTED: Final = 3  # largest sizes, to which exponents are fitted
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A roll-out of a body of an experiment."""
+
+    simulator: Simulator
+    start: State
+    steps: int
+    inputs: Inputs
+    moduli: Mapping[str, torch.Tensor]
+
+    def measure(self) -> dict[str, float]:
+        """Times a step of the whole batch without gradients (plain), with them, and in the backward pass.
+
+        The gradient is that of the sum of squares of the last state, with respect to the first state, a force on every
+        vertex at every step, and a modulus.
+        """
+        device, steps, batch = self.start.q.device, self.steps, len(self.start.q)
+        began = now(device)
+        with torch.no_grad():
+            path = self.simulator.rollout(self.start, steps, self.inputs, self.moduli)
+        plain = now(device) - began
+        q, v = (tensor.detach().clone().requires_grad_() for tensor in (self.start.q, self.start.v))
+        force = q.new_zeros(steps, *q.shape).requires_grad_()
+        moduli = {name: value.clone().requires_grad_() for name, value in self.moduli.items()}
+        began = now(device)
+        path = self.simulator.rollout(State(q, v), steps, self.inputs.replace(external_force=force), moduli)
+        forward = now(device) - began
+        loss = path.q[-1].square().sum() + path.v[-1].square().sum()
+        began = now(device)
+        torch.autograd.grad(loss, [q, v, force, *moduli.values()])
+        backward = now(device) - began
+        times = {"plain_ms": plain, "forward_ms": forward, "backward_ms": backward}
+        speed = {"steps_per_s": batch * steps / plain, **solves(path)}
+        return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
+
+
+def rollout_of(
+    overrides: tuple[str, ...], material: str, refinement: float, solver: str, batch: int, steps: int, straight: bool
+) -> Rollout:
+    """Returns a roll-out, after two steps and their gradient, which compile kernels.
+
+    Args:
+        overrides: of the configuration of a run.
+        material: a key of `MATERIALS`.
+        refinement: of the configured mesh.
+        solver: its name.
+        batch: number of environments.
+        steps: of the roll-out.
+        straight: whether the body starts from its shape at rest, and not from an equilibrium under loads.
+    """
+    settings = run_settings((*_DEFAULTS, *overrides))
+    mesh = settings.mesh if refinement == 1.0 else finer(settings.mesh, refinement)
+    settings = settings.changed(mesh=mesh, solver=settings.solver.changed(name=solver))
+    changes = MATERIALS[material]
+    law = parse(MaterialSettings, changes) if "model" in changes else settings.simulation.changed(**changes)
+    simulator = build_simulator(settings, law, build_body(settings))
+    start, inputs = simulator.rest_state(batch), Inputs()
+    if not straight:
+        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
+    name = next((name for name in _MODULI if name in law.constants), None)
+    moduli = {} if name is None else {name: simulator.tensor(law.constants[name]).reshape(1)}
+    Rollout(simulator, start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}), moduli).measure()
+    return Rollout(simulator, start, steps, inputs, moduli)
+
+
+def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> tuple[State, Inputs]:
+    """Returns start and inputs of a roll-out: let go under a weight or, with chambers, at rest before pressures rise.
+
+    The weight hangs at the end that is farthest from the fixed vertices along the body; it is lighter in each further
+    environment, and lifts the end where ``sign`` is negative.
+    """
+    chambers = simulator.counts.get("pressure", 0)
+    shares = simulator.tensor(np.arange(batch) / batch)
+    if chambers:
+        phase = simulator.tensor(np.arange(steps)[:, None, None] / steps)
+        shift = simulator.tensor(np.arange(chambers) / chambers) + shares[:, None]
+        pressure = 0.5 * _PRESSURE * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))  # (T, B, n)
+        return simulator.static_equilibrium(Inputs(pressure=pressure[0])).detach(), Inputs(pressure=pressure)
+    rest = simulator.rest_positions
+    along = rest[:, int((rest.amax(0) - rest.amin(0)).argmax())]
+    distance = (along - along[simulator.fixed].mean()).abs()
+    tip = (distance > (1.0 - 1e-9) * distance.max()).to(rest.dtype)
+    masses = sign * _TIP_MASS * (1.0 - 0.5 * shares)
+    force = masses[:, None, None] * (tip / tip.sum())[:, None] * simulator.tensor(simulator.gravity)
+    return simulator.static_equilibrium(Inputs(force)).detach(), Inputs()
+
+
+def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Times steps and their parts, and the environments of a run."""
+    device = choose_device(arguments.device)
+    overrides = (*arguments.settings, *(FLOOR if arguments.floor else ()), f"device={device}")
+    batches = arguments.batches or BATCHES[device.type]
+    cases = [*product(arguments.solvers, arguments.materials, arguments.refinements, batches)]
+    rollouts = [
+        rollout_of(
+            overrides,
+            material,
+            refinement,
+            solver,
+            batch,
+            steps_of(solver, refinement, arguments.steps),
+            arguments.straight,
+        )
+        for solver, material, refinement, batch in cases
+    ]
+    measured, yardstick = take_turns("steps", [rollout.measure for rollout in rollouts], arguments.repeats)
+    steps, parts = Rows(), Rows()
+    for (*case, batch), rollout, times in zip(cases, rollouts, measured, strict=True):
+        head: dict[str, Any] = {**dict(zip(("solver", "material", "refinement"), case, strict=True)), "batch": batch}
+        relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
+        size = {"unknowns": free_unknowns(rollout.simulator)}
+        steps.append({**head, **size, **times, **relative, "memory_gib": peak_memory_gib()})
+        parts.append({**head, **part_times(rollout.simulator, batch, arguments.repeats)})
+    tables: dict[str, Any] = {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
+    if arguments.run is not None:
+        counts = arguments.batches or (1, 16, 64)
+        tables["environments"] = environments(arguments.run, counts, arguments.repeats, str(device))
+    return tables
+
+
+def steps_of(solver: str, refinement: float, most: int) -> int:
+    """Returns the length of a roll-out: fewer steps of large bodies, and of a solver with hundreds of iterations."""
+    return min(most, 5) if solver == "projective_dynamics" else max(round(most / refinement**2), min(most, 5))
+
+
+def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]:
+    """Returns the median times of the parts of a solver's iteration [ms] in the last state of a batch."""
+    workspace = simulator.workspace(batch)
+    potential = workspace.gather()
+    linear = workspace.linear_solver(simulator.settings.linear_solver, simulator.dtype)
+    assemble = HessianAssembly(potential, linear, workspace.pattern)
+    potential.update_tangent()
+    values = assemble().to(simulator.dtype, copy=True)
+    factor = linear.factor(values.clone())
+    right = torch.ones(batch, linear.n, 1, device=potential.device, dtype=simulator.dtype)
+    parts: dict[str, Callable[[], object]] = {
+        "local_step": potential.evaluate,
+        "tangent": potential.update_tangent,
+        "assembly": assemble,
+        "factor": lambda: linear.factor(values.clone()),
+        "solve": lambda: factor.solve(right),
+    }
+    with threads_for(linear.n):  # as in a step
+        times = {f"{name}_ms": median_ms(part, 5 * repeats, potential.device) for name, part in parts.items()}
+    return {"linear_solver": type(linear).__name__, **times}
+
+
+def environments(run: Path, counts: Sequence[int], repeats: int, device: str) -> Rows:
+    """Times random actions of environments of a run with the task reach; an action is several steps.
+
+    Raises:
+        DataFileError: the folder has no run that can be loaded.
+    """
+    from warp_resphys.environments.making import make_vector
+
+    rows, random = Rows(), np.random.default_rng(0)
+    for count in counts:
+        robots = make_vector("reach", run, count, spread=0.0, seconds=100.0, device=device)
+        robots.reset(seed=0)
+        action = random.uniform(-1.0, 1.0, (count, robots.world.parts)).astype(np.float32)
+        robots.step(action)  # loads kernels and makes buffers
+        ms = median_ms(partial(robots.step, action), 5 * repeats)  # an action ends with states on the host
+        speed = 1e3 * count / ms
+        rows.append({"robots": count, "action_ms": ms, "actions_per_s": speed, "steps_per_s": speed * robots.frames})
+    return rows
+
+
+def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Times a body that starts straight, by size and linear solver, each case in a process with its own memory.
+
+    Where a case fails or takes too long, larger ones of its linear solver are left out.
+    """
+    tables, kinds = dict[str, Any](), [*product(arguments.materials, arguments.linear_solvers)]
+    fixed = ["--straight", "--steps=2", f"--device={arguments.device}", f"--repeats={arguments.repeats}"]
+    with Progress("sizes", len(kinds) * len(arguments.refinements), "cases") as progress:
+        for material, linear in kinds:
+            rows, failure = Rows(), ""
+            for refinement in arguments.refinements:
+                case = [f"solver.linear_solver={linear}", f"--materials={material}", f"--refinements={refinement}"]
+                if not failure:
+                    measured, failure = alone([*arguments.settings, *case, *fixed], arguments.longest)
+                    rows += measured
+                progress.advance()
+            powers = ", ".join(f"{name} {power:.2f}" for name, power in exponents(rows).items())
+            tables[f"{material}, {linear}; exponents: {powers or 'not known'}{failure}"] = rows
+    return tables
+
+
+def alone(words: Sequence[str], longest: float) -> tuple[Rows, str]:
+    """Returns the row of `measure_steps` in a new process, or none and why it failed."""
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, str(_SCRIPT), "step", *words, "--solvers=quasi_newton", f"--output={folder}"]
+        try:
+            run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=longest)
+        except subprocess.TimeoutExpired:
+            return Rows(), f"; the next takes more than {longest:g} s"
+        if run.returncode:
+            return Rows(), f"; the next: {[f'exit code {run.returncode}', *run.stderr.splitlines()][-1]}"
+        (written,) = Path(folder).iterdir()
+        return read_json(written)["step"][STEPS], ""
+
+
+def exponents(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Returns exponents of times and memory over the number of unknowns, fitted to the three largest sizes."""
+    largest = rows[-_FITTED:]
+    if len(largest) < 2:
+        return {}
+    size = np.log([row["unknowns"] for row in largest])
+    names = ("plain_ms", "backward_ms", "memory_gib")
+    return {name: float(np.polyfit(size, np.log([row[name] for row in largest]), 1)[0]) for name in names}

@@ -82,20 +82,18 @@ class Rollout:
         return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
 
 
-def rollout_of(
-    overrides: tuple[str, ...], material: str, refinement: float, solver: str, batch: int, steps: int, straight: bool
-) -> Rollout:
+def rollout_of(arguments: argparse.Namespace, solver: str, material: str, refinement: float, batch: int) -> Rollout:
     """Returns a roll-out, after two steps and their gradient, which compile kernels.
 
     Args:
-        overrides: of the configuration of a run.
+        arguments: of the command line.
+        solver: its name.
         material: a key of `MATERIALS`.
         refinement: of the configured mesh.
-        solver: its name.
         batch: number of environments.
-        steps: of the roll-out.
-        straight: whether the body starts from its shape at rest, and not from an equilibrium under loads.
     """
+    overrides = (*arguments.settings, *(FLOOR if arguments.floor else ()), f"device={choose_device(arguments.device)}")
+    steps = steps_of(solver, refinement, arguments.steps)
     settings = run_settings((*_DEFAULTS, *overrides))
     mesh = settings.mesh if refinement == 1.0 else finer(settings.mesh, refinement)
     settings = settings.changed(mesh=mesh, solver=settings.solver.changed(name=solver))
@@ -103,7 +101,7 @@ def rollout_of(
     law = parse(MaterialSettings, changes) if "model" in changes else settings.simulation.changed(**changes)
     simulator = build_simulator(settings, law, build_body(settings))
     start, inputs = simulator.rest_state(batch), Inputs()
-    if not straight:
+    if not arguments.straight:
         start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
     name = next((name for name in _MODULI if name in law.constants), None)
     moduli = {} if name is None else {name: simulator.tensor(law.constants[name]).reshape(1)}
@@ -136,29 +134,18 @@ def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> t
 def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times steps and their parts, and the environments of a run."""
     device = choose_device(arguments.device)
-    overrides = (*arguments.settings, *(FLOOR if arguments.floor else ()), f"device={device}")
     batches = arguments.batches or BATCHES[device.type]
     cases = [*product(arguments.solvers, arguments.materials, arguments.refinements, batches)]
-    rollouts = [
-        rollout_of(
-            overrides,
-            material,
-            refinement,
-            solver,
-            batch,
-            steps_of(solver, refinement, arguments.steps),
-            arguments.straight,
-        )
-        for solver, material, refinement, batch in cases
-    ]
+    rollouts = [rollout_of(arguments, *case) for case in cases]
     measured, yardstick = take_turns("steps", [rollout.measure for rollout in rollouts], arguments.repeats)
     steps, parts = Rows(), Rows()
     for (*case, batch), rollout, times in zip(cases, rollouts, measured, strict=True):
         head: dict[str, Any] = {**dict(zip(("solver", "material", "refinement"), case, strict=True)), "batch": batch}
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
-        size = {"unknowns": free_unknowns(rollout.simulator)}
-        steps.append({**head, **size, **times, **relative, "memory_gib": peak_memory_gib()})
+        steps.append({**head, "unknowns": free_unknowns(rollout.simulator), **times, **relative})
         parts.append({**head, **part_times(rollout.simulator, batch, arguments.repeats)})
+    if len(cases) == 1:
+        steps[0]["memory_gib"] = peak_memory_gib()  # of this process
     tables: dict[str, Any] = {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
     if arguments.run is not None:
         counts = arguments.batches or (1, 16, 64)

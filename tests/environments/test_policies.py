@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.main_job import end_of
+from support.scripts import script
 from support.sentences import offending
 from warp_resphys import cli
 from warp_resphys.control.sampling import Sampling
@@ -146,3 +147,11 @@ def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
     assert code == 2
     assert offending(err) == wrong.split("=")[0]
+
+
+def test_speeds_are_those_of_all_robots(folder):
+    rows = script("benchmarks.steps").environments(folder, [1, 2], 1, "cpu")
+    assert [row["robots"] for row in rows] == [1, 2]
+    for row in rows:
+        assert row["actions_per_s"] == pytest.approx(1e3 * row["robots"] / row["action_ms"])
+        assert row["steps_per_s"] == pytest.approx(5 * row["actions_per_s"])

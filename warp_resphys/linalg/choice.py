@@ -82,8 +82,8 @@ def _cheapest(rows: Indices, cols: Indices, n_nodes: int, block: int, device: to
 
     A band of width w takes n w numbers and n w^2 operations, a border of m unknowns 4 n w m more, each of which takes
     eleven times as long (measured on 87 unknowns beside a band of 1,161). A dense matrix takes n^2 numbers and n^3 / 3
-    operations; for wide bands a sparse factor has less fill-in. The limit on a CPU is measured (``warp-resphys
-    benchmark sizes``), those on a GPU are estimates from these counts.
+    operations; for wide bands a sparse factor has less fill-in. The limit on a CPU is measured (``python
+    scripts/benchmark.py sizes``), those on a GPU are estimates from these counts.
     """
     unknowns, width = n_nodes * block, block * bandwidth(rows, cols, n_nodes)
     if device.type == "cpu":

@@ -1,1 +1,1 @@
-"""Is it right, how fast is it, and what was published: checks, benchmarks and studies beside the experiments."""
+"""Is it right, and what was published: checks and studies beside the experiments."""

@@ -1,0 +1,192 @@
+"""The script that times the simulator, on the smallest bodies."""
+
+import numpy as np
+import pytest
+import torch
+
+from support.scripts import script
+from warp_resphys.experiment.build import build_simulator
+from warp_resphys.io.files import read_json
+
+benchmark, measuring = script("benchmark"), script("benchmarks.measuring")
+gripper, peers, steps = (script(f"benchmarks.{name}") for name in ("gripper", "peers", "steps"))
+TINY = ("mesh.divisions=[2,1,1]", "--repeats=1", "--materials=0.45")
+
+
+@pytest.fixture
+def measured(folder):
+    """Runs a subcommand, and returns what the file of the machine has of it."""
+
+    def run(*words):
+        assert benchmark.main(words) == 0
+        (written,) = (folder / "outputs/benchmark").glob("*.json")
+        return read_json(written)[words[0]]
+
+    return run
+
+
+def arguments(*words):
+    """Arguments of a command line."""
+    known, known.settings = benchmark.command_line().parse_known_args(words)
+    return known
+
+
+def test_the_median_of_every_figure_over_turns():
+    figures = iter([1.0, 10.0, 3.0, 30.0, 2.0, 90.0])
+
+    def task():
+        return {"ms": next(figures)}
+
+    (one, ten), yardstick = measuring.take_turns("turns", [task, task], 3)
+    assert (one, ten) == ({"ms": 2.0}, {"ms": 30.0})
+    assert yardstick > 0.0
+
+
+def test_a_row_for_every_case(measured, capsys, device):
+    result = measured("step", *TINY, "--steps=2", "--refinements", "1", "2", f"--device={device}")
+    rows = result[steps.STEPS]
+    assert [(row["solver"], row["refinement"]) for row in rows] == [
+        (solver, refinement) for solver in ("quasi_newton", "newton") for refinement in (1.0, 2.0)
+    ]
+    for row in rows:
+        assert (row["batch"], row["unknowns"]) == (1, {1.0: 24, 2.0: 108}[row["refinement"]])
+        assert row["steps_per_s"] == pytest.approx(1e3 / row["plain_ms"])
+        assert row["yardsticks"] == pytest.approx((row["forward_ms"] + row["backward_ms"]) / result["yardstick_ms"])
+        assert row["factorisations"] >= row["iterations"] >= 1.0 or row["solver"] == "quasi_newton"
+    assert f"{rows[0]['plain_ms']:.4g}" in capsys.readouterr().out
+    parts = result["parts of an iteration"]
+    assert len(parts) == len(rows)
+    assert all(part[f"{name}_ms"] > 0.0 for part in parts for name in ("local_step", "assembly", "factor", "solve"))
+    # A batch, in the same file.
+    (row,) = measured("batches", *TINY, "--steps=1", "--batches=3", f"--device={device}")[steps.STEPS]
+    assert row["steps_per_s"] == pytest.approx(3e3 / row["plain_ms"])
+    assert row["memory_gib"] > 0.0
+    assert measured("batches", *TINY, "--steps=1", "--batches=1", "--floor")["command"].endswith("--floor")
+
+
+def test_a_beam_that_is_lifted_falls_on_the_floor():
+    rollout = steps.rollout_of(arguments("batches", *TINY, "--floor", "--steps=40"), "quasi_newton", "0.45", 1.0, 2)
+    with torch.no_grad():
+        path = rollout.simulator.rollout(rollout.start, rollout.steps)
+    gaps = path.q[..., 2].flatten(1).amin(1) + 0.004
+    assert float(gaps[0]) > 1e-3 > float(gaps.min()) > 0.0
+
+
+def test_a_beam_hangs_under_a_weight_that_is_lighter_in_later_environments():
+    settings = measuring.run_settings(("mesh.divisions=[2,1,1]",))
+    simulator = build_simulator(settings, settings.simulation)
+    start, _ = steps.loaded(simulator, 2, 3)
+    sag = (start.q - simulator.static_equilibrium().q)[:, :, 2].amin(1)
+    assert float(sag[0]) < 1.2 * float(sag[1]) < 0.0
+
+
+def test_exponents_are_those_of_the_three_largest_sizes():
+    powers = {"plain_ms": 1.5, "backward_ms": 1.0, "memory_gib": 0.5}
+    rows = [
+        {"unknowns": n, **{name: 3e-6 * n**power for name, power in powers.items()}} for n in (10, 100, 1000, 10_000)
+    ]
+    rows[0]["plain_ms"] = 7.0
+    assert steps.exponents(rows) == pytest.approx(powers)
+    assert steps.exponents(rows[:1]) == {}
+
+
+def test_a_case_that_takes_too_long_has_no_row():
+    assert steps.alone(TINY, 0.2) == ([], "; the next takes more than 0.2 s")
+
+
+@pytest.mark.slow
+def test_sizes_in_processes_of_their_own(measured):
+    result = measured("sizes", *TINY, "--refinements", "1", "2", "--linear-solvers", "banded", "lu")
+    tables = [rows for rows in result.values() if isinstance(rows, list)]
+    assert [row["unknowns"] for row in tables[0]] == [24, 108]
+    assert all(row["memory_gib"] > 0.0 for row in tables[0])
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("step", "mash.divisions=[2,1,1]"), "unknown key 'mash'"),
+        (("step", "--device=tpu"), "device is 'tpu'"),
+        (("twin", "nowhere"), "nowhere"),
+    ],
+)
+def test_an_error_is_a_sentence(words, sentence, folder, capsys):
+    assert benchmark.main(words) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert sentence in said
+
+
+@pytest.mark.parametrize("words", [("step", "beam"), ("step", "--colour=red"), ("gripper", "fingers=2"), ("fly",)])
+def test_an_unknown_word_is_refused(words, capsys):
+    with pytest.raises(SystemExit):
+        benchmark.main(words)
+    assert words[-1] in capsys.readouterr().err
+
+
+def test_a_twin_follows_the_trials_of_a_run(finished, measured, capsys):
+    run = str(finished[0])
+    ((row,),) = [
+        rows for rows in measured("twin", run, "horizon=0.02", "--trials", "150 g").values() if isinstance(rows, list)
+    ]
+    assert row["trial"] == "150 g"
+    assert row["predictions"] > 0
+    assert 0.0 < row["estimate_ms"] <= row["p99_ms"]
+    assert row["twin_mm"] < row["held_mm"]
+    assert benchmark.main(("twin", run, "--trials", "175")) == 2
+    assert "--trials names '175'" in capsys.readouterr().err
+    assert benchmark.main(("twin", run, "engine=half")) == 2
+    assert "engine is 'half'" in capsys.readouterr().err
+
+
+class TestGripper:
+    @pytest.mark.slow
+    def test_all_hold_the_ball_and_nothing_crosses(self, measured):
+        result = measured("gripper", "--batches=2", "--repeats=1", "--tensions", "1.5", "1.8")
+        (row,) = result["a step of 10 ms of all grippers"]
+        assert (row["grippers"], row["held"], row["crossings"]) == (2, 2, 0)
+        assert row["speed_of_that_without"] == pytest.approx(row["without_contact_ms"] / row["grasp_ms"])
+
+    @pytest.mark.slow
+    def test_a_loose_one_drops_it(self):
+        words = arguments("gripper", "--tensions", "0.3", "0.3")
+        assert gripper.Grasp.of(words, 1, torch.device("cpu"), contact=True).measure()["held"] == 0
+
+
+class TestPeers:
+    @pytest.mark.parametrize(("error", "said"), [(1e-1, "1"), (1e-3, "2"), (6e-5, "2"), (1e-6, "-")])
+    def test_the_least_time_with_no_more_error(self, error, said):
+        times = ((1.0, 1e-2), (3.0, 1e-4), (2.0, 5e-5))
+        rows = [{"program": peers.OURS, "load": load, "error_mm": error_mm} for load, error_mm in times]
+        assert peers.at_equal_error({"program": "newton", "error_mm": error}, rows) == said
+        assert peers.at_equal_error(rows[0], rows) == ""
+
+    def test_a_block_begins_where_contact_does(self):
+        for name, across, faces in (("slide", 2, 1), ("grip", 1, 2)):
+            scene = peers.Scene.of(name, (4, 3, 2))
+            gaps = np.min([(scene.start(1e-3) - point) @ normal for point, normal in scene.planes], axis=0)
+            nearest = np.isclose(gaps, 1e-3, rtol=0.0, atol=1e-12)
+            assert gaps.min() > 1e-3 - 1e-12
+            assert nearest.sum() == faces * (scene.mesh.vertices[:, across] == 0.0).sum()
+        narrow = np.ptp(peers.Scene.of("grip", (4, 3, 2)).start(0.0), axis=0) / peers.SIZE
+        assert narrow == pytest.approx([1.045, 0.9, 1.045])
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("program", ["newton", "mujoco"])
+    def test_all_approach_coulombs_law_and_rigid_walls(self, program, measured, monkeypatch):
+        pytest.importorskip(program)
+        last = {peers.OURS: [(4e-3, 1e-3, 1e-4), (1e-3, 1e-4, 1e-4)], program: peers.SETTINGS[program][-1:]}
+        monkeypatch.setattr(peers, "SETTINGS", last)
+        result = measured("peers", "--divisions", "4", "3", "2", "--repeats=1", f"--programs={program}")
+        for name, ours, theirs in (("slide", 1.0, 3.0), ("grip", 0.2, 0.1)):
+            coarse, fine, peer = result[name]
+            assert fine["error_mm"] < min(0.4 * coarse["error_mm"], ours), name
+            assert coarse["penetration_um"] == fine["penetration_um"] == 0.0
+            assert coarse["load"] == pytest.approx(coarse["time_ms"] / 4.0)
+            assert peer["error_mm"] < theirs
+            assert peer["penetration_um"] > 0.0
+
+    def test_one_that_is_not_installed(self, capsys, monkeypatch):
+        monkeypatch.setattr(peers, "import_module", lambda name: (_ for _ in ()).throw(ModuleNotFoundError(name)))
+        assert benchmark.main(("peers", "--programs=newton")) == 2
+        assert "pip install 'warp-resphys[peer]'" in capsys.readouterr().err

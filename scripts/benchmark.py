@@ -44,8 +44,9 @@ _LOG_WIDTH: Final = 180  # of tables that go to a file, in characters
 def main(words: Sequence[str]) -> int:
     """Measures what the words of a command line ask for, and returns the exit code."""
     parser = command_line()
-    arguments, arguments.settings = parser.parse_known_args(words)
-    for word in arguments.settings:
+    arguments, settings = parser.parse_known_args(words)
+    arguments.settings = settings
+    for word in settings:
         if word.startswith("-") or "=" not in word or arguments.subcommand in ("gripper", "peers"):
             parser.error(f"unknown argument {word}")
     try:
@@ -84,11 +85,11 @@ def command_line() -> argparse.ArgumentParser:
     parts = parser.add_subparsers(dest="subcommand", required=True)
     step = parts.add_parser("step", parents=[shared, body], help="one body, by solver")
     batches = parts.add_parser("batches", parents=[shared, body], help="many bodies at once")
-    for part, solvers, sizes in ((step, ["quasi_newton", "newton"], (1,)), (batches, ["quasi_newton"], None)):
+    for part, solvers, counts in ((step, ["quasi_newton", "newton"], [1]), (batches, ["quasi_newton"], None)):
         part.set_defaults(measure=steps.measure_steps, run=None)
         part.add_argument("--solvers", nargs="+", choices=SOLVERS, default=solvers)
         part.add_argument("--refinements", nargs="+", type=float, default=[1.0])
-        part.add_argument("--batches", nargs="+", type=int, default=sizes)
+        part.add_argument("--batches", nargs="+", type=int, default=counts)
         part.add_argument("--steps", type=int, default=60, help="of a roll-out (default: %(default)s)")
         part.add_argument("--straight", action="store_true", help="the body starts from its shape at rest")
         part.add_argument("--floor", action="store_true", help="the body is lifted, and falls on a floor")

@@ -29,7 +29,7 @@ def rows():
 def place_of(name):
     """Where a module inside the package belongs: "io.files" to `io/`, "cli" to `cli`."""
     first = name.split(".")[0]
-    return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf") else first
+    return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf", "scripts") else first
 
 
 @functools.cache
@@ -72,14 +72,14 @@ def imported(path):
 
 
 def test_every_module_has_its_place_and_every_place_a_module():
-    places = {"scripts/" if name.startswith("scripts") else place_of(name) for name in modules().values()}
+    places = {place_of(name) for name in modules().values()}
     assert {*places, "conf/"} == {place for place in rows() if place != "tests/"}
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(REPOSITORY)))
 def test_imports_point_up(path):
-    row, name = rows(), modules()[path]
-    own = row["scripts/" if name.startswith("scripts") else place_of(name)]
+    row = rows()
+    own = row[place_of(modules()[path])]
     assert {other for other, _ in imported(path) if other and row[place_of(other)] > own} == set()
 
 

@@ -40,7 +40,7 @@ FLOOR: Final = ("obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004
 STEPS: Final = "a step of the whole batch"
 _SCRIPT: Final = Path(__file__).parents[1] / "benchmark.py"
 _DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
-_MODULI: Final = ("youngs_modulus", "c10")  # by the first of which gradients are taken
+_MODULI: Final[tuple[str, ...]] = ("youngs_modulus", "c10")  # by the first of which gradients are taken
 _TIP_MASS: Final = 0.1  # [kg]
 _PRESSURE: Final = 2e4  # [Pa]
 _FITTED: Final = 3  # largest sizes, to which exponents are fitted

@@ -32,7 +32,7 @@ def coarse(monkeypatch):
 @pytest.mark.numerics
 @pytest.mark.usefixtures("coarse")
 def test_the_cpu_passes(folder):
-    small = ("check.experiments=[]", "check.steps=1", "benchmark.quick=true", "hydra.run.dir=check")
+    small = ("check.experiments=[]", "check.steps=1", "hydra.run.dir=check")
     ended = outcome("verify", "device", *small, "check.results=pages")
     assert ended.code == 0, ended.out
     assert "FAILED" not in ended.out
@@ -42,7 +42,6 @@ def test_the_cpu_passes(folder):
     (page,) = (folder / "pages").glob("*-check-cpu.md")
     text = page.read_text()
     assert "all passed" in text
-    assert "| Plain | Forward | Backward | / yardstick | Steps/s |" in text
     assert (folder / "check" / "check.html").is_file()
 
 

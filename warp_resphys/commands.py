@@ -43,19 +43,9 @@ class Command:
 COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
     {
         "run": Command("run an experiment; the word run may be left out", "pipeline:run_experiment"),
-        "tune": Command("search for better settings of the network and its training", "studies.tuning.tune:run_tuning"),
-        "reproduce": Command(
-            "run published beams, or recorded robots, and write a page on them",
-            "studies.reproduction:reproduce",
-            words="only",
-        ),
+        "tune": Command("search for better settings of the network and its training", "studies.tuning:tune"),
         "inspect": Command(
             "what is in a mesh, or how good a recording is", "studies.inspection:inspect", words="files"
-        ),
-        "inspect compare": Command(
-            "a recording of a beam that is let go, beside its simulation",
-            "studies.recording_comparison:compare",
-            word="recording.path",
         ),
         "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.mesh_inspection:make_arm"),
         "convert": Command(
@@ -85,8 +75,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
 
 RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
     {
-        "robots": "reproduce robots",
-        "compare": "inspect compare",
         "make-arm": "inspect make-arm",
         "film": "view film",
         "gradcheck": "verify gradients",

@@ -261,14 +261,9 @@ def learning_stages(
     if run.control is not None:
         stages += control_stages(run, run.control, common, workers)
     last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))
-    shown = SplitReportStage(config=shown_of(run), acquired=acquired)
+    shown = SplitReportStage(config=run, acquired=acquired)
     stages.append(Stage("report", make_report, (REPORT,), shown, last))
     return stages
-
-
-def shown_of(run: RunSettings) -> RunSettings:
-    """Returns the settings without those that do not affect a run."""
-    return run.model_copy(update={"tune": {}})
 
 
 def control_stages(
@@ -357,7 +352,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     if folds is not None:
         errors = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
-        reported = FoldsReportStage(config=shown_of(run), folds=errors)
+        reported = FoldsReportStage(config=run, folds=errors)
         run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
     _print(metrics, folder, run)
 

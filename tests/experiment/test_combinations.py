@@ -195,30 +195,6 @@ def test_poses_under_weights_and_releases_are_identified_and_corrected_together(
     assert results["errors_mm"]["sysid"]["mean"] < results["errors_mm"]["simulation"]["mean"]
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [*SEGMENT, "tune=reduced", "tune.space.network.width=[4,8]", "tune.settings.trainer={}"],
-        [*BEAM, "tune=in_the_loop"],
-    ],
-    ids=["pressure", "released"],
-)
-def test_settings_are_searched_for_any_experiment(arguments):
-    code, err = run("tune", *arguments, "tune.trials=2", *QUIET)
-    assert (code, err[-600:] if code else "") == (0, "")
-    (option,) = Path("configs/tuned").glob("*.yaml")
-    written = option.read_text()
-    assert "network:" in written
-    assert ("in_the_loop:" in written) == ("tune=in_the_loop" in arguments)
-
-
-def test_a_search_where_the_force_is_trained_on_motions_has_its_own_group():
-    code, err = run("tune", *BEAM, "tune.trials=2", *QUIET)
-    assert code == 2
-    assert "unknown key 'trainer." in err
-    assert "network or in_the_loop" in err or "network, in_the_loop" in err
-
-
 def test_what_is_seen_is_held_in_the_range_of_the_training_or_not():
     for guard in ("true", "false"):
         results = done(*TINY, f"range_guard={guard}", "timing=false")

@@ -202,7 +202,6 @@ class TestCompleteRun:
     def test_the_report_depends_on_the_configuration_and_the_trials(self, finished):
         shown = records(finished)["report"]["settings"]
         assert shown["config"]["name"] == "beam_real"
-        assert shown["config"]["tune"] == {}
         assert shown["acquired"] == records(finished)["import"]["fingerprint"]
 
     def test_the_reconstruction_says_how_close_it_came_and_where_its_forces_lead(self, finished):

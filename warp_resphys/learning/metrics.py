@@ -106,44 +106,6 @@ PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedErro
         "10": PUBLISHED_MM["sopra_extrapolation"],
     },
 }
-# Parameters in that paper, which the first two experiments share except for their trajectories.
-_PUBLISHED_BEAMS: Final[Mapping[str, float]] = {
-    "degrees of freedom": 528,
-    "Poisson's ratio, incorrect beam": 0.45,
-    "Poisson's ratio, correct beam": 0.499,
-    "Young's modulus, incorrect beam": 215e3,
-    "Young's modulus, correct beam": 264e3,
-    "step size": 0.01,
-}
-PUBLISHED_SETUP: Final[Mapping[str, Mapping[str, float]]] = {
-    "beam_oscillation": {
-        **_PUBLISHED_BEAMS,
-        "time steps": 150,
-        "training trajectories": 9,
-        "validation trajectories": 2,
-        "testing trajectories": 5,
-    },
-    "beam_twist": {
-        **_PUBLISHED_BEAMS,
-        "time steps": 100,
-        "training trajectories": 10,
-        "validation trajectories": 2,
-        "testing trajectories": 8,
-    },
-}
-# Time benchmark of that paper: a trajectory of the real beam, 140 steps, on a 32-core AMD Ryzen Threadripper 3970X;
-# mean and standard deviation [s].
-PUBLISHED_SECONDS: Final[Mapping[str, tuple[float, float]]] = {
-    "simulation": (0.711, 0.002),
-    "target": (2.218, 0.005),
-    "resphys": (1.393, 0.004),
-    "inference": (0.112, 0.002),
-}
-PUBLISHED_SECONDS_STEPS: Final = 140
-# Marker ablation of that paper, read off its figure: the median error [mm] stays below this from 4 markers on.
-PUBLISHED_MARKER_MEDIAN_MM: Final = 0.1
-PUBLISHED_MARKERS: Final = 4
-PUBLISHED_MARKERS_OF_SMALL_SPREAD: Final = 10
 
 
 def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -133,15 +133,12 @@ def describe_boxes(metrics: Mapping[str, Any]) -> str:
 
 
 @in_style()
-def marker_boxes(
-    errors: Mapping[int, FloatArray], uncorrected: float, published: tuple[int, float] | None = None, *, narrow: bool
-) -> Figure:
+def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow: bool) -> Figure:
     """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
 
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
         uncorrected: Error without any correction [mm].
-        published: A number of markers, and an upper bound of the published median error from there on [mm].
         narrow: Whether the figure is for a narrow page.
     """
     ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
@@ -150,13 +147,9 @@ def marker_boxes(
     axes, count = figure.subplots(), len(errors)
     lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
     axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
-    levels = {"uncorrected simulation": (0.5, uncorrected)}
-    if published is not None:
-        start = 0.5 + sum(markers < published[0] for markers in errors)
-        levels["published median: below" if narrow else "published: the median is below"] = (start, published[1])
-    for text, (start, level) in levels.items():
-        axes.plot([start, count + 0.5], [level, level], color=grey, linewidth=1.1, linestyle="--")
-        axes.annotate(text, (count + 0.5, level), (-2, 3), textcoords="offset points", ha="right", color=grey)
+    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
+    place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
+    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
     axes.set_xlim(0.5, count + 0.5)
     axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
     axes.set_yscale("log")

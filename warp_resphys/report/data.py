@@ -36,7 +36,6 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
-MODEL_NAMES: Final = {m: MODELS[m][0] for m in ("simulation", "reconstruction", "sysid", "simfree", "resphys")}
 PLAIN_NAMES: Final = {  # By model without physics: its name in sentences.
     "rest": "a body that does not move",
     "interpolation": "interpolation between the training trials",

@@ -48,14 +48,11 @@ TONES: Final[Mapping[str, Tone]] = {
     "law": Tone("#0f766e", "#5eead4"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
-    "published_network": Tone("#b0307a", "#f08bc4"),
     "published": Tone("#b0307b", "#f08bc5"),
     "sysid_elastic": Tone("#a57cc4", "#d9bdf0"),
     "resphys_uncorrected": Tone("#1f93b0", "#6fd0e8"),
 }
-LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.items()} | {
-    "published_network": "Published network"
-}
+LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.items()}
 # Okabe and Ito (2008): distinguishable with colour vision deficiencies.
 CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
 LARGEST_SHOWN: Final = 1e5  # Largest error [mm] or loss that is drawn.
@@ -116,7 +113,6 @@ def in_style() -> Iterator[None]:
 def error_over_time(
     errors: Mapping[str, FloatArray],
     times: FloatArray | float,
-    published: Mapping[str, float] | None = None,
     *,
     of: str = "vertex",
     window: float | None = None,
@@ -128,7 +124,6 @@ def error_over_time(
     Args:
         errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
         times: (T,) [s]; or the time between two frames, the first of which is at zero.
-        published: Published errors of models [mm], means over time, drawn as dashed lines.
         of: What is observed: "vertex" or "marker".
         window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
             unfiltered one as a thin line. None for no filter.
@@ -142,8 +137,6 @@ def error_over_time(
     lowest: list[float] = []
     for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
         lowest += _error_lines(axes, {model: own[rows] for model, own in errors.items()}, times, window)
-        for model, error in (published or {}).items():
-            axes.axhline(error, color=TONES[model].light, linewidth=1.1, linestyle=(0, (4, 3)))
         axes.set_title(title)
     if len(groups) > 1:
         figure.set_layout_engine("constrained", wspace=_BETWEEN)

@@ -139,8 +139,6 @@ class RunSettings(SimulatorSettings):
     timing: bool = setting(True, "whether models are timed, one trial at a time")
     parallel: ParallelSettings = ParallelSettings()
     budget: Word = setting("full", "full or quick")
-    tuned: Word = setting("none", "settings found by a search; files of configs/tuned")
-    tune: dict[str, Any] = setting({}, "the search of warp-resphys tune, whose keys are in conf/tune")
 
     @property
     def recorded(self) -> RecordedData | None:

@@ -1,0 +1,483 @@
+"""Runs the published beams and the recorded robots with the ordinary command, and writes the page of each.
+
+python scripts/reproduce.py                                          the beams, beside what was published
+python scripts/reproduce.py robots --data FOLDER --results docs      robots with recordings in FOLDER: docs/robots.md
+python scripts/reproduce.py tentacle --data FOLDER --budget quick    one of them; or beam_twist, beam_twist/default
+
+Runs follow each other. One that fails does not stop the others, and one that is up to date is not run again. The pages
+are reproduction.md and robots.md, with their figures beside them, in --results. robots.json keeps the result of every
+robot, so that robots.md also has those of earlier runs, each with its day and machine. reproduce.yaml has the rows.
+"""
+
+import argparse
+import hashlib
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Final
+
+import yaml
+
+from warp_resphys.data.recordings.segment import convert_segment
+from warp_resphys.io.errors import ResphysError
+from warp_resphys.io.files import read_json, write_text
+from warp_resphys.io.labels import run_label
+from warp_resphys.io.machine import commit, hardware
+from warp_resphys.io.stages import package_versions
+from warp_resphys.learning.baselines import BASELINES
+from warp_resphys.learning.metrics import PUBLISHED_MM, paired_gain
+from warp_resphys.report.page import duration_text, error_parts, number_text, published_parts
+
+ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+LEAST_TRIALS: Final = 5  # for an interval over trials
+NONE, MINUS = "\N{EN DASH}", "\N{MINUS SIGN}"
+INTERRUPTED, USER_ERROR = 130, 2
+
+# Models: name in tables, and in sentences.
+MODELS: Final = {
+    "rest": ("At rest", "a body that does not move"),
+    "interpolation": ("Interpolation", "interpolation between the training trials"),
+    "regression": ("Regression", "kernel regression over the training trials"),
+    "linear": ("Linear model", "a linear model without physics"),
+    "simulation": ("Uncorrected", "the uncorrected simulation"),
+    "sysid": ("SysID", "SysID"),
+    "simfree": ("SimFree", "SimFree"),
+    "resphys": ("ResPhys", "ResPhys"),
+}
+CORRECTED: Final = ("sysid", "resphys")
+IN_BEAMS: Final = {"simulation": "Uncorrected", "reconstruction": "Reconstruction", "simfree": "SimFree"}
+FIGURES: Final = ("error_over_time", "tip_displacement")
+BODY_PICTURES: Final = ("figures/body.png", "fold_*/figures/body.png", "figures/registration.png")
+MACHINE: Final = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
+PACKAGES: Final = ("python", "warp-lang", "torch")
+
+
+@dataclass
+class Run:
+    """A run of the ordinary command.
+
+    Attributes:
+        name: of a robot, or of a beam and a column, as in beam_twist/default.
+        arguments: of the command.
+        folder: of its files.
+        failure: error message of a failed run.
+    """
+
+    name: str
+    arguments: list[str]
+    folder: Path
+    failure: str = ""
+
+    def execute(self) -> None:
+        """Runs the command, unless its files are up to date; Ctrl-C interrupts it, and it saves its state."""
+        command = [sys.executable, "-m", "warp_resphys", *self.arguments, f"hydra.run.dir={_quoted(self.folder)}"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as child:
+            assert child.stderr is not None
+            sentence = ""
+            try:
+                for line in child.stderr:
+                    sys.stderr.write(line)
+                    sentence = line.removeprefix("error: ").strip() if line.startswith("error: ") else sentence
+            except KeyboardInterrupt:
+                child.terminate()
+                sys.stderr.write(child.stderr.read())
+                raise
+        self.failure = (sentence or f"exit code {child.returncode}") if child.returncode else ""
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """Content of metrics.json."""
+        return dict(read_json(self.folder / "metrics.json"))
+
+    @cached_property
+    def data(self) -> dict[str, Any]:
+        """The group `data` of the configuration of the run, from the record of its report."""
+        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"]["data"])
+
+
+def main() -> None:
+    """Runs the selected rows, and writes their pages; the exit code is 2 where a run failed, 130 after Ctrl-C."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("only", nargs="*", default=["beams"], help="beams, robots, or names of them (beams)")
+    parser.add_argument("--data", type=Path, help="folder with a folder of recordings for each robot")
+    parser.add_argument("--budget", choices=["full", "quick"], default="full", help="quick for a first look")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs (runs)")
+    parser.add_argument("--results", type=Path, default=Path("outputs/reproduce"), help="folder of the pages")
+    parser.add_argument("--overrides", nargs="*", default=[], help="of every run, such as seed=1")
+    options = parser.parse_args()
+    beyond = [*options.overrides, *([] if options.budget == "full" else [f"budget={options.budget}"])]
+    try:
+        beams, robots = selected(options.only)
+        runs = [beam_run(*pair, beyond, options.runs) for pair in beams]
+        places = {name: _place(name, options.data) for name in robots}
+        present = {name: place for name, place in places.items() if place is None or place.is_dir()}
+        if absent := places.keys() - present.keys():
+            print(f"no recordings in --data: {', '.join(sorted(absent))}", file=sys.stderr)
+        kept = kept_results(options.results / "robots.json", present, beyond)
+        robot_runs = [robot_run(name, place, beyond, options.runs) for name, place in present.items()]
+        for run in (*runs, *robot_runs):
+            print(f"run {run.name}", file=sys.stderr, flush=True)
+            run.execute()
+        if beams:
+            _write(options.results / "reproduction.md", beams_page(runs, options.results / "reproduction"))
+        if robots:
+            pictures = options.results / "robots"
+            for run in robot_runs:
+                if not run.failure:
+                    kept[run.name] = measure(run, beyond)
+                    copy_picture(run.folder, BODY_PICTURES, pictures / f"{run.name}.png")
+            failed = {run.name: run.failure for run in robot_runs if run.failure}
+            _write(options.results / "robots.json", json.dumps(kept, indent=2))
+            _write(options.results / "robots.md", robots_page(kept, failed, pictures))
+    except KeyboardInterrupt:
+        print("interrupted; finished work is kept, and the same command continues from there", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except (ResphysError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR)
+    if failures := [run.name for run in (*runs, *robot_runs) if run.failure]:
+        print(f"error: failed: {', '.join(failures)}; correct it and run the same command again", file=sys.stderr)
+        sys.exit(USER_ERROR)
+
+
+def selected(only: Iterable[str]) -> tuple[list[tuple[str, str]], list[str]]:
+    """Returns beams, as pairs of a row and a variant, and names of robots.
+
+    Raises:
+        ResphysError: an unknown name.
+    """
+    pairs = [(name, variant) for name, beam in ROWS["beams"].items() for variant in beam["variants"]]
+    names = ["beams", "robots", *ROWS["beams"], *ROWS["robots"], *("/".join(pair) for pair in pairs)]
+    wanted = {*only}
+    if unknown := wanted - {*names}:
+        raise ResphysError(f"there is no {min(unknown)}: choose from {', '.join(names)}.")
+    beams = [pair for pair in pairs if {"beams", pair[0], "/".join(pair)} & wanted]
+    return beams, [name for name in ROWS["robots"] if {"robots", name} & wanted]
+
+
+def beam_run(name: str, variant: str, beyond: Sequence[str], runs: Path) -> Run:
+    """Returns the run of a beam with the settings of a column."""
+    overrides = [*ROWS["variants"][variant]["overrides"], *beyond]
+    return Run(f"{name}/{variant}", [f"experiment={name}", *overrides], _folder(runs, name, overrides))
+
+
+def robot_run(name: str, place: Path | None, beyond: Sequence[str], runs: Path) -> Run:
+    """Returns the run of a robot, whose recordings are in a folder; without one, a simulation plays the robot.
+
+    Raises:
+        ResphysError: the recordings are not those of the row.
+    """
+    robot = ROWS["robots"][name]
+    experiment, overrides = robot["experiment"], [*robot.get("overrides", ()), *beyond]
+    run = Run(name, [f"experiment={experiment}", *overrides], _folder(runs, experiment, overrides))
+    if place is not None:
+        files = sorted(place.glob(robot["files"]))
+        if hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest() != robot["sha256"]:
+            raise ResphysError(f"the files {place / robot['files']} are not those of the page: fetch them again.")
+        if "converted" in robot:
+            place = runs / "recordings" / name
+            convert_segment(files[0], place)
+        run.arguments.append(f"data.folder={_quoted(place.resolve())}")
+    return run
+
+
+def _place(name: str, data: Path | None) -> Path | None:
+    """Folder with the recordings of a robot; None where a simulation plays it."""
+    recordings = ROWS["robots"][name].get("recordings")
+    return None if recordings is None else (data or Path("recordings")) / recordings
+
+
+def _folder(runs: Path, experiment: str, overrides: Sequence[str]) -> Path:
+    """Run folder that the command itself would choose, below the folder of runs."""
+    return runs / experiment / run_label(overrides, ("experiment", "device"))
+
+
+def _quoted(path: Path) -> str:
+    """A path as a value on Hydra's command line."""
+    text = str(path).replace("\\", r"\\").replace("'", r"\'")
+    return f"'{text}'"
+
+
+def kept_results(path: Path, names: Iterable[str], beyond: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Returns results of earlier runs, by robot.
+
+    Raises:
+        ResphysError: a robot of this run was measured with other overrides.
+    """
+    kept: dict[str, dict[str, Any]] = read_json(path) if path.is_file() else {}
+    for name in names:
+        if name in kept and kept[name]["beyond"] != list(beyond):
+            old, new = (" ".join(words) or "its own settings" for words in (kept[name]["beyond"], beyond))
+            raise ResphysError(f"{path} has {name} with {old}, not with {new}: name another folder by --results.")
+    return kept
+
+
+def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
+    """Returns the results of a robot's run, as robots.json keeps them."""
+    metrics = run.metrics
+    folds = metrics.get("folds", {})
+    parts = list(folds.values()) or [metrics]
+    tested = list(folds) or [row["name"] for row in metrics["per_trajectory"]]
+    records = [read_json(path) for fold in (".", "fold_*") for path in run.folder.glob(f"{fold}/stages/evaluate.json")]
+    made = max(records, key=lambda record: str(record["finished"]))
+    how = "each held out once" if len(folds) > 1 else "held out"
+    if run.data.get("train_fraction", 1.0) < 1.0 and {*tested} <= {*run.data["train"]}:
+        how = "in the part that was not used for training"
+    trials = [row["errors_mm"] for part in parts for row in part.get("per_trajectory", ())]
+    errors = {model: [row.get(model) for row in trials] for model in MODELS}
+    intervals = metrics.get("intervals", {}).get("models", {}).get("resphys")
+    return {
+        "day": str(made["finished"]).partition("T")[0],
+        "machine": {**made.get("machine", {}), **made["versions"]},
+        "arguments": ["data.folder=FOLDER" if x.startswith("data.folder=") else x for x in run.arguments],
+        "beyond": list(beyond),
+        "tested": tested,
+        "how": how,
+        "errors_mm": {model: metrics["errors_mm"][model] for model in MODELS if model in metrics["errors_mm"]},
+        "beside": _best_pair(errors),
+        "gains": {"sysid": _gain(errors, "simulation", "sysid"), "resphys": _gain(errors, "sysid", "resphys")},
+        "intervals": intervals and {key: intervals[key] for key in ("coverage", "half_width_mm")},
+        "seconds": sum(sum(part["seconds"].values()) for part in (metrics, *folds.values())),
+        "moved_mm": metrics.get("mesh_check", {}).get("moved_mm"),
+    }
+
+
+def _best_pair(errors: Mapping[str, Sequence[Any]]) -> dict[str, Any] | None:
+    """The corrected model of least mean error beside the best of all others; None where one of them is missing."""
+    known = {m: fmean(e) for m, e in errors.items() if e and None not in e}
+    corrected = min((m for m in known if m in CORRECTED), key=known.__getitem__, default="")
+    other = min((m for m in known if m not in CORRECTED), key=known.__getitem__, default="")
+    gain = _gain(errors, other, corrected) if corrected and other else None
+    return gain and {"corrected": corrected, "other": other, "gain": gain}
+
+
+def _gain(errors: Mapping[str, Sequence[Any]], before: str, after: str) -> dict[str, Any] | None:
+    """Share of the error of one model that another removes; None where a roll-out of one diverged."""
+    pair = errors[before], errors[after]
+    if not pair[0] or any(None in own for own in pair) or 0.0 in pair[0]:
+        return None
+    return dict(paired_gain(*pair)._asdict())
+
+
+def robots_page(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], pictures: Path) -> str:
+    """Returns the page of robots: a table with a row for each, and a section for each.
+
+    Args:
+        results: by robot, from `measure`.
+        failed: error messages of runs that failed now, by robot; such a robot keeps its last results.
+        pictures: folder with pictures of their bodies.
+    """
+    results = {name: results[name] for name in ROWS["robots"] if name in results}
+    titles = {name: str(robot["title"]) for name, robot in ROWS["robots"].items()}
+    lines = [f"# Robots of {max((row['day'] for row in results.values()), default=NONE)}", _robots_verdict(results)]
+    lines += ["## All robots", *_robots_table(results, failed)] if results else []
+    for name, row in results.items():
+        lines += [f"## {titles[name]}", *_robot_section(name, row, pictures)]
+    failures = [f"{titles[name]} failed: {failure}" for name, failure in failed.items()]
+    lines += ["## Not run", _items(failures)] if failures else []
+    cells = [
+        [titles[name], row["day"], *(row["machine"].get(key, NONE) for key in (*MACHINE, *PACKAGES))]
+        for name, row in results.items()
+    ]
+    lines += ["## Machines and versions", _table(["Robot", "Measured", *MACHINE.values(), *PACKAGES], cells)]
+    return "\n\n".join([*lines, "## Command", "- `python scripts/reproduce.py robots --data FOLDER --results docs`"])
+
+
+def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> list[str]:
+    models = ("simulation", "sysid", "simfree", "resphys")
+    rows = []
+    for name, row in results.items():
+        errors, title = row["errors_mm"], str(ROWS["robots"][name]["title"])
+        small = [*row["beyond"], *([f"failed since {row['day']}"] if name in failed else [])]
+        means = {m: errors[m]["mean"] for m in BASELINES if m in errors and errors[m]["mean"] is not None}
+        best = min(means, key=means.__getitem__, default="")
+        interval = row["intervals"]
+        rows.append(
+            [
+                f"{title} ({', '.join(small)})" if small else title,
+                f"{number_text(means[best])} {MODELS[best][0].lower()}" if best else NONE,
+                *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for model in models),
+                *(_gain_text(row["gains"].get(model)) for model in CORRECTED),
+                f"{100.0 * interval['coverage']:.0f} % (± {interval['half_width_mm']:.2g} mm)" if interval else NONE,
+                duration_text(row["seconds"]),
+            ]
+        )
+    note = (
+        "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
+        "deviation over trials. Without physics: the best of a body at rest, interpolation and kernel regression "
+        "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
+        "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
+        f"if there are {LEAST_TRIALS} or more. Coverage: the share of the "
+        "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: the "
+        "sum over all stages and folds, including those that ran in parallel, on a machine with other load."
+    )
+    heads = ["Robot", "Without physics [mm]", *(f"{MODELS[model][0]} [mm]" for model in models)]
+    heads += [*(f"Less error by {MODELS[model][0]}" for model in CORRECTED), "Coverage", "Time"]
+    return [_table(heads, rows), note]
+
+
+def _gain_text(gain: Mapping[str, Any] | None) -> str:
+    if gain is None:
+        return NONE
+    share, *ends = (f"{100.0 * gain[key]:.0f}".replace("-", MINUS) for key in ("share", "lower", "upper"))
+    return f"{share} %" if gain["trials"] < LEAST_TRIALS else f"{share} % ({' to '.join(ends)})"
+
+
+def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[str]:
+    """Picture, source of the recordings, test trials and published results of a robot."""
+    robot, count = ROWS["robots"][name], len(row["tested"])
+    text = f"Tested on {count} trial{'s' if count > 1 else ''}, {row['how']}: {', '.join(row['tested'])}."
+    if pair := row["beside"]:
+        own, other = (number_text(row["errors_mm"][pair[key]]["mean"]) for key in ("corrected", "other"))
+        text += f" The best corrected model, {MODELS[pair['corrected']][1]}, has an error of {own} mm; "
+        text += f"the best of all others, {MODELS[pair['other']][1]}, {other} mm."
+    if row["moved_mm"] is not None:
+        text += f" A finer mesh moves the markers of the identified simulator by {number_text(row['moved_mm'])} mm."
+    blocks = []
+    if (pictures / f"{name}.png").is_file():
+        alt = f"The body of {robot['title']} and its markers."
+        blocks += [f"![{alt}]({pictures.name}/{name}.png)", "The simulated body."]
+    actuation = robot["actuation"]
+    blocks += [f"{actuation[:1].upper()}{actuation[1:]}. {robot['source']}", text]
+    if published := robot.get("published"):
+        blocks += ["Published:", _items(published)]
+    return [*blocks, f"- `{shlex.join(['warp-resphys', *row['arguments']])}`"]
+
+
+def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """Sentences on the robots that need a corrected simulator, and on those for which the learned force helps."""
+    if not results:
+        return "No run has succeeded."
+    gains = {name: (row["beside"] and row["beside"]["gain"], row["gains"]["resphys"]) for name, row in results.items()}
+    words = []
+    for which, of in ((0, [n for n, row in results.items() if row["beside"]]), (1, [*results])):
+        clear = [n for n in of if (g := gains[n][which]) and g["trials"] >= LEAST_TRIALS and g["lower"] > 0.0]
+        words.append(f"{len(clear)} of {len(of)} robots" + (f" ({_in_a_row(clear)})" if clear else ""))
+    few = [name for name, row in results.items() if len(row["tested"]) < LEAST_TRIALS]
+    return (
+        "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
+        f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and the "
+        f"learned force reduces the error of identification on {words[1]}."
+    ) + (f" {_in_a_row(few)}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
+
+
+def _in_a_row(names: Sequence[str]) -> str:
+    """Titles of robots as a list in a sentence."""
+    titles = [str(ROWS["robots"][name]["title"]) for name in names]
+    return " and ".join([", ".join(titles[:-1]), titles[-1]] if len(titles) > 1 else titles)
+
+
+def beams_page(runs: Sequence[Run], figures: Path) -> str:
+    """Returns the page that compares published results with those of the runs, whose figures are copied."""
+    done: dict[str, dict[str, Run]] = {}
+    for run in runs:
+        name, _, variant = run.name.partition("/")
+        if not run.failure:
+            done.setdefault(name, {})[variant] = run
+    sections = []
+    for name, columns in done.items():
+        first, kinds = next(iter(columns.values())), FIGURES if name in PUBLISHED_MM else ("marker_ablation",)
+        for kind in kinds:
+            copy_picture(first.folder, [f"figures/{kind}.png"], figures / f"{name}_{kind}.png")
+        sections += [f"## {ROWS['beams'][name]['title']}"]
+        sections += _errors_table(name, columns) if name in PUBLISHED_MM else _markers_table(name, first)
+        sections += [f"![{kind.replace('_', ' ')}]({figures.name}/{name}_{kind}.png)" for kind in kinds]
+        sections += ["Reasons for deviations:", _items(ROWS["beams"][name]["deviations"])]
+        if name == "beam_oscillation":
+            sections += ["## Time benchmark", *_time_table(columns)]
+    lines = []
+    for run in runs:
+        command = shlex.join(["warp-resphys", *run.arguments])
+        lines.append(f"`{command}`: {run.failure or duration_text(sum(run.metrics['seconds'].values()))}")
+    sections += ["## Runs", _items(lines)]
+    made = {**hardware(), "commit": commit() or "not known", **package_versions()}
+    sections += ["## Machine and versions", _items(f"{key}: {value}" for key, value in made.items())]
+    return "\n\n".join(["# Reproduction of the published beams", *sections])
+
+
+def _columns(columns: Mapping[str, Run]) -> list[str]:
+    return ["Published", *(str(ROWS["variants"][variant]["label"]) for variant in columns)]
+
+
+def _errors_table(name: str, columns: Mapping[str, Run]) -> list[str]:
+    published, measured = PUBLISHED_MM[name], [run.metrics["errors_mm"] for run in columns.values()]
+    rows = [
+        [
+            label,
+            " ".join(published_parts(published[model])) if model in published else NONE,
+            *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for errors in measured),
+        ]
+        for model, label in {**IN_BEAMS, "resphys": "**ResPhys**"}.items()
+    ]
+    note = (
+        "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. There is no "
+        "mean if a roll-out diverged. Reconstruction: the simulator with forces fitted to the test trajectory itself."
+    )
+    return [_table(["Roll-out error [mm]", *_columns(columns)], rows), note]
+
+
+def _time_table(columns: Mapping[str, Run]) -> list[str]:
+    timing = ROWS["timing"]
+    steps = [run.data["steps"] for run in columns.values()]
+    seconds = [run.metrics["seconds_per_test_trajectory"] for run in columns.values()]
+
+    def text(mean: float, std: float, count: int) -> str:
+        return f"{mean:.3f} ± {std:.3f} {1e3 * mean / count:.2g} ms a step"
+
+    rows = []
+    for key, (label, *published) in timing["published"].items():
+        ours = [text(own[key]["mean"], own[key]["std"], n) for own, n in zip(seconds, steps, strict=True)]
+        rows.append([label, text(*published, timing["steps"]), *ours])
+    note = f"Published: trajectories of {timing['steps']} steps; here: of {' and '.join(sorted({*map(str, steps)}))}."
+    table = _table(["Time per trajectory [s]", *_columns(columns)], rows)
+    return [table, note, "Reasons for deviations:", _items(timing["deviations"])]
+
+
+def _markers_table(name: str, run: Run) -> list[str]:
+    published = ROWS["beams"][name]["published"]
+    rows = []
+    for row in run.metrics["by_markers"]:
+        count = row["markers"]
+        median = f"below {published['median_mm']:g}" if count >= published["markers"] else "not given"
+        spread = "small" if count >= published["markers_of_small_spread"] else "high"
+        ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
+        rows.append([str(count), median, spread, *ours])
+    uncorrected = number_text(run.metrics["uncorrected_mm"])
+    note = f"Error over all vertices [mm] of random sets of markers on the surface. Uncorrected: {uncorrected} mm."
+    heads = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
+    return [_table(["Markers", *heads], rows), note]
+
+
+def copy_picture(folder: Path, patterns: Iterable[str], to: Path) -> None:
+    """Copies the first file of a run folder that has one of several patterns; none where there is no such file."""
+    files = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
+    if files:
+        to.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(files[0], to)
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"|{'|'.join(cells)}|" if cells[0] == "---" else f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _items(texts: Iterable[str]) -> str:
+    return "\n".join(f"- {text}" for text in texts)
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes a file, and prints its name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, f"{text}\n")
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""The script of the published tables and of the page of robots: its pages, which rows it keeps, and what it refuses."""
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from support.command_line import configuration
+from warp_resphys.io.errors import ResphysError
+from warp_resphys.report.page import error_parts, number_text
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce.py"
+DOCS = SCRIPT.parents[1] / "docs"
+SMALL_BEAM = ["mesh.divisions=[4,2,2]", "data.steps=8", "trainer.epochs=4", "trainer.rollout_every=2", "budget=quick"]
+SMALL_ROBOT = [
+    *("data.sequences=5", "data.train=2", "data.validation=1", "data.test=2", "data.steps=12", "mesh.nodes=20"),
+    *("mesh.layers=3", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20", "data.rest_seconds=0.01"),
+    *("data.horizons=[0.06,0.12]", "data.cutoff=20.0", "laboratory.sequences.rest=0.01", "identify.trials=1"),
+    *("laboratory.sequences.correlation_time=0.03", "identify.seconds=0.1", "identify.max_evaluations=2"),
+    *("identify.grid=null", "mesh_check=1.4", "network.position_modes=2", "network.velocity_modes=0"),
+    *("network.force_modes=2", "network.width=8", "trainer.epochs=4", "trainer.rollout_every=2"),
+]
+
+
+@pytest.fixture
+def script(monkeypatch):
+    specification = importlib.util.spec_from_file_location("reproduce", SCRIPT)
+    module = importlib.util.module_from_spec(specification)
+    monkeypatch.setitem(sys.modules, "reproduce", module)
+    specification.loader.exec_module(module)
+    return module
+
+
+def end_of(script, monkeypatch, *arguments):
+    """Runs the script in this process, whose runs are processes of their own; returns its exit code."""
+    monkeypatch.setattr(sys, "argv", ["reproduce.py", *map(str, arguments)])
+    try:
+        script.main()
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def test_the_page_of_robots_is_that_of_the_kept_results(script):
+    kept = json.loads((DOCS / "robots.json").read_text())
+    assert (DOCS / "robots.md").read_text() == script.robots_page(kept, {}, DOCS / "robots") + "\n"
+
+
+def test_the_readme_has_the_figures_of_the_robots():
+    """Every robot of docs/robots.md has a row in README.md, with the same errors, rounded there."""
+    robots = table_of((DOCS / "robots.md").read_text(), "| Robot | Without physics [mm]")
+    readme = table_of((DOCS.parent / "README.md").read_text(), "| robot | without physics")
+    for robot, *measured in robots:
+        (row,) = (cells for cells in readme if cells[0].casefold().startswith(robot.casefold()))
+        expected = [measured[column].split()[0] for column in (0, 1, 2, 4)]
+        for text, exact in zip((cell.strip("*") for cell in row[1:5]), expected, strict=True):
+            digits = len(text.partition(".")[2])
+            assert abs(float(text) - float(exact)) <= 0.5 * 10.0**-digits + 1e-9, (robot, text, exact)
+
+
+def table_of(text, head):
+    """The cells of the rows of a Markdown table whose first line begins in a given way."""
+    lines = text[text.index(head) :].partition("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_every_row_is_an_experiment(script):
+    experiments = {path.stem for path in (SCRIPT.parents[1] / "conf/experiment").glob("*.yaml")}
+    assert {robot["experiment"] for robot in script.ROWS["robots"].values()} <= experiments
+    assert {*script.ROWS["beams"]} <= experiments
+    every = [*script.ROWS["robots"].values(), *script.ROWS["variants"].values()]
+    assert configuration("config", *(override for row in every for override in row.get("overrides", ())))
+
+
+def test_gains_and_the_best_models_are_those_of_the_trials(script):
+    errors = {"rest": [9.0, 8.0], "simulation": [2.0, 2.0], "sysid": [1.0, 1.0], "resphys": [3.0, None]}
+    pair = script._best_pair(errors)
+    assert (pair["corrected"], pair["other"], pair["gain"]["share"]) == ("sysid", "simulation", 0.5)
+    assert script._gain(errors, "sysid", "resphys") is None
+    kept = json.loads((DOCS / "robots.json").read_text())
+    kept["sopra"]["gains"]["resphys"]["lower"] = -0.1
+    page = script.robots_page(kept, {"tentacle": "data.steps is -1"}, DOCS / "robots")
+    assert "reduces the error of identification on 0 of 6 robots." in page
+    assert "| 48 % (\N{MINUS SIGN}10 to 50) |" in page
+    assert "| Tentacle (failed since 2026-11-27) |" in page
+    assert "- Tentacle failed: data.steps is -1" in page
+
+
+def test_rows_with_other_settings_and_other_recordings_are_refused(script, tmp_path):
+    with pytest.raises(ResphysError, match="has sopra with its own settings, not with budget=quick"):
+        script.kept_results(DOCS / "robots.json", ["sopra"], ["budget=quick"])
+    (tmp_path / "m1.csv").write_text("0,1")
+    with pytest.raises(ResphysError, match="are not those of the page"):
+        script.robot_run("tentacle", tmp_path, [], Path("runs"))
+    with pytest.raises(ResphysError, match="there is no starfish: choose from beams, robots, beam_oscillation"):
+        script.selected(["starfish"])
+
+
+@pytest.mark.slow
+def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_others(script, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(script.ROWS["variants"]["published_physics"], "overrides", ["seed=-1"])
+    arguments = ["--results", "out", "--overrides", *SMALL_BEAM]
+    assert (
+        end_of(script, monkeypatch, "beam_oscillation/default", "beam_oscillation/published_physics", *arguments) == 2
+    )
+    page = Path("out/reproduction.md").read_text()
+    (metrics,) = (json.loads(path.read_text()) for path in Path("runs").rglob("metrics.json"))
+    ours = " ".join(error_parts(metrics["errors_mm"]["resphys"])).strip()
+    assert f"| **ResPhys** | 0.004 ± 0.010 | {ours} |" in page
+    time = metrics["seconds_per_test_trajectory"]["simulation"]
+    assert f"| Uncorrected simulation | 0.711 ± 0.002 5.1 ms a step | {time['mean']:.3f} ± {time['std']:.3f}" in page
+    assert "seed is -1" in page
+    assert Path("out/reproduction/beam_oscillation_error_over_time.png").is_file()
+    overrides = ["ablation.counts=[1,4]", "ablation.draws=3", "ablation.processes=1"]
+    assert end_of(script, monkeypatch, "marker_ablation", *arguments, *overrides) == 0
+    (ablation,) = (json.loads(path.read_text()) for path in Path("runs/marker_ablation").rglob("metrics.json"))
+    median = number_text(ablation["by_markers"][1]["median_mm"])
+    assert f"| 4 | below 0.1 | high | {median} |" in Path("out/reproduction.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_robot_has_a_row_and_those_of_earlier_runs_keep_theirs(script, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(script.ROWS["robots"]["sopra"], "experiment", "tendon_rod")
+    shutil.copytree(DOCS / "robots", "out/robots")
+    kept = json.loads((DOCS / "robots.json").read_text())
+    del kept["sopra"]
+    Path("out/robots.json").write_text(json.dumps(kept))
+    assert end_of(script, monkeypatch, "robots", "--results", "out", "--overrides", *SMALL_ROBOT) == 0
+    (metrics,) = (json.loads(path.read_text()) for path in Path("runs").rglob("metrics.json"))
+    page = Path("out/robots.md").read_text()
+    new, *others = table_of(page, "| Robot | Without physics [mm]")
+    means = [error_parts(metrics["errors_mm"][m])[0] for m in ("simulation", "sysid", "simfree", "resphys")]
+    assert [cell.split()[0] for cell in new[2:6]] == means
+    assert others == table_of((DOCS / "robots.md").read_text(), "| Robot | Without physics [mm]")[1:]
+    assert "Tested on 2 trials, held out: " in page
+    assert "A finer mesh moves the markers of the identified simulator by " in page
+    assert json.loads(Path("out/robots.json").read_text()).keys() == {"sopra", *kept}
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_the_run_which_saves_its_state(tmp_path):
+    command = [
+        sys.executable,
+        "-c",
+        f"import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"import sys; sys.path.insert(0, {str(SCRIPT.parent)!r}); sys.argv = ['reproduce.py', "
+        f"'beam_oscillation/default']; runpy.run_path({str(SCRIPT)!r}, run_name='__main__')",
+    ]
+    child = subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    for line in child.stderr:
+        if "simulate: " in line:
+            break
+    child.send_signal(2)
+    err = child.communicate(timeout=100)[1]
+    assert child.returncode == 130, err
+    assert "interrupted in stage" in err
+    assert "the same command continues from there" in err
+    assert "Traceback" not in err

@@ -432,9 +432,9 @@ def _time_table(columns: Mapping[str, Run]) -> list[str]:
         return f"{mean:.3f} ± {std:.3f} {1e3 * mean / count:.2g} ms a step"
 
     rows = []
-    for key, (label, *published) in timing["published"].items():
+    for key, (label, mean, std) in timing["published"].items():
         ours = [text(own[key]["mean"], own[key]["std"], n) for own, n in zip(seconds, steps, strict=True)]
-        rows.append([label, text(*published, timing["steps"]), *ours])
+        rows.append([label, text(mean, std, timing["steps"]), *ours])
     note = f"Published: trajectories of {timing['steps']} steps; here: of {' and '.join(sorted({*map(str, steps)}))}."
     table = _table(["Time per trajectory [s]", *_columns(columns)], rows)
     return [table, note, "Reasons for deviations:", _items(timing["deviations"])]

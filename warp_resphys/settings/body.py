@@ -22,11 +22,9 @@ OwnEnergies = Annotated[
 class PhysicsSettings(Settings):
     """Computation of masses and volumes."""
 
-    mass: Literal["row_sum", "per_vertex"] = setting(
-        "row_sum", "per_vertex: every vertex has the mean element mass, as in the published code"
-    )
+    mass: Literal["row_sum", "per_vertex"] = setting("row_sum", "per_vertex: the mean element mass, as published")
     volume_integration: Literal["centre", "full"] = setting(
-        "centre", "volumetric integration of an element: centre, against locking, or full, as in the published code"
+        "centre", "integration of the volume term; full locks, as published"
     )
 
 
@@ -153,10 +151,10 @@ class RouteSettings(Settings):
 
     guides: Curve = setting(description="points through which it runs", unit="m")
     pieces: Divisions = setting(1, "pieces into which each straight part is divided")
-    fixed_guides: Many[int] = setting((), "numbers of guides, from 0, that stay in the world, such as pulleys")
-    entry_angle: NotNegative = setting(0.0, "contact angle before the first guide, such as around pulleys", "rad")
+    fixed_guides: Many[int] = setting((), "guides, from 0, that stay in the world")
+    entry_angle: NotNegative = setting(0.0, "contact angle before the first guide", "rad")
     offsets: Annotated[Many[Direction | Curve], Field(max_length=2)] = setting(
-        (), "directions of an identified offset of the route: three numbers each, or three for each guide"
+        (), "directions of identified offsets, common or per guide"
     )
 
 
@@ -168,9 +166,7 @@ class TendonSettings(Settings):
     stiffness: NotNegative = setting(description="required for commanded contractions", unit="N/m")
     toe: Positive = setting(1.0e-4, "contraction over which a tendon becomes taut", "m")
     reach: Positive = setting(1.0e-3, "largest distance of a guide from the body", "m")
-    friction: NotNegative | None = setting(
-        None, "coefficient in the guides, by the angle of contact (`tendon_friction`); null: none"
-    )
+    friction: NotNegative | None = setting(None, "coefficient in the guides; null: none")
     bristle_length: Positive = setting(1.0e-4, "slide over which friction reverses", "m")
 
     @model_validator(mode="after")
@@ -246,23 +242,20 @@ class SolveSettings(Settings):
     """Settings of the solver of a step, `dynamics.nonlinear_solver`."""
 
     name: Literal["quasi_newton", "newton", "projective_dynamics"] = setting("quasi_newton", "method")
-    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(
-        1.0e-8, "residual at which a step is solved, over the forces in equilibrium"
-    )
+    relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(1.0e-8, "residual over the forces in balance")
     absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
     max_iterations: Natural = setting(500, "iterations after which a step fails")
     memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
     refactor_after: Natural = setting(
         4,
-        "iterations of a step (pardiso: three times as many) above which quasi_newton refactorises for the next one",
+        "iterations above which quasi_newton refactorises (pardiso: three times as many)",
     )
     linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
-        "auto", "linear solver of Newton's equation; banded, bordered and pardiso run only on the CPU"
+        "auto", "linear solver; banded, bordered and pardiso need a CPU"
     )
     factors: Literal["double", "single"] = setting(
         "double",
-        "precision of factors and L-BFGS pairs (pardiso, but for tendons and contact: single); residuals, states and "
-        "gradients stay accurate",
+        "precision of factors and L-BFGS pairs; results stay accurate",
     )
     on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
 
@@ -339,7 +332,7 @@ class SimulatorSettings(SteppedSettings):
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
     dtype: Literal["float64", "float32"] = setting("float64", "precision of the simulation; experiments need float64")
     coupling: Literal["implicit", "explicit"] = setting(
-        "implicit", "pressure acts on the chambers at the end of a step (implicit) or at its start (explicit)"
+        "implicit", "pressure acts on the chambers at the end of a step, or at its start (explicit)"
     )
 
 

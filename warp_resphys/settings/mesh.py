@@ -84,7 +84,7 @@ class TetrahedralBox(Settings):
     divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
         description="cells along each edge"
     )
-    order: Order = setting(1, "2 adds edge midpoints, without which tetrahedra bend far too stiffly")
+    order: Order = setting(1, "2: with edge midpoints; linear tetrahedra bend far too stiffly")
 
 
 class BoxesMesh(Settings):
@@ -122,8 +122,8 @@ class RodMesh(Settings):
     kind: Literal["rod"]
     centreline: Curve = setting(description="points of its axis", unit="m")
     radii: Positive | Some[Annotated[Many[float], Field(min_length=2, max_length=3)]] = setting(
-        description="one radius, or arc lengths with the radius there, linear in between; two radii for an ellipse: "
-        "along the axis that is most perpendicular to the rod at its start (the first of x, y and z), and across it",
+        description="one radius, or arc lengths with the radius there; two radii for an ellipse: along x, y or z, "
+        "whichever is most perpendicular to the rod at its start, and across it",
         unit="m",
     )
     layers: Divisions = setting(10, "cells along the axis")
@@ -131,7 +131,7 @@ class RodMesh(Settings):
     rings: Divisions = setting(1, "rings of cells around the core")
     nodes: Nodes = setting(27, "nodes of a cell")
     grading: Annotated[float, Field(ge=0.0, le=1.0)] = setting(
-        0.0, "from 0, layers of equal length, to 1, layers with lengths proportional to the radius"
+        0.0, "0: layers of equal length; 1: lengths in proportion to the radius"
     )
 
 
@@ -148,7 +148,7 @@ class GeneratedArm(Settings):
     kind: Literal["arm_generated"]
     size: Positive = setting(0.01, "size of the cells", "m")
     cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
-    layers: Positive | None = setting(None, "length of hexahedra along the arm; null: 2.5 times the size", "m")
+    layers: Positive | None = setting(None, "length along the arm; null: 2.5 times the size", "m")
     order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
     chamber_lengths: Some[Positive] = setting((0.120, 0.120), "lengths of the chambers, one per segment", "m")
     caps: Some[Positive] = setting((0.010, 0.021, 0.005), "solid parts before, between and after the chambers", "m")
@@ -160,12 +160,10 @@ class GeneratedArm(Settings):
     outline: Word = setting("lobed", "lobed, around the chambers, or round")
     wall: Positive = setting(0.004, "thickness of the wall", "m")
     web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
-    core: Positive | None = setting(
-        None, "distance of the chambers from the axis, at the base; null: the least for the webs", "m"
-    )
+    core: Positive | None = setting(None, "distance of the chambers from the axis at the base; null: the least", "m")
     rotations: Many[float] = setting(
         (),
-        "rotations of the chambers about the axis, one per segment; only for tetrahedra and a round outline",
+        "rotations of the chambers, one per segment; for tetrahedra and a round outline",
         "degrees",
     )
 

@@ -11,7 +11,7 @@ from .mesh import Direction, LengthUnit
 class _Placed(Settings):
     position: Vector = setting((0.0, 0.0, 0.0), "position of its centre; of a half-space, a point of its plane", "m")
     axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
-    moves: bool = setting(False, "whether it moves, by `data.obstacle_motion` or by inputs of a robot")
+    moves: bool = setting(False, "moves by `data.obstacle_motion` or inputs of a robot")
 
 
 class HalfSpaceSettings(_Placed):
@@ -58,7 +58,7 @@ class SurfaceSettings(_Placed):
     shape: Literal["surface"]
     path: Word = setting(description="path of an STL, OBJ or PLY file; its z axis is along `axis`")
     units: LengthUnit = setting("mm", "unit of the file")
-    spacing: Positive = setting(1.0e-3, "spacing of the grid, about the radius of rounded edges", "m")
+    spacing: Positive = setting(1.0e-3, "spacing of the grid, which rounds edges", "m")
 
 
 ObstacleSettings = Annotated[
@@ -78,9 +78,7 @@ class FrictionPairSettings(Settings):
 class SurfaceContactSettings(Settings):
     """Contact of the body with itself, and of its parts with one another, by `energies.surfaces`."""
 
-    stiffness: Positive = setting(
-        1.0e5, "stiffness of the barrier, which determines the gap between resting surfaces", "Pa"
-    )
+    stiffness: Positive = setting(1.0e5, "stiffness of the barrier", "Pa")
     friction: NotNegative = setting(0.0, "coefficient of friction")
     distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
@@ -90,12 +88,8 @@ class SurfaceContactSettings(Settings):
 class ContactSettings(Settings):
     """Contact of the body with its obstacles, by `energies.contact`."""
 
-    stiffness: Positive | dict[str, Positive] = setting(
-        1.0e5, "stiffness of the barrier, a number or one per obstacle; it determines the gap of a resting body", "Pa"
-    )
-    friction: NotNegative | dict[str, NotNegative] = setting(
-        0.0, "coefficient of friction, a number or one by obstacle"
-    )
+    stiffness: Positive | dict[str, Positive] = setting(1.0e5, "stiffness of the barrier, or one per obstacle", "Pa")
+    friction: NotNegative | dict[str, NotNegative] = setting(0.0, "coefficient, or one per obstacle")
     distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
     slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
     friction_factors: dict[str, NotNegative] = setting({}, "factors of the friction of regions of the mesh, by name")

@@ -29,9 +29,7 @@ class LensSettings(Settings):
 
     file: Word | None = setting(None, "calibration by OpenCV or ROS, in the folder of the pictures")
     matrix: _Rows | None = setting(None, "K, row by row", "px")
-    row_time: float = setting(
-        0.0, "time of a rolling shutter from the exposure of a row to that of the row below; 0: all at once", "s"
-    )
+    row_time: float = setting(0.0, "rolling shutter: time from a row to the row below", "s")
 
     @model_validator(mode="after")
     def _has_one(self) -> Self:
@@ -58,8 +56,8 @@ class CloudSettings(Settings):
     units: LengthUnit = setting("m", "unit of scans")
     depth_unit: Positive = setting(1e-3, "length that an integer of a depth image stands for", "m")
     noise: Positive = setting(1e-3, "standard deviation of a distance from the surface", "m")
-    reach: Positive = setting(0.05, "distance from the body, beyond which a point is of something else", "m")
-    points: Natural = setting(1000, "points per scan or depth image, chosen at random")
+    reach: Positive = setting(0.05, "largest distance of a point from the body", "m")
+    points: Natural = setting(1000, "points per scan or depth image")
 
 
 class TagSettings(Settings):
@@ -92,13 +90,11 @@ class PoseSettings(Settings):
     )
     mask: ColourSettings | None = setting(None, "colours of the body, where its frames have no masks; null: data.mask")
     outline: bool = setting(True, "whether the body's outline is compared")
-    points: Word | None = setting(None, "file of tracked points, in its folder, with a row for each frame")
-    cloud: Word | None = setting(
-        None, "file of a scan of its surface, in its folder: .ply, .xyz, .pcd, .npy, .obj, .off or .stl"
-    )
+    points: Word | None = setting(None, "file of tracked points, a row per frame")
+    cloud: Word | None = setting(None, "file of a scan: .ply, .xyz, .pcd, .npy, .obj, .off or .stl")
     depth: bool = setting(True, "whether depth images of its frames are compared")
     gravity: Vector | None = setting(None, "gravity in the axes of the scene; null: as configured", "m/s^2")
-    clamp_turn: float = setting(0.0, "about which the second clamp is turned against the first", "degrees")
+    clamp_turn: float = setting(0.0, "rotation of the second clamp against the first", "degrees")
     release: ReleasedForceSettings | None = setting(
         None, "release of a force, after which the body moves, in frames with times; null: it rests"
     )
@@ -108,17 +104,13 @@ class SimulatedCamera(Settings):
     """A simulated laboratory of pictures, on the body of the configuration."""
 
     material: dict[str, float] = setting({}, "constants of the true material that differ from the simulation")
-    corrections: dict[str, float] = setting({}, "true corrections of the camera and of releases, by parameter")
-    noise: NotNegative = setting(
-        1.0, "standard deviation of an outline, across it, and of each coordinate of a tracked point", "px"
-    )
+    corrections: dict[str, float] = setting({}, "true corrections by parameter")
+    noise: NotNegative = setting(1.0, "standard deviation of outlines and tracked points", "px")
     frames: Natural = setting(60, "number of frames of a released body")
     frame_rate: Positive = setting(60.0, "rate of these frames", "Hz")
     row_time: float | None = setting(None, "true time between two rows; null: that of the lens", "s")
     substeps: Natural = setting(2, "substeps per time step in true motions")
-    depth: NotNegative | None = setting(
-        None, "standard deviation of each pixel of depth images; null: no depth images", "m"
-    )
+    depth: NotNegative | None = setting(None, "standard deviation of depth images; null: none", "m")
     size: Pair[Natural] = setting((1280, 720), "width and height of the pictures", "px")
     place: Vector = setting(description="position of the camera", unit="m")
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
@@ -143,18 +135,14 @@ class PictureData(Settings):
         None, "lens of the camera; of several cameras, by name: {left: {file: left.yaml}, right: {...}}"
     )
     tag: TagSettings | None = setting(None, "tag on the clamp; null: frames have world_to_camera")
-    stands: bool = setting(
-        True, "whether the camera stands still during a pose, so that the poses of its frames differ by errors alone"
-    )
+    stands: bool = setting(True, "the camera stands still during a pose")
     order: Literal[1, 2] = setting(2, "order of the elements of meshes in the folders of poses")
     units: LengthUnit = setting("m", "unit of these meshes")
     mask: ColourSettings | None = setting(None, "colours of the bodies, where frames have no masks")
-    points: dict[str, Vector] = setting({}, "places of tracked points on the undeformed body, by name", "m")
-    likelihood: _Fraction = setting(0.6, "likelihood below which a tracked point counts as not seen")
+    points: dict[str, Vector] = setting({}, "tracked points on the undeformed body, by name", "m")
+    likelihood: _Fraction = setting(0.6, "least likelihood of a tracked point")
     cloud: CloudSettings = setting(CloudSettings(), "settings of scans and depth images")
-    materials: dict[str, dict[str, float]] = setting(
-        {}, "constants of materials by name, where they differ from the group simulation"
-    )
+    materials: dict[str, dict[str, float]] = setting({}, "constants by material, where they differ from simulation")
     poses: dict[str, PoseSettings] = setting(description="poses by name")
     train: Some[Word] = setting(description="poses that identify the material")
     test: Many[Word] = setting((), "poses that are predicted with it")

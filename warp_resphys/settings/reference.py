@@ -21,7 +21,7 @@ from .run import RunSettings
 
 _HEAD: Final = """# Settings
 
-All keys of a run, with their values, units [in brackets] and defaults; [Bring your robot](bring_your_robot.md) shows
+All keys of a run, with their defaults, values and units [in brackets]; [Bring your robot](bring_your_robot.md) shows
 the few that a configuration needs. Set one with `key=value` on the command line, or in a file of `configs/experiment`;
 `warp-resphys --cfg job` shows the values of a run. `NAME` stands for any name. A key without a default is required.
 Keys of `simfree` that are left out are as in `network` and `trainer`.
@@ -75,11 +75,13 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
                     below.append((inner, at, "Required. " if name in required else _omitted(key)))
                     continue
                 values = f"{'by name, ' if at.endswith('.NAME') else ''}as `{shown[content]}`"
-            default = "" if name in required else f"`{json.dumps(key.get('default'), separators=(',', ':'))}`"
-            cells = (f"`{name}`", values, default, key.get("description", ""))
+            default = key.get("default")
+            word = default if isinstance(default, str) else json.dumps(default, separators=(",", ":"))
+            set_to = name if name in required else f"{name}={word}"
+            cells = (f"`{set_to}`", values, key.get("description", ""))
             lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
         if lines:
-            yield "\n".join(["| key | values | default | meaning |", "|---|---|---|---|", *lines, ""])
+            yield "\n".join(["| key=default | values | meaning |", "|---|---|---|", *lines, ""])
 
     yield f"## {f'`{path}`' if path else 'The run'}\n"
     about = kinds[0].get("description", "") if len(kinds) == 1 and path else ""

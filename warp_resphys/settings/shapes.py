@@ -20,7 +20,7 @@ class ShapeSettings(BodySettings):
     held: HeldSettings | None = setting(None, "how it is held before its release")
     inputs: Many[float] | None = setting(
         None,
-        "inputs under which it rests before they drop to zero, in their unit: one for each chamber, tendon or muscle",
+        "inputs before the release, one per chamber, tendon or muscle",
     )
 
     @model_validator(mode="after")

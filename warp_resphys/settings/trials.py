@@ -84,14 +84,14 @@ class TrialSettings(Settings):
     begins: Begins | None = setting(None, "how it begins; null: as data.begins")
     inputs: Some[float] | None = setting(None, "constant inputs, one for each chamber, tendon or muscle")
     onset: NotNegative | None = setting(None, "start of the inputs, by the clock of the recording; null: at once", "s")
-    input_delay: float = setting(0.0, "delay of the inputs against their log, as clocks differ", "s")
-    labels: Labels | None = setting(None, "labels of the markers in the order of its file; null: those of the file")
+    input_delay: float = setting(0.0, "delay of the inputs against their log", "s")
+    labels: Labels | None = setting(None, "labels in the order of its file; null: those of the file")
     session: Word | None = setting(None, "session in which it was recorded; null: one session")
     payload: NotNegative = setting(0.0, "mass that hangs on the body", "kg")
     waves: WaveSettings | None = setting(None, "periodic inputs of a simulated trial, in place of random ones")
-    pull: Vector | None = setting(None, "force at the tip that holds a simulated body before its release", "N")
-    base_motion: MotionSettings | None = setting(None, "motion of the base in this trial, in place of data.base_motion")
-    obstacle_motion: ObstacleMotions = setting({}, "motion by obstacle in this trial, in place of data.obstacle_motion")
+    pull: Vector | None = setting(None, "force at the tip of a simulated body before its release", "N")
+    base_motion: MotionSettings | None = setting(None, "in place of data.base_motion")
+    obstacle_motion: ObstacleMotions = setting({}, "in place of data.obstacle_motion")
 
 
 def _file(value: Any) -> Any:
@@ -211,8 +211,8 @@ class HeldSettings(Settings):
     weight_g: NotNegative = setting(0.0, "weight", unit="g")
     direction: Direction = setting((0.0, 0.0, -1.0), "direction in which it pulls")
     at: PlaceSettings | None = setting(None, "vertices that carry it, in equal shares; null: data.load")
-    twist_deg: float = setting(0.0, "angle of the high end of a body that is held in a twist instead", "degrees")
-    twist_axis: Axis = setting("x", "axis along which the angle grows linearly, from zero at the low end")
+    twist_deg: float = setting(0.0, "angle of the high end of a twisted body", "degrees")
+    twist_axis: Axis = setting("x", "axis along which the angle grows")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -237,7 +237,7 @@ class ReleaseFromTwist(_Simulated):
     """Bodies that are released from a twist."""
 
     kind: Literal["release_from_twist"]
-    twist_axis: Axis = setting(description="axis along which the angle grows linearly, from zero at the low end")
+    twist_axis: Axis = setting(description="axis along which the angle grows")
     angles_deg: AmountSettings = setting(description="angle of the high end", unit="degrees")
 
 
@@ -256,8 +256,8 @@ class TableSettings(Settings):
     """Columns of CSV or TSV files without a header, or with another one."""
 
     columns: Many[Word | None] = setting((), "headers such as 'time [s]' or 'tip.x [mm]'; null: not read")
-    names: dict[str, Word] = setting({}, "in place of columns: such headers by those of the file; others are not read")
-    header_lines: Count = setting(0, "lines before the first row of numbers, or with names before the header")
+    names: dict[str, Word] = setting({}, "such headers by those of the file, in place of columns")
+    header_lines: Count = setting(0, "lines before the numbers, or before the header")
 
     @model_validator(mode="after")
     def _has_one(self) -> Self:
@@ -275,57 +275,45 @@ class BagSettings(Settings):
     """
 
     markers: dict[str, Word] = setting(description="topics by name of the marker; poses are rigid bodies")
-    inputs: Many[Word] = setting((), "topics of the inputs, with their unit in brackets: '/pressure#1 [mbar]'")
+    inputs: Many[Word] = setting((), "topics with units: '/pressure#1 [mbar]'")
     base: Word | None = setting(None, "topic of the pose of the base")
-    rate: Positive | None = setting(
-        None, "rate of the frames to which messages are resampled; null: rate of the first marker", "Hz"
-    )
+    rate: Positive | None = setting(None, "rate of the frames; null: that of the first marker", "Hz")
 
 
 class ReadingSettings(Settings):
     """Reading of recordings and their transformation into the frame of the body."""
 
-    folder: Word | None = setting(None, "folder of the recordings; null: the group laboratory simulates the real body")
+    folder: Word | None = setting(None, "folder of the recordings; null: the laboratory simulates them")
     units: LengthUnit | None = setting(None, "unit of files that do not state one")
     rate: Positive | None = setting(None, "frame rate of files that do not state one", "Hz")
     table: TableSettings | None = setting(None, "columns of tables without headers")
     bag: BagSettings | None = setting(None, "topics of ROS bags")
     axes: Annotated[Many[SignedAxis], Field(min_length=3, max_length=3), AfterValidator(different)] | None = setting(
-        None, "recorded axes along the body's x, y and z, if known; one fixed marker then suffices for registration"
+        None, "recorded axes along the body's x, y and z, if known"
     )
-    rest: Literal["held", "file"] = setting(
-        "held", "undeformed body: while it is held; file: the recordings' array rest, for bodies pulled aside"
-    )
-    alignment: Literal["shared", "own"] = setting(
-        "own", "own: each trial is shifted to the mean positions of the markers, as they drift"
-    )
+    rest: Literal["held", "file"] = setting("held", "the undeformed body: while held, or the array rest of the files")
+    alignment: Literal["shared", "own"] = setting("own", "own: shift each trial to the mean marker positions")
     base_motion: BaseMotion = setting(None, "motion of the base: recorded, reference (by markers), or given")
     obstacle_motion: dict[str, MotionSettings | Literal["recorded"]] = setting(
         {},
-        "motion of obstacles from their places, by obstacle: given, or recorded by a marker or rigid body of its name",
+        "motion of obstacles, given or recorded",
     )
     payload_at: PlaceSettings | None = setting(None, "vertices that carry payloads, in equal shares")
     up: SignedAxis | Direction | None = setting(
-        None, "direction against gravity in the frame of the recordings; null: gravity is as configured"
+        None, "direction against gravity in the recordings; null: as configured"
     )
     seconds: Positive | None = setting(None, "evaluated duration after a release", "s")
-    rest_seconds: NotNegative = setting(
-        0.05, "largest duration before the inputs, for the rest positions of markers", "s"
-    )
+    rest_seconds: NotNegative = setting(0.05, "duration before the inputs for the rest positions", "s")
     longest_gap: Count = setting(5, "frames; longer occlusions are masked")
-    steps: Natural | None = setting(None, "time steps that are read of each driven recording")
+    steps: Natural | None = setting(None, "time steps read of a driven recording")
     parts: Annotated[Some[Natural], AfterValidator(different)] | None = setting(
-        None, "chamber, tendon or muscle, from 1, of each column of inputs; null: in their order"
+        None, "chamber, tendon or muscle, from 1, of each column; null: in order"
     )
-    input_limit: Positive | None = setting(
-        None, "largest input, in its unit: larger recorded inputs are refused, simulated ones are clipped"
-    )
+    input_limit: Positive | None = setting(None, "largest input: larger ones are refused, simulated ones clipped")
     valve: Literal["recorded", "detected"] = setting(
-        "recorded", "start of the inputs: of the files, or detected by the motion of the markers"
+        "recorded", "start of the inputs: as recorded, or detected from the markers"
     )
-    cutoff: Positive | None = setting(
-        None, "cutoff of the low-pass filter for reconstruction; errors are not filtered", "Hz"
-    )
+    cutoff: Positive | None = setting(None, "cutoff of the low-pass filter, for reconstruction only", "Hz")
 
 
 class RecordedData(ReadingSettings):
@@ -333,23 +321,23 @@ class RecordedData(ReadingSettings):
 
     kind: Literal["recorded"]
     trials: TrialTable = setting({}, "trials by name; none: all files of the folder")
-    sequences: Count = setting(0, "trials of the laboratory under random inputs: t000, t001, ...")
+    sequences: Count = setting(0, "trials under random inputs: t000, t001, ...")
     begins: Begins = setting(
         "held",
-        "held at rest, for 0.2 s or more, until the release; released with the first frame; rest, until inputs are "
-        "applied; driven, at rest under the first inputs; slack, where those do not act; static, a pose",
+        "held at rest until the release; released with the first frame; rest, until inputs; driven, at rest under the "
+        "first inputs; slack, where those do not act; static, a pose",
     )
-    train_fraction: Share = setting(1.0, "share of every trial, from its start, that is used for training")
+    train_fraction: Share = setting(1.0, "share of every trial, from its start, for training")
     horizons: Annotated[Many[Positive], AfterValidator(rising)] = setting(
-        (), "durations from the start, over which errors are reported as well", "s"
+        (), "further durations over which errors are reported", "s"
     )
     input_scales: Annotated[Many[Positive], AfterValidator(different)] = setting(
-        (), "factors of the inputs, for additional simulated test trials"
+        (), "factors of the inputs for additional test trials"
     )
     folds: Literal["leave_one_out"] | None = setting(None, "cross-validation over the trials; null: the split")
-    train: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
-    validation: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
-    test: Trials = setting((), "names of trials, or how many; others: all that the other two do not name")
+    train: Trials = setting((), "names or number of trials; others: the rest")
+    validation: Trials = setting((), "names or number of trials; others: the rest")
+    test: Trials = setting((), "names or number of trials; others: the rest")
     limit: LimitSettings | None = setting(None, "fewer trials, evenly chosen")
 
     @model_validator(mode="after")
@@ -403,7 +391,7 @@ class BindingSettings(Settings):
     reference: dict[str, Vector] = setting({}, "positions of fixed markers, for the registration", "m")
     bind: Literal["normal", "frame", "rigid", "patch"] = setting("normal", "how tracked markers follow the body")
     bind_to: PlaceSettings | None = setting(None, "vertices that rigid markers follow")
-    patch: Positive = setting(0.02, "radius of the patch of vertices that a patch marker follows", "m")
+    patch: Positive = setting(0.02, "radius of a patch", "m")
     largest_distance: Positive = setting(0.02, "largest distance from the surface of the body", "m")
     observation: ClassSettings | None = setting(
         None, "observation of tracked markers by a class of another package, in place of bind"
@@ -425,24 +413,14 @@ class MarkerSettings(BindingSettings):
     """Markers and tolerances of their registration."""
 
     plane: Annotated[Many[Axis], Field(min_length=2, max_length=2), AfterValidator(different)] | None = setting(
-        None, "axes of the body that a single camera sees; null: all three"
+        None, "axes that a single camera sees; null: all"
     )
-    frame: Literal["body", "own"] = setting(
-        "body", "own: the pose of the body is not known, as for swimming, and markers measure its shape alone"
-    )
-    labels: Literal["recorded", "assigned"] = setting(
-        "recorded", "names of the files; assigned: names are assigned by position"
-    )
-    register_with: Labels | None = setting(None, "markers that register the recordings; null: all of a body at rest")
-    largest_residual: Positive = setting(
-        0.004, "largest residual of the registration, due to errors of the nominal positions", "m"
-    )
-    largest_distortion: Positive = setting(
-        0.001, "largest motion of a reference marker relative to the others between trials", "m"
-    )
-    largest_shift: Positive | None = setting(
-        None, "largest shift of a reference marker in the frame of the recordings; null: any", "m"
-    )
+    frame: Literal["body", "own"] = setting("body", "own: markers measure the shape alone, as for swimming")
+    labels: Literal["recorded", "assigned"] = setting("recorded", "assigned: names are assigned by position")
+    register_with: Labels | None = setting(None, "markers for registration; null: all of a body at rest")
+    largest_residual: Positive = setting(0.004, "largest residual of the registration", "m")
+    largest_distortion: Positive = setting(0.001, "largest motion of a reference marker between trials", "m")
+    largest_shift: Positive | None = setting(None, "largest shift of a reference marker; null: any", "m")
 
     @model_validator(mode="after")
     def _are_bound(self) -> Self:
@@ -476,9 +454,7 @@ class SequenceSettings(Settings):
     mean: float = setting(8e3, "mean, in the unit of the input")
     deviation: Positive = setting(9e3, "standard deviation, in the unit of the input")
     correlation_time: Positive = setting(0.4, "correlation time of the random process", "s")
-    correlation: float | Many[Many[float]] = setting(
-        0.0, "correlation of the inputs of different parts: one number or a matrix"
-    )
+    correlation: float | Many[Many[float]] = setting(0.0, "correlation of different parts")
     rest: NotNegative = setting(0.1, "duration without inputs at the start and at the end", "s")
 
 
@@ -496,7 +472,7 @@ class PlaySettings(TargetSettings):
     orientation_noise: Annotated[float, Field(ge=0.0, le=45.0)] = setting(
         0.0, "noise of a component of a rigid body's rotation", unit="degrees"
     )
-    zero_noise: NotNegative = setting(0.0, "noise of the zero of a trial's recorded inputs, in the unit of the input")
+    zero_noise: NotNegative = setting(0.0, "noise of the zero of recorded inputs")
     tilt: Annotated[float, Field(ge=0.0, le=20.0)] = setting(0.0, "tilt of the body from level", "degrees")
     held_seconds: Annotated[float, Field(ge=0.25)] | None = setting(None, "recorded duration before the release", "s")
     seconds: Positive | None = setting(None, "recorded after the release", "s")

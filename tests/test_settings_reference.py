@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 
 from warp_resphys.data.marker_view import FRAMES
 from warp_resphys.data.markers import KINDS
-from warp_resphys.dynamics.potential_terms import COUPLINGS
 from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
@@ -51,7 +50,6 @@ def test_an_editor_marks_a_wrong_key(editor):
 def test_choices_in_the_settings_are_those_in_the_code():
     pairs = [
         (SimulatorSettings, "integrator", INTEGRATORS),
-        (SimulatorSettings, "coupling", COUPLINGS),
         (PhysicsSettings, "mass", MASS_MODES),
         (PhysicsSettings, "volume_integration", VOLUME_INTEGRATIONS),
         (MarkerSettings, "bind", KINDS),

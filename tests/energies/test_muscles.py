@@ -166,7 +166,6 @@ def test_a_negative_stress_lengthens_a_bar_as_an_inflated_chamber_does(solver):
         (lambda: Muscles([whole(BEAM)], stiffness=-1.0), "muscle_stiffness is"),
         (lambda: Muscles([whole(BEAM)], toe=0.0), "the strain over which muscle fibres tighten is 0"),
         (lambda: simulator(Muscle([99], ALONG)), "runs through cell 99, but there are 24"),
-        (lambda: replace(simulator(whole(BEAM)), coupling="explicit"), "muscle_stress is a follower load"),
     ],
 )
 def test_what_cannot_contract_is_refused(make, said):

@@ -227,7 +227,6 @@ def recorded(tmp_path, finished, change):
         (["data.test=[t777]"], "data.test names the trial 't777'"),
         (["data.folder=nowhere"], "nowhere is not a folder"),
         (["data.train=0"], "data.train"),
-        (["coupling=weak"], "coupling is"),
         (["force_frame=rest"], "force_frame is"),
         (["actuation.filter_time_constants=[-1.0]"], "actuation.filter_time_constants"),
         (["laboratory.sequences.rest=1.0"], "leave no time between two rests"),

@@ -229,8 +229,6 @@ class EnergySet:
                 accepted = ", ".join(self.inputs) or "none"
                 raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
             energy, (points,) = placed.energy, placed.all_points or placed.points
-            if energy.implicit_only:
-                raise InputError(f"{name} is a follower load, so it cannot be held constant over a step.")
             q = self._rest_positions
             self._explicit[batch, name] = ExplicitEnergy(energy, points, len(q), batch, q.device)
         return self._explicit[batch, name]

@@ -1,7 +1,6 @@
 """Terms of the incremental potential: inertia, loads, and the values of the energies.
 
-Mass damping is linear in x, so it is merged with inertia and target. With explicit coupling, loads such as pressure are
-dead loads, evaluated at the start of the step.
+Mass damping is linear in x, so it is merged with inertia and target.
 """
 
 from collections.abc import Sequence
@@ -12,13 +11,10 @@ from ..energies.base import Term
 from ..energies.placement import DEPENDENT
 from ..energies.potential import StepTerms
 from ..fem.coordinates import DeviceCoordinates
-from ..io.errors import InputError
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.state import ImplicitStage, State
 from .energy_set import EnergySet
-
-COUPLINGS = ("implicit", "explicit")
 
 
 class PotentialTerms:
@@ -27,24 +23,10 @@ class PotentialTerms:
     Args:
         energies: all energies of the simulator.
         coordinates: coordinates of the body.
-        coupling: as for the simulator.
-
-    Raises:
-        InputError: an unknown coupling, or explicit coupling of a follower load.
     """
 
-    def __init__(self, energies: EnergySet, coordinates: DeviceCoordinates, coupling: str) -> None:
-        if coupling not in COUPLINGS:
-            raise InputError(f"coupling is {coupling!r}: choose one of {', '.join(COUPLINGS)}.")
+    def __init__(self, energies: EnergySet, coordinates: DeviceCoordinates) -> None:
         self._energies, self._coordinates = energies, coordinates
-        explicit = energies.placed if coupling == "explicit" else ()
-        self._explicit = [name for item in explicit if item.energy.is_load for name in item.input_names]
-        followers = [name for item in explicit if item.energy.implicit_only for name in item.input_names]
-        if followers:
-            raise InputError(
-                f"coupling is explicit, but {followers[0]} is a follower load, which acts at the end of a step: choose "
-                "implicit."
-            )
 
     def of_step(
         self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, terms: Sequence[Term]
@@ -57,11 +39,6 @@ class PotentialTerms:
             mass = mass + inputs.attached_mass
         values = self._energies.values(constants, inputs, batch)
         values |= self._energies.begin_step(state, stage, inputs, constants, terms)
-        for name in self._explicit:
-            value = values[name]
-            assert value is not None
-            force = force + self._energies.explicit_energy(name, batch).force(state.q, value)
-            values[name] = torch.zeros_like(value)
         target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
         inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
         if self._coordinates.depends:

@@ -69,12 +69,9 @@ class Simulator:
         dtype: ``torch.float64``, or ``torch.float32`` for states, loads and factors. Forces are evaluated in float64 in
             both cases, as in single precision those of a nearly incompressible solid have no correct digit. With a
             relative tolerance of 1e-5 a float32 step is as accurate as its positions, 4e-9 m for a beam of 0.1 m.
-        coupling: time at which loads such as pressure act: ``implicit``, at the end of a step (at its middle for
-            ``midpoint``); or ``explicit``, at its start, as in the publication.
 
     Raises:
-        InputError: a time step that is not positive, an unknown integrator, solver or coupling, or a missing CUDA
-            device.
+        InputError: a time step that is not positive, an unknown integrator or solver, or a missing CUDA device.
 
     Warns:
         ResphysWarning: a size, a material or a gravity that looks like a wrong unit, a cell that is nearly flat, or so
@@ -97,7 +94,6 @@ class Simulator:
     relative_tolerance: float | None = None
     device: str | torch.device = "cpu"
     dtype: torch.dtype = torch.float64
-    coupling: str = "implicit"
 
     def __post_init__(self) -> None:
         """Checks the arguments and builds the energies."""
@@ -126,7 +122,7 @@ class Simulator:
         if any(item.energy.is_barrier for item in placed):
             self._check_barriers()
         energies = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
-        self._energies, self._terms = energies, PotentialTerms(energies, self._coordinates, self.coupling)
+        self._energies, self._terms = energies, PotentialTerms(energies, self._coordinates)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
         sets = [points for item in placed for points in item.points]
         pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
@@ -213,7 +209,7 @@ class Simulator:
         """Returns the energy with the named input, for evaluation at given positions.
 
         Raises:
-            InputError: no energy of the body has that input.
+            InputError: no energy of the body has that input, or one that has several values.
         """
         return self._energies.explicit_energy(name, batch)
 

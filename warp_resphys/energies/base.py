@@ -172,13 +172,11 @@ class Energy(ABC):
     Attributes:
         inputs: inputs of the energy, with `count` values each.
         is_load: whether it is a load, which counts among the balancing forces in the convergence test.
-        implicit_only: whether it is a follower load, for which `Simulator.coupling` must be ``implicit``.
         is_barrier: whether the energy is infinite at some positions (`Term.feasible`).
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = ()
     is_load: ClassVar[bool] = False
-    implicit_only: ClassVar[bool] = False
     is_barrier: ClassVar[bool] = False
 
     @property

@@ -1,8 +1,6 @@
-"""Value and force of a single energy at given positions, for explicit coupling and for measurements.
+"""Value and force of a single energy at given positions, for measurements.
 
-In implicit coupling an energy is part of the incremental potential; in explicit coupling its force is constant during a
-step. The derivative of an energy by an input is the work-conjugate quantity, such as the volume of a chamber for its
-pressure.
+The derivative of an energy by an input is the work-conjugate quantity: the volume of a chamber, for its pressure.
 """
 
 from typing import Any
@@ -12,6 +10,7 @@ import warp as wp
 from typing_extensions import override
 
 from ..fem.elements import Points
+from ..io.errors import InputError
 from .base import Energy, PointSet
 from .launcher import Launcher, warp_view
 from .part_terms import PartTerm
@@ -26,6 +25,9 @@ class ExplicitEnergy(Launcher):
         n_vertices: N.
         batch: number of environments B.
         device: device of every tensor.
+
+    Raises:
+        InputError: an energy that depends on more than one value per part.
     """
 
     def __init__(self, energy: Energy, points: Points, n_vertices: int, batch: int, device: torch.device) -> None:
@@ -33,13 +35,9 @@ class ExplicitEnergy(Launcher):
         all_points = slice(0, points.n_points)
         self._set = PointSet(self, points, n_vertices, all_points, all_points)
         term = energy.term(self, [self._set])
-        assert isinstance(term, PartTerm)
+        if not isinstance(term, PartTerm) or len(term.shapes) != 1:
+            raise InputError(f"the energy with the input {energy.inputs[0].name} depends on more than that input.")
         self.term, (self._value,) = term, term.shapes
-
-    def force(self, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Returns the force (B, N, 3) [N] at positions (B, N, 3) [m] for values (B, count)."""
-        force: torch.Tensor = _Force.apply(self, positions, values)
-        return force
 
     def conjugates(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns minus the derivatives of the energy by the values, (B, count): for pressure, volumes [m^3]."""
@@ -57,26 +55,6 @@ class ExplicitEnergy(Launcher):
         force = torch.zeros_like(positions)
         self.launch(step, self.gather(s, view, force))
         return self.term.sum_parts(energy), force.neg_()
-
-    def force_adjoint(
-        self, positions: torch.Tensor, values: torch.Tensor, adjoint: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns vector-Jacobian products of `force` by positions, (B, N, 3), and by values, (B, count)."""
-        positions, values, adjoint = positions.double(), values.double(), adjoint.double()
-        s, named = self._set, {self._value: values.contiguous()}
-        view = s.stress_view(self.zeros(s.n_points, 3, s.width))
-        tangent = warp_view(self.zeros(s.n_points, s.blocks, 3, 3), wp.mat33d)
-        masks = [warp_view(mask, wp.int32) for mask in (self.active, torch.zeros_like(self.active))]
-        kernel, inputs = self.term.tangent(s, named, self._view(positions))
-        out = torch.zeros_like(positions)
-        self.launch(
-            self.record(kernel, (self.batch, s.n_points), [*masks, *inputs], [tangent]),
-            # The Hessian is symmetric, so its product is its own transpose.
-            self.product(s, tangent, self._view(adjoint), view),
-            self.gather(s, view, out),
-        )
-        slopes = self.term.adjoint(named, positions.contiguous(), adjoint.contiguous())()
-        return out.neg_(), slopes[self._value]
 
     def _view(self, field: torch.Tensor) -> Any:
         return warp_view(field.contiguous(), wp.vec3d)
@@ -99,20 +77,3 @@ class _Conjugates(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
         (positions,) = ctx.saved_tensors
         return None, ctx.held.evaluate(positions, gradient)[1]
-
-
-class _Force(torch.autograd.Function):
-    """-dE/dx."""
-
-    @override
-    @staticmethod
-    def forward(ctx: Any, held: ExplicitEnergy, positions: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        ctx.held = held
-        ctx.save_for_backward(positions, values)
-        return held.evaluate(positions.detach(), values.detach())[1].to(positions.dtype)
-
-    @override
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor, torch.Tensor]:
-        return None, *ctx.held.force_adjoint(*ctx.saved_tensors, gradient)

@@ -68,7 +68,6 @@ class Muscles(Energy):
     parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("muscle_stiffness", "Pa", 0.0, closed=True, per="muscle"),)
     inputs: ClassVar[tuple[Quantity, ...]] = (STRESS, CONTRACTION)
     is_load: ClassVar[bool] = True
-    implicit_only: ClassVar[bool] = True
 
     muscles: Sequence[Muscle]
     stiffness: Parameter = 0.0  # k [Pa], parameter ``muscle_stiffness``: a number, (A,), (B, 1) or (B, A) values

@@ -49,8 +49,6 @@ class PointwiseEnergy(Energy):
         rate_independent: as for `BoundEnergy`.
     """
 
-    implicit_only: ClassVar[bool] = True
-
     density: ClassVar[Any]
     size: ClassVar[float] = 1.0
     memory: ClassVar[tuple[Quantity, ...]] = ()

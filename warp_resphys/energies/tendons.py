@@ -55,7 +55,6 @@ class Tendons(Energy):
 
     inputs: ClassVar[tuple[Quantity, ...]] = (TENSION, CONTRACTION)
     is_load: ClassVar[bool] = True
-    implicit_only: ClassVar[bool] = True
 
     routes: Sequence[ArrayLike]  # (G, 3) guides of each tendon on the undeformed body, in order [m]
     # k [N/m], parameter ``tendon_stiffness``: a number, (T,), (B, 1) or (B, T) values; zero for commanded tension

@@ -370,5 +370,4 @@ def build_simulator(
         solver=SolverSettings(**solver),
         device=simulation_device(settings.device),
         dtype=_DTYPES[settings.dtype],
-        coupling=settings.coupling,
     )

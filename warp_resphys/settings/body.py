@@ -331,9 +331,6 @@ class SimulatorSettings(SteppedSettings):
     solver: SolveSettings = SolveSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
     dtype: Literal["float64", "float32"] = setting("float64", "precision of the simulation; experiments need float64")
-    coupling: Literal["implicit", "explicit"] = setting(
-        "implicit", "pressure acts on the chambers at the end of a step, or at its start (explicit)"
-    )
 
 
 class SimulationSettings(SimulatorSettings):

@@ -63,7 +63,6 @@ class PlayedSettings(Settings):
     solver: SolveSettings
     device: str
     dtype: str
-    coupling: str
     seed: int
     binding: BindingSettings
     data: ReadingSettings

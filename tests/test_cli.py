@@ -315,7 +315,7 @@ class TestCommands:
             module, function = f"warp_resphys.{entry.function}".split(":")
             monkeypatch.setitem(sys.modules, module, sys.modules.get(module, types.ModuleType(module)))
             monkeypatch.setattr(sys.modules[module], function, recorder(name), raising=False)
-        for name in ("verify", "verify_gradients", "inspect_make_arm", "view_film"):
+        for name in ("verify", "verify_gradients", "view_film"):
             (config_dir / f"{name}.yaml").write_text("defaults: [config, _self_]\nfiles: []\nrun: null")
         return called
 
@@ -325,7 +325,7 @@ class TestCommands:
             ("", "run", 0),
             ("run", "run", 0),
             ("seed=1", "run", 1),
-            ("inspect make-arm seed=2", "inspect make-arm", 2),
+            ("view film seed=2", "view film", 2),
             ("seed=3 verify gradients", "verify gradients", 3),
             ("--run verify +extra=1 ~material gradients", "verify gradients", 0),
             ("--config-dir . verify", "verify", 0),

@@ -159,11 +159,10 @@ print(json.dumps(helps))
 
 
 def test_a_command_runs_from_an_empty_folder(installed, tmp_path):
-    out = call(installed / "warp-resphys", "inspect", "make-arm", "mesh.layers=0.03", "picture=false", folder=tmp_path)
+    arguments = ["mesh=arm_generated", "mesh.layers=0.03", "save=arm.msh", "picture=false"]
+    out = call(installed / "warp-resphys", "inspect", *arguments, folder=tmp_path)
     assert "chamber_6" in out
-    out = call(
-        installed / "warp-resphys", "inspect", "mesh.path=outputs/make-arm/arm.msh", "picture=false", folder=tmp_path
-    )
+    out = call(installed / "warp-resphys", "inspect", "outputs/inspect/arm.msh", "picture=false", folder=tmp_path)
     assert "chamber_6 (" in out
 
 

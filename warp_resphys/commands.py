@@ -1,6 +1,6 @@
 """The commands of `warp-resphys`: parsing of command lines, and help.
 
-A command is one word or two: ``inspect``, ``inspect make-arm``. This module imports only what is fast to import.
+A command is one word or two: ``view``, ``view film``. This module imports only what is fast to import.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         "inspect": Command(
             "what is in a mesh, or how good a recording is", "studies.inspection:inspect", words="files"
         ),
-        "inspect make-arm": Command("make the mesh of a pneumatic arm", "studies.mesh_inspection:make_arm"),
         "convert": Command(
             "recordings, such as bags, MCAP files and exported tables, to HDF5",
             "studies.conversion:convert",
@@ -75,7 +74,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
 
 RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
     {
-        "make-arm": "inspect make-arm",
         "film": "view film",
         "gradcheck": "verify gradients",
         "check": "verify device",

@@ -267,7 +267,7 @@ def test_shipped_arms(option, count):
 
 
 def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
-    rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) file=(\S+)`", (SHIPPED / "README.md").read_text())
+    rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) save=(\S+)`", (SHIPPED / "README.md").read_text())
     assert {name for _, _, name in rows} == {path.name for path in SHIPPED.iterdir() if path.name.endswith(".msh")}
     for size, layers, name in rows:
         mesh, surfaces = mesh_arm(ArmGeometry(), float(size), layers=float(layers))

@@ -14,14 +14,14 @@ from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic, select_vertices
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from warp_resphys.studies.inspection import Inspection
-from warp_resphys.studies.mesh_inspection import ArmMaking, inspect_mesh, make_arm
+from warp_resphys.studies.inspection import Inspection, inspect
+from warp_resphys.studies.mesh_inspection import inspect_mesh
 
 
 def inspected(*overrides):
     """The table of a mesh, by the name of the row."""
     settings = settings_of(Inspection, "inspect", *overrides, "picture=false")
-    return rows_of(inspect_mesh(settings.mesh, settings.fixed, settings.density, None))
+    return rows_of(inspect_mesh(settings.mesh, settings.fixed, settings.density, None, None))
 
 
 def rows_of(text):
@@ -198,14 +198,14 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
     assert "fixed" not in rows
 
 
-def test_make_arm_writes_what_it_says(tmp_path, capsys):
-    make_arm(settings_of(ArmMaking, "inspect_make_arm", "mesh.layers=0.03", "file=own.msh"), tmp_path)
+def test_an_arm_is_written_as_it_is_described(tmp_path, capsys):
+    inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "mesh.layers=0.03", "save=own.msh"), tmp_path)
     rows = rows_of(capsys.readouterr().out.partition("Written: ")[0])
     mesh = read_mesh(tmp_path / "own.msh")
     assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"
     assert set(read_surfaces(tmp_path / "own.msh")) == set(name_surfaces(mesh))
     assert rows["mass"].startswith(f"{1070e3 * cell_volumes(mesh).sum():.1f} g")
-    picture = imread(tmp_path / "arm.png")[..., :3]
+    picture = imread(tmp_path / "mesh.png")[..., :3]
     colours = {"chamber 1": (0.90, 0.62, 0.0), "chamber 4": (0.84, 0.37, 0.0)}
     views = picture[: int(0.85 * len(picture))]  # without the legend
     for colour in colours.values():
@@ -224,19 +224,19 @@ def test_make_arm_writes_what_it_says(tmp_path, capsys):
 )
 def test_wrong_settings(tmp_path, overrides, error, message):
     with pytest.raises(error, match=message):
-        make_arm(settings_of(ArmMaking, "inspect_make_arm", *overrides), tmp_path)
+        inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "save=arm.msh", *overrides), tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("command", "arguments", "message"),
+    ("arguments", "message"),
     [
-        ("inspect make-arm", ["mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
-        ("inspect", ["nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
-        ("inspect", [], "error: nothing to inspect: name a mesh or a recording"),
+        (["mesh=arm_generated", "mesh.wall=0.02"], "error: where the arm's radius is 21.29 mm, 3 chambers do not fit"),
+        (["nowhere.vtk"], "error: nowhere.vtk: there is no such mesh file"),
+        ([], "error: nothing to inspect: name a mesh or a recording"),
     ],
 )
-def test_commands_end_with_one_sentence(folder, command, arguments, message):
-    sentence = refusal(*command.split(), *arguments)
+def test_commands_end_with_one_sentence(folder, arguments, message):
+    sentence = refusal("inspect", *arguments)
     assert sentence.startswith(message)
     assert sentence.count("\n") == 1
 

@@ -24,6 +24,7 @@ class Inspection(RecordingInspection):
     fixed: PlaceSettings
     density: Positive = setting(unit="kg/m^3")
     picture: bool
+    save: Word | None
 
     @model_validator(mode="before")
     @classmethod
@@ -49,7 +50,7 @@ class Inspection(RecordingInspection):
 
 
 def inspect(settings: Inspection, folder: Path) -> None:
-    """Prints tables; writes quality.json and quality.png of a recording, and mesh.png of a mesh.
+    """Prints tables; writes quality.json and quality.png of a recording, mesh.png of a mesh, and the mesh.
 
     Raises:
         ResphysError: nothing was named, or it cannot be used.
@@ -60,6 +61,8 @@ def inspect(settings: Inspection, folder: Path) -> None:
         print(inspect_recording(settings, folder))
         print(f"Written: {folder / 'quality.json'}, {folder / 'quality.png'}")
     if settings.mesh is not None:
-        print(inspect_mesh(settings.mesh, settings.fixed, settings.density, folder if settings.picture else None))
-        if settings.picture:
-            print(f"Written: {folder / 'mesh.png'}")
+        picture = folder / "mesh.png" if settings.picture else None
+        file = None if settings.save is None else folder / settings.save
+        print(inspect_mesh(settings.mesh, settings.fixed, settings.density, picture, file))
+        if written := [str(path) for path in (file, picture) if path is not None]:
+            print(f"Written: {', '.join(written)}")

@@ -1,5 +1,6 @@
-"""Properties of a mesh as a table and a picture, and the command `inspect make-arm`."""
+"""Properties of a mesh as a table and a picture; a generated arm as a file."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -7,11 +8,10 @@ import numpy as np
 
 from ..experiment.build import build_mesh
 from ..io.errors import MeshError
-from ..io.settings import Positive, Settings, Word, setting
 from ..mesh.arm import name_surfaces
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import FloatArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
+from ..mesh.mesh import FloatArray, IntArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..report.body_picture import MeshSummary, draw_mesh
@@ -22,49 +22,23 @@ _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
 
-class ArmMaking(Settings):
-    """The configuration ``inspect_make_arm``, which explains its keys."""
-
-    file: Word
-    density: Positive = setting(unit="kg/m^3")
-    picture: bool
-    mesh: GeneratedArm
-
-
-def make_arm(settings: ArmMaking, folder: Path) -> None:
-    """Prints a table of a generated arm; writes its mesh and arm.png into the run folder.
-
-    With an absolute path in ``file``, the mesh is written there.
-
-    Raises:
-        ResphysError: an arm that cannot be made.
-    """
-    if settings.mesh.order == 2 and settings.mesh.cells != "tetrahedra":
-        raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
-    mesh = build_mesh(settings.mesh)
-    surfaces = name_surfaces(mesh)
-    write_mesh(folder / settings.file, mesh, surfaces)
-    summary = MeshSummary(mesh, settings.density, np.unique(surfaces["base"]), find_chambers(mesh))
-    if settings.picture:
-        draw_mesh(folder / "arm.png", summary)
-    print(aligned([*summary_rows(summary), ("clamped at the base", f"{len(summary.fixed)} vertices")], left=2))
-    print(f"Written: {folder / settings.file}{f', {folder}/arm.png' if settings.picture else ''}")
-
-
-def inspect_mesh(settings: MeshSettings, fixed: PlaceSettings, density: float, pictures: Path | None) -> str:
-    """Returns a table of a mesh, and draws it.
+def inspect_mesh(
+    settings: MeshSettings, fixed: PlaceSettings, density: float, picture: Path | None, file: Path | None
+) -> str:
+    """Returns a table of a mesh, draws it, and writes it with the names of its surfaces.
 
     Args:
         settings: the group ``mesh``.
         fixed: vertices that are counted and drawn; nothing for none.
         density: for the mass [kg/m^3].
-        pictures: folder for mesh.png; None draws nothing.
+        picture: PNG file; None draws nothing.
+        file: of the mesh; None writes nothing.
 
     Raises:
-        ResphysError: a file that cannot be read, or a mesh that cannot be simulated.
+        ResphysError: a file that cannot be read or written, or a mesh that cannot be simulated.
     """
     rows: list[tuple[str, str]] = []
-    is_file, names = isinstance(settings, FileMesh), ""
+    surfaces: Mapping[str, IntArray] = {}
     if isinstance(settings, FileMesh):
         path, units, order = settings.path, settings.units, settings.order
         points = read_vertices(path, units)
@@ -74,7 +48,6 @@ def inspect_mesh(settings: MeshSettings, fixed: PlaceSettings, density: float, p
         if unused:
             rows.append(("of these unused", f"{unused} belong to no cell; drop_unreferenced leaves them out"))
         surfaces = read_surfaces(path, units, order, True)
-        names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
     else:
         mesh = build_mesh(settings)
         points = mesh.vertices
@@ -85,11 +58,18 @@ def inspect_mesh(settings: MeshSettings, fixed: PlaceSettings, density: float, p
     rows += summary_rows(summary)
     if place is not None:
         rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(vertices)} of them used"))
-    if is_file:
+    if isinstance(settings, FileMesh):
+        names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
         rows.append(("surfaces with a name", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
-    if pictures is not None:
-        draw_mesh(pictures / "mesh.png", summary)
+    if file is not None:
+        if isinstance(settings, GeneratedArm):
+            if settings.order == 2 and settings.cells != "tetrahedra":
+                raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
+            surfaces = name_surfaces(mesh)
+        write_mesh(file, mesh, surfaces)
+    if picture is not None:
+        draw_mesh(picture, summary)
     return aligned(rows, left=2)
 
 

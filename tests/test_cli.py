@@ -204,7 +204,6 @@ class TestUserErrors:
             ("run seed", "cannot read the override 'seed'"),
             ("seed", "unknown command 'seed' (--help lists all)"),
             ("seed=1 inspct", "unknown command 'inspct', did you mean 'inspect'?"),
-            ("gradcheck seed=1", "'gradcheck' is now part of verify: warp-resphys verify gradients --config-path"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
             ("+seed=1", "Could not append to config. An item is already at 'seed'."),
             ("hydra.run.dir=conf/config.yaml", "cannot write conf/config.yaml (File exists)"),
@@ -349,16 +348,6 @@ class TestCommands:
         actions = get_args_parser()._actions
         valued = {name for action in actions if action.nargs in (None, "?") for name in action.option_strings}
         assert set(commands.VALUED) == valued
-
-    @pytest.mark.parametrize("old", commands.RETIRED)
-    def test_old_names_give_the_new_one(self, command, old):
-        new = commands.RETIRED[old]
-        name, words = commands.parse(new.split())
-        assert f"{name} {words[0][6:-1]}" == new if words else name == new
-        code, errors = command(old, "a=[1, 2]")
-        assert code == 2
-        assert f": warp-resphys {new} " in errors
-        assert errors.endswith(" 'a=[1, 2]'\n")
 
 
 _OWN = {"my_robot", "my_tentacle", "my_arm", "--cfg"}  # experiments that the reader writes

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -72,14 +71,6 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
     }
 )
 
-RETIRED: Final[Mapping[str, str]] = MappingProxyType(  # old names of commands
-    {
-        "film": "view film",
-        "gradcheck": "verify gradients",
-        "check": "verify device",
-    }
-)
-
 # Hydra's options whose next word is their value.
 VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -113,10 +104,6 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
         and (at == 0 or rest[at - 1] not in VALUED)
     ]
     name = rest[words[0]] if words else "run"
-    if name in RETIRED:
-        new = RETIRED[name].split()
-        line = shlex.join(["warp-resphys", *new, *rest[: words[0]], *rest[words[0] + 1 :]])
-        raise InputError(f"'{name}' is now part of {new[0]}: {line}")
     if name not in COMMANDS:
         firsts = [command for command in COMMANDS if " " not in command]
         raise InputError(f"unknown command '{name}'{did_you_mean(name, firsts)} (--help lists all)")

@@ -56,7 +56,7 @@ control:
   seconds: [1.5]
   size: 0.03  # m
   plan: {corrections: 2, reach: 0.05}
-  horizon: {seconds: 0.1, pieces: 3}
+  horizon: 0.1
   feedback: {gains: [5.0], settles: 0.3}
   reduction: {modes: [4], equilibria: 48, tangents: 24, motions: 3, seconds: 2.0, batch: 24}
 """)

@@ -53,9 +53,9 @@ CONTROL = [
     *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
     *("actuation.filter_time_constants=[0.1]", "trainer.batch_size=16", "timing=false"),
     *("control.models=[sysid,resphys]", "control.shapes=[circle]", "control.seconds=[0.4]", "control.size=0.01"),
-    *("control.plan={corrections:2,reach:0.05}", "control.horizon={seconds:0.1,pieces:3}"),
+    *("control.plan={corrections:2,reach:0.05}", "control.horizon=0.1"),
     *("control.feedback={gains:[5.0],settles:0.1}",),
-    "control.reduction={modes:[4],equilibria:48,tangents:24,motions:3,seconds:2.0,batch:24}",
+    "control.reduction={modes:[4],equilibria:48,tangents:24,motions:3,seconds:2.0}",
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
 
@@ -415,7 +415,7 @@ class TestPlans:
     def test_the_adjoint_improves_a_plan_too(self, robot, model, folder):
         plan = read_plan(folder / plans_file("resphys"), "circle_0.4s")
         task = Task(control_of(folder), robot.labels, robot.time_step, 3)
-        follower = Follower(robot, model, task.planner(model, 0.4, control_of(folder).plan), 4, "adjoint")
+        follower = Follower(robot, model, task.planner(model, 0.4), 4, "adjoint")
         errors = follower.follow(plan.path[None])[0].errors_mm
         assert errors.min() < 0.8 * errors[0]
 
@@ -483,7 +483,7 @@ class TestDriving:
             raise InputError("stopped.")
 
         monkeypatch.setattr(pipeline, "drive", stop)
-        code, err = run(*CONTROL, "control.horizon.effort=0.02")
+        code, err = run(*CONTROL, "control.horizon=0.2")
         assert code != 0
         assert "stopped." in err
         assert record.stat().st_mtime_ns == before

@@ -34,7 +34,6 @@ TINY = [
     "network.width=32",
     "timing=false",
     "law.branches=7",
-    "law.stride=2",
     "law.trials=2",
     "law.seconds=0.2",
     "law.max_evaluations=6",

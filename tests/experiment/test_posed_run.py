@@ -179,7 +179,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
 
 def test_a_law_is_identified_from_poses(poses, tmp_path):
     write(tmp_path / "recordings", poses)
-    law = "law={terms:[c01],branches:0,families:0,viscous:false,max_evaluations:3}"
+    law = "law={terms:[c01],branches:0,families:0,max_evaluations:3}"
     folder = run_without_report(tmp_path, *TINY, *TRIALS, law, "mesh_check=null")
     found = json.loads((folder / "law.json").read_text())
     assert found["validation"]["trials"] == ["other"]

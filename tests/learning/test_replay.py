@@ -19,7 +19,6 @@ from warp_resphys.learning.release import (
     estimate_release,
     hold,
     sideways_shapes,
-    velocity_shapes,
 )
 from warp_resphys.learning.replay import Replay, Start, later, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
@@ -278,8 +277,8 @@ def test_without_hold_modes_a_body_rests_under_gravity_and_its_weight():
     assert float((still - still[:, :1]).abs().max()) < 1e-7
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, 0.6, 0.9, 1.2, 1.5])
-def test_the_delay_and_the_push_of_a_release_are_recovered_in_any_basis(angle, monkeypatch):
+@pytest.mark.parametrize("angle", [0.0, 0.6, 1.5])
+def test_the_delay_of_a_release_is_recovered_in_any_basis(angle, monkeypatch):
     """The beam is square: any rotation of its first two vibrations is as good a basis."""
 
     def rotated(sim, count):
@@ -290,20 +289,17 @@ def test_the_delay_and_the_push_of_a_release_are_recovered_in_any_basis(angle, m
     monkeypatch.setattr("warp_resphys.learning.release.vibration_modes", rotated)
     sim, motions = simulator(), blank(frames=16)
     replay = Replay(sim, MARKERS, motions)
-    shapes, delay = velocity_shapes(sim, 2), double([0.012, -0.004])
-    assert float(shapes.norm(dim=2).amax()) == pytest.approx(1.0)
+    delay = double([0.012, -0.004])
     q = hold(replay, 6)
-    pushes = double([[0.06, -0.03], [0.0, 0.05]])
-    velocity = torch.einsum("bk,knc->bnc", pushes, shapes)
-    seen = replay(Start(State(q, velocity), delay))[0]
-    settings = ReleaseSettings(velocity_modes=2, delay=0.01, window=0.1, noise=1e-5, iterations=8)
+    seen = replay(Start(State(q, torch.zeros_like(q)), delay))[0]
+    settings = ReleaseSettings(delay=0.01, window=0.1, noise=1e-5)
     result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(result.delay, delay, rtol=0.0, atol=5e-4)
-    torch.testing.assert_close(result.state.v, velocity, rtol=0.0, atol=3e-3)
+    torch.testing.assert_close(result.state.q, q)
     again = replay(result)[0]
     assert float((again - seen).norm(dim=-1).mean()) < 2e-5
     assert result.shift is None
-    kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(velocity_modes=0, delay=0.0))
+    kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(delay=0.0))
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
 
 
@@ -312,12 +308,11 @@ def test_releases_within_twice_what_is_expected_are_recovered(seed):
     """Delays between any two frames: each frame that sees the body at rest or moving is a minimum of its own."""
     sim, count = simulator(), 8
     motions = blank(frames=12, masses=(0.0,) * count)
-    values = 4.0 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 2.0
-    velocity = torch.einsum("bk,knc->bnc", 0.05 * values[:, 1:], velocity_shapes(sim, 2))
-    q = sim.rest_state(count).q
-    release = Start(State(q, velocity), 0.01 * values[:, 0])
+    values = 4.0 * torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 2.0
+    q = hold(Replay(sim, MARKERS, motions), 6)
+    release = Start(State(q, torch.zeros_like(q)), 0.01 * values)
     seen = Replay(sim, MARKERS, motions)(release)[0]
-    settings = ReleaseSettings(hold_modes=6, velocity_modes=2, delay=0.01, window=0.1, noise=1e-5)
+    settings = ReleaseSettings(hold_modes=6, delay=0.01, window=0.1, noise=1e-5)
     result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(result.delay, release.delay, rtol=0.0, atol=5e-4)
 
@@ -348,7 +343,7 @@ def test_a_sideways_held_body_is_identified_from_its_initial_motion():
     truth = Start(State(bent, torch.zeros_like(q)), torch.zeros(2).double(), MARKERS(q) - MARKERS(bent))
     seen = replay(truth)[0]
     torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
-    settings = ReleaseSettings(velocity_modes=0, delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
+    settings = ReleaseSettings(delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
     result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
     torch.testing.assert_close(result.state.q, bent, rtol=0.0, atol=2e-5)
     torch.testing.assert_close(replay(result)[0], seen, rtol=0.0, atol=1e-5)

@@ -26,6 +26,7 @@ from .world import FloatArray
 STATIC_ORDER: Final = 3  # at least, as are those of the tangents
 TANGENT_ORDER: Final = 2
 USUAL_ORDER: Final = 1
+_BATCH: Final = 32  # equilibria that are computed at once
 _LEAST_SETTLED: Final = 0.9  # share of the sampled inputs that must have an equilibrium
 _WINDOW: Final = 0.3  # length of the predictions that measure the error [s]
 
@@ -132,7 +133,7 @@ def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> 
     commands[0] = np.clip(0.0, *source.commands(np.array([[0.0], [1.0]])))
     batches = []
     with torch.no_grad():
-        for some in np.array_split(commands, -(-asked // sampling.batch)):
+        for some in np.array_split(commands, -(-asked // _BATCH)):
             batches.append(source.equilibria(some))
             on_progress(len(some))
         q, commands = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])

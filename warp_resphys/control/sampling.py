@@ -41,7 +41,6 @@ class Sampling:
         tangents: number of equilibria about which vibrations are computed.
         motions: number of motions for H; as many more measure the error.
         seconds: of a motion.
-        batch: equilibria computed together.
         seed: of the random inputs.
     """
 
@@ -50,7 +49,6 @@ class Sampling:
     tangents: int = 96
     motions: int = 6
     seconds: float = 2.5
-    batch: int = 32
     seed: int = 0
 
     @property

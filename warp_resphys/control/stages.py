@@ -57,6 +57,7 @@ from .sampling import Sampling, check_plannable, driven_input
 from .task import Task, motion_name, motions_of
 from .world import FloatArray
 
+_PRESSED: Final = 0.3  # share of the range by which inputs are changed to measure the Jacobian
 _ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
 
 
@@ -95,7 +96,7 @@ def plan_motions(context: StageContext) -> None:
     kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
     plans = {} if kept is None else plans_from_plain(*kept)
     followers = {
-        seconds: Follower(robot, reduced, task.planner(reduced, seconds, plan), plan.corrections, plan.gradient)
+        seconds: Follower(robot, reduced, task.planner(reduced, seconds), plan.corrections, plan.gradient)
         for seconds in settings.figures.seconds
     }
     work = {seconds: follower.rollouts * task.steps(seconds) for seconds, follower in followers.items()}
@@ -134,7 +135,7 @@ def fit_baselines(context: StageContext) -> None:
     linear = fit_linear(train, validation or train, np.asarray(driven.high), robot.time_step)
     feedback, limits = settings.feedback, task.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
-    pressed = feedback.pressed * np.diag(limits.range)
+    pressed = _PRESSED * np.diag(limits.range)
     laboratory = Laboratory(settings.played, context.run_dir, driven.name, parts, len(motions_of(settings.figures)))
     rest, seen = laboratory.rest(), []
     with Progress(context.name, steps, "steps") as progress:
@@ -211,12 +212,12 @@ def receding_controllers(
         rests: (>= C, M, 3) markers that each controller observes while the robot rests without inputs [m].
     """
     control = settings.control
-    task, noise, controllers = task_of(control, robot), Noise(**dict(control.estimate)), list[Controller]()
+    task, controllers = task_of(control, robot), list[Controller]()
     limits, horizon = task.limits, task.horizon(control.horizon)
     for model, rest in zip(control.receding, rests, strict=False):
         learned = robot if model == robot.description.model else load(folder, model, settings.device)
         reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
-        controllers.append(RecedingHorizon(reduced, task.tracked, limits, horizon, noise, path, rest))
+        controllers.append(RecedingHorizon(reduced, task.tracked, limits, horizon, Noise(), path, rest))
     linear, rest = read_baselines(folder / BASELINES)[0], rests[len(controllers)]
     return [*controllers, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest)]
 

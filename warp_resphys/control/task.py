@@ -8,13 +8,17 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ..io.errors import InputError
-from ..settings.control import FigureSettings, HorizonSettings, PlanSettings
+from ..settings.control import FigureSettings
 from .plan import Horizon, Limits, Planner, Weights, tracked_of
 from .reduced import ReducedModel
 from .reference import Path
 from .world import FloatArray
 
 _POINTS = 40  # number of points of a path whose reach is checked
+
+
+_SPACING, _WEIGHTS, _ITERATIONS = 0.05, Weights(1e-3, 1e-3), 6  # of whole motions: between knots of the inputs [s]
+_PIECES = 6  # of the inputs in a receding horizon
 
 
 @dataclass(frozen=True)
@@ -58,18 +62,16 @@ class Task:
         """Reference (T, 3) after each step of a motion from a start (3,) [m]."""
         return path.timed(seconds, self.time_step, lead=start)[1:]
 
-    def planner(self, model: ReducedModel, seconds: float, plan: PlanSettings) -> Planner:
+    def planner(self, model: ReducedModel, seconds: float) -> Planner:
         """Planner of whole motions."""
         steps = self.steps(seconds)
-        pieces = min(max(round(steps * self.time_step / plan.spacing), 1), steps)
-        horizon = Horizon(steps, pieces, Weights(plan.effort, plan.change), plan.iterations)
-        return Planner(model, self.tracked, self.limits, horizon)
+        pieces = min(max(round(steps * self.time_step / _SPACING), 1), steps)
+        return Planner(model, self.tracked, self.limits, Horizon(steps, pieces, _WEIGHTS, _ITERATIONS))
 
-    def horizon(self, settings: HorizonSettings) -> Horizon:
+    def horizon(self, seconds: float) -> Horizon:
         """Horizon of receding plans."""
-        steps = max(round(settings.seconds / self.time_step), 1)
-        weights = Weights(settings.effort, settings.change)
-        return Horizon(steps, min(settings.pieces, steps), weights, settings.iterations)
+        steps = max(round(seconds / self.time_step), 1)
+        return Horizon(steps, min(_PIECES, steps))
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.

@@ -39,6 +39,7 @@ _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a sma
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
 _OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
+_STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
 
@@ -89,7 +90,6 @@ class _LawSearch:
         shortest, longest = wanted.relaxation_times
         library = Library(
             terms=tuple(wanted.terms),
-            viscous=wanted.viscous,
             times=tuple(np.geomspace(shortest, longest, wanted.branches).tolist()),
             families=wanted.families,
         )
@@ -169,7 +169,6 @@ class _LawSearch:
 
     def _from_states(self, library: Library) -> list[LawClass]:
         """Returns the classes of the weak form."""
-        wanted = self.settings.law
         zero = dict.fromkeys((*library.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
         zero |= branches_of([0.0], [0.1]) | _family(0.0)
         simulator, guess = self.trials.simulator(zero), self.trials.guess
@@ -177,7 +176,7 @@ class _LawSearch:
         forms = []
         for names in (self.settings.split.train, self.settings.split.validation):
             motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
-            forms.append(WeakForm(simulator, motions, zero, stiff, wanted.stride) if motions else None)
+            forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], library)
 
@@ -237,8 +236,7 @@ class _LawSearch:
             whole: whether to use the whole of training trials on which laws are tested as well.
         """
         guess = dict(law.constants)
-        if self.settings.law.viscous:
-            guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
+        guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
         simulator = self.trials.simulator(guess)
         others = self.trials.bounds_of_others(simulator)
         bounds = {name: self.trials.bounds(name, value) for name, value in guess.items() if is_refined(name)} | others

@@ -2,8 +2,8 @@
 
 Before the release, the body is at rest under gravity, its weights and a virtual force that brings its markers to their
 held positions (the published method finds such forces by time steps; here it is one static equilibrium). The release
-happens between two frames, may push the body, and the body may have been bent sideways: the delay, a velocity in a few
-slow modes, and a sideways displacement are estimated from the first frames.
+happens between two frames, and the body may have been bent sideways: the delay and a sideways displacement are
+estimated from the first frames.
 """
 
 from collections.abc import Callable
@@ -30,6 +30,7 @@ _SIDEWAYS_STRAIN = 1e-3  # of the body's extent: size of the displacement from w
 _FURTHEST, _TRIED = 3.0, 121  # largest delay of inputs, in expected deviations, and number of delays
 _DELAYS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # starts of the search, in expected deviations
 _HOLD_WEIGHT = 1e-6  # w, in units of the largest diagonal entry of the first J^T J
+_ITERATIONS = 4  # of Levenberg-Marquardt, at most
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
@@ -192,7 +193,7 @@ def _initial_motion(
     start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
     copies = motions.select(list(range(count)) * len(delays) * (1 + unknowns))
     problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise, parameters)
-    solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, settings.iterations).point
+    solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, _ITERATIONS).point
     best = solution.value.view(-1, count).argmin(0)
     return model(solution.x.view(-1, count, unknowns)[best, torch.arange(count, device=best.device)])
 
@@ -241,7 +242,7 @@ class _FirstFrames(Problem):
 
 
 class _ReleaseModel:
-    """Maps delays, velocities and sideways displacements, in expected deviations, to releases.
+    """Maps delays and sideways displacements, in expected deviations, to releases.
 
     Args:
         simulator: of the body.
@@ -252,21 +253,20 @@ class _ReleaseModel:
 
     def __init__(self, simulator: Simulator, markers: Observation, held: Start, settings: ReleaseSettings) -> None:
         self._markers, self._held = markers, held
-        velocities = velocity_shapes(simulator, settings.velocity_modes)
-        sideways = sideways_shapes(simulator) if settings.sideways > 0.0 else velocities[:0]
-        self._shapes = (velocities, sideways)
-        self._sizes = (int(settings.delay > 0.0), len(velocities), len(sideways))
-        deviations = (settings.delay, settings.speed, settings.sideways)
+        none = simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
+        self._shapes = sideways_shapes(simulator) if settings.sideways > 0.0 else none
+        self._sizes = (int(settings.delay > 0.0), len(self._shapes))
+        deviations = (settings.delay, settings.sideways)
         self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
 
     def __call__(self, values: torch.Tensor) -> Start:
         """Returns the releases for values (k R, unknowns); the R motions run fastest."""
-        delay, speeds, bends = (values * self.deviation).split(self._sizes, 1)
+        delay, bends = (values * self.deviation).split(self._sizes, 1)
         repeats = len(values) // len(self._held.delay)
         held = self._held.state.q.repeat(repeats, 1, 1)
-        velocity, bend = (torch.einsum("bk,knc->bnc", a, b) for a, b in zip((speeds, bends), self._shapes, strict=True))
-        shift = self._markers(held) - self._markers(held + bend) if len(self._shapes[1]) else None
-        return Start(State(held + bend, velocity), delay.sum(1), shift)
+        bend = torch.einsum("bk,knc->bnc", bends, self._shapes)
+        shift = self._markers(held) - self._markers(held + bend) if len(self._shapes) else None
+        return Start(State(held + bend, torch.zeros_like(held)), delay.sum(1), shift)
 
 
 def sideways_shapes(simulator: Simulator) -> torch.Tensor:
@@ -292,12 +292,3 @@ def sideways_shapes(simulator: Simulator) -> torch.Tensor:
     furthest = shapes.norm(dim=2).amax(1)
     reach = simulator.tensor(sizes) * furthest
     return (shapes / furthest[:, None, None])[reach >= 0.5 * reach[0]]
-
-
-def velocity_shapes(simulator: Simulator, modes: int) -> torch.Tensor:
-    """Shapes (modes, N, 3) of the slowest vibrations, scaled to a maximum of one."""
-    if modes == 0:
-        return simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
-    inertial = vibration_modes(simulator, modes).mT.unflatten(1, (-1, 3))
-    shapes = inertial / simulator.prepare().mass[..., None]
-    return shapes / shapes.norm(dim=2).amax(1)[:, None, None]

@@ -161,8 +161,7 @@ def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
     absent += (
         [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
     )
-    if settings.viscous:
-        absent += [_lower(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
+    absent += [_lower(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
     if settings.branches and not any(name.startswith("prony") for name in constants):
         absent.append("relaxing branches")
     if settings.families and not families(constants):

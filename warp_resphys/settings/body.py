@@ -246,10 +246,6 @@ class SolveSettings(Settings):
     absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
     max_iterations: Natural = setting(500, "iterations after which a step fails")
     memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
-    refactor_after: Natural = setting(
-        4,
-        "iterations above which quasi_newton refactorises (pardiso: three times as many)",
-    )
     linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
         "auto", "linear solver; banded, bordered and pardiso need a CPU"
     )

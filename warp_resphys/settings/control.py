@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Share, Some, Vector, Word, setting
+from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Some, Vector, Word, setting
 from .mesh import Direction
 from .trials import different
 
@@ -28,10 +28,6 @@ class LimitsOfInputs(Settings):
 class PlanSettings(Settings):
     """Plans of whole motions."""
 
-    spacing: Positive = setting(0.05, "between the knots of the inputs", "s")
-    effort: Positive = setting(1.0e-3, "cost of inputs at their upper limits", "mm^2")
-    change: Positive = setting(1.0e-3, "cost of inputs that change at their largest rate", "mm^2")
-    iterations: Natural = setting(6, "iterations on the reduced model")
     corrections: Count = setting(3, "with the robot's simulator")
     gradient: Literal["reduced", "adjoint"] = setting(
         "reduced", "gradients of the corrections: of the reduced model, or by the simulator's adjoint"
@@ -39,32 +35,11 @@ class PlanSettings(Settings):
     reach: Positive = setting(1.0e-3, "largest distance of a path from reachable points", "m")
 
 
-class HorizonSettings(Settings):
-    """Plans with a receding horizon."""
-
-    seconds: Positive = setting(0.3, "horizon", "s")
-    pieces: Natural = setting(6, "constant pieces of the inputs in the horizon")
-    effort: Positive = setting(1.0e-2, "cost of inputs at their upper limits", "mm^2")
-    change: Positive = setting(1.0e-2, "cost of inputs that change at their largest rate", "mm^2")
-    iterations: Natural = setting(1, "iterations per step")
-
-
-class EstimateSettings(Settings):
-    """Standard deviations of the estimator, `control.estimate.Noise`."""
-
-    observed: Positive = setting(1.0e-4, "standard deviation of a coordinate of a marker", "m")
-    rate: Positive = setting(
-        0.3, "deviation of the unmodelled change of rates in a step, over their deviation in an oscillation of 1 mm"
-    )
-    bias: Positive = setting(5.0e-3, "deviation of the drift of the bias in a second", "m")
-
-
 class FeedbackSettings(Settings):
     """Feedback by a measured Jacobian."""
 
     gains: Numbers = setting((0.5, 1.0, 2.0), unit="1/s")
-    pressed: Share = setting(0.3, "share of the range by which inputs are changed to measure the Jacobian")
-    settles: Positive = setting(1.5, "time after which it is measured", "s")
+    settles: Positive = setting(1.5, "time after a change of inputs after which the Jacobian is measured", "s")
 
 
 class ReductionSettings(Settings):
@@ -77,7 +52,6 @@ class ReductionSettings(Settings):
     tangents: Natural = setting(96, "number of these states whose vibrations are computed")
     motions: Natural = setting(6, "number of motions for the fit, and as many for its error")
     seconds: Positive = setting(2.5, "duration of a motion", "s")
-    batch: Natural = setting(32, "equilibria that are computed at once")
 
 
 class FigureSettings(Settings):
@@ -103,7 +77,6 @@ class ControlSettings(FigureSettings):
     )
     receding: Models = setting(("resphys",), "those of the models that plan with a receding horizon")
     plan: PlanSettings = PlanSettings()
-    horizon: HorizonSettings = HorizonSettings()
-    estimate: EstimateSettings = EstimateSettings()
+    horizon: Positive = setting(0.3, "of plans with a receding horizon", "s")
     feedback: FeedbackSettings = FeedbackSettings()
     reduction: ReductionSettings = ReductionSettings()

@@ -155,13 +155,11 @@ class LawSettings(Settings):
     terms: Many[Word] = setting(
         ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
-    viscous: bool = setting(True, "whether it may have a viscosity")
     branches: Count = setting(13, "relaxation times that are tried, with markers at most two; 0: none")
     relaxation_times: Annotated[Pair[Positive], AfterValidator(rising)] = setting(
         (0.01, 1.0), "shortest and longest", "s"
     )
     families: Count = setting(1, "largest number of families of fibres; with markers at most one")
-    stride: Natural = setting(10, "steps from one balance of forces to the next, where all vertices are observed")
     trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
     seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its derivatives in a search")
@@ -311,19 +309,16 @@ class ReleaseSettings(Settings):
     hold_modes: Count = setting(
         6, "vibration modes whose inertial forces hold it; 0 starts from equilibrium under gravity and payload"
     )
-    velocity_modes: Count = setting(0, "vibration modes of a velocity at the release")
     window: Positive = setting(
-        0.13, "duration after the release for estimating delay, velocity and sideways displacement: about a period", "s"
+        0.13, "duration after the release for estimating delay and sideways displacement: about a period", "s"
     )
     noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
     delay: NotNegative = setting(
         0.0, "expected deviation of the release, or of a trial's inputs, from the detected time; 0 uses that", "s"
     )
-    speed: Positive = setting(0.05, "expected speed of the fastest vertex", "m/s")
     sideways: NotNegative = setting(
         0.0, "expected displacement, across gravity, of a body that is held nearly undeformed; 0 for none", "m"
     )
-    iterations: Natural = setting(4, "Levenberg-Marquardt steps")
 
 
 class AblationSettings(Settings):

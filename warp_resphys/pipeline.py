@@ -52,7 +52,7 @@ from .experiment.identify import identify
 from .experiment.identify_law import identify_law
 from .experiment.importing import import_recordings, import_scaled
 from .experiment.laboratory import run_laboratory
-from .experiment.learn import refine, takes_long, train
+from .experiment.learn import takes_long, train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.prediction_intervals import intervals_of_folds
@@ -92,7 +92,6 @@ from .settings.stages import (
     PlayedSettings,
     ReconstructStage,
     ReduceStage,
-    RefineStage,
     ShapesStage,
     SimulateStage,
     SplitReportStage,
@@ -238,9 +237,6 @@ def learning_stages(
         add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), forces)
         trained = TrainStage.of(run, **common, model=model, training=run.training(model))
         add(second, train, (weights_file(model), training_file(model)), trained, first)
-        if run.refinement is not None:
-            outputs = (weights_file(model, True), training_file(model, True))
-            add(f"refine_{model}", refine, outputs, RefineStage.of(run, **common, model=model), first, second)
         learned.append(stages[-1].name)
     trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
@@ -250,7 +246,7 @@ def learning_stages(
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
     learned.append("train_simfree")
-    tested = {**common, "groups": test_groups(run, split), "refined": run.refinement is not None}
+    tested = {**common, "groups": test_groups(run, split)}
     calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
     work, evaluated = partial(evaluate, workers=workers), EvaluateStage.of(run, **tested, calibration=calibration)
     add("evaluate", work, (ROLLOUTS, ERRORS), evaluated, *learned, "reconstruct_resphys")

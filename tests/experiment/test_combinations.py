@@ -1,4 +1,4 @@
-"""What experiments are made of combines: payloads, releases, poses, folds, refinement and searches of any bodies."""
+"""What experiments are made of combines: payloads, releases, poses, folds, windows and searches of any bodies."""
 
 import json
 from pathlib import Path
@@ -79,24 +79,24 @@ def dataset(*names):
         return words, [read_array(file, name) for name in names]
 
 
-def test_a_force_under_pressure_is_refined_through_the_simulator():
-    results = segment("refinement=solver_in_the_loop", "refinement.window=3", "refinement.epochs=3")
+@pytest.mark.slow
+def test_a_force_under_pressure_is_trained_through_the_simulator():
+    results = segment("+in_the_loop=windows", "in_the_loop.window=3", "in_the_loop.epochs=3")
     finite(results)
-    history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
-    assert history[-1]["train_loss"] < 0.99 * history[0]["train_loss"]
-    start = results["networks"]["resphys"]["validation_rollout_error_mm"]
-    assert results["networks"]["resphys_refined"]["validation_rollout_error_mm"] <= start * (1.0 + 1e-9)
-    described = [
-        read_checkpoint(Path(f"run/{name}.safetensors"), "residual force")[1] for name in ("resphys", "resphys_refined")
-    ]
-    assert described[0]["range"] == described[1]["range"] is not None
-    assert described[0]["force_frame"] == described[1]["force_frame"] == "corotated"
+    first, *_, last = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
+    assert last["train_loss"] < 0.99 * first["train_loss"]
+    kept = results["networks"]["resphys"]["validation_rollout_error_mm"]
+    assert kept <= first["rollout_error_mm"] * (1.0 + 1e-9)
+    described = read_checkpoint(Path("run/resphys.safetensors"), "residual force")[1]
+    assert described["range"] is not None
+    assert described["force_frame"] == "corotated"
 
 
-def test_a_force_that_was_trained_on_markers_is_refined_over_windows():
-    results = done(*BEAM, "refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=2")
+@pytest.mark.slow
+def test_a_force_from_markers_is_trained_over_windows():
+    results = done(*BEAM, "in_the_loop.window=4")
     finite(results)
-    history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
+    history = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
     assert history[-1]["train_loss"] < history[0]["train_loss"]
 
 

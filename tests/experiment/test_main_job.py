@@ -17,8 +17,6 @@ from support.main_job import (
     IN_RUN,
     LEARNED,
     MODELS,
-    REFINE,
-    REFINED,
     REPOSITORY,
     SHORT,
     STAGES,
@@ -218,35 +216,22 @@ class TestChanges:
         history = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
         assert min(history, key=lambda r: r["validation_loss"])["epoch"] == metrics()["networks"]["resphys"]["epoch"]
 
-    def test_refinement_is_never_worse_on_the_validation_split(self, finished, copied):
-        """Here it overfits three short trajectories, so that the weights from before it are taken."""
-        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
-        assert ran(copied) == ["refine_resphys", "evaluate", "time", "report"]
-        history = json.loads(Path("run/refinement_resphys.json").read_text())["epochs"]
-        assert [r["epoch"] for r in history] == [0, 1, 2, 3]
+    def test_training_over_windows_helps_a_poor_network(self, folder):
+        poor = [*TINY, "trainer.epochs=3", "trainer.rollout_every=1", "trainer.linear_noise=null"]
+        assert run(*poor, "hydra.run.dir=run")[0] == 0
+        first, alone = metrics(), files()
+        windows = ["+in_the_loop=windows", "in_the_loop.window=4", "in_the_loop.epochs=3"]
+        assert run(*poor, *windows, IN_RUN)[0] == 0
+        assert ran(alone) == ["train_resphys", "evaluate", "time", "report"]
+        results, start = metrics(), first["networks"]["resphys"]
+        history = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
+        assert [record["epoch"] for record in history] == [start["epoch"] + k for k in range(4)]
+        assert history[0]["rollout_error_mm"] == pytest.approx(start["validation_rollout_error_mm"], rel=0.05)
         assert history[3]["train_loss"] < history[0]["train_loss"]
-        results, before = metrics()["networks"], metrics(finished[0])["networks"]
-        assert results["resphys"] == before["resphys"]
-        assert results["resphys_refined"]["epoch"] == 0
-        start = results["resphys"]["validation_rollout_error_mm"]
-        assert results["resphys_refined"]["validation_rollout_error_mm"] == pytest.approx(start, rel=1e-6)
-        same_errors(errors(), errors(finished[0]))
-        before = files()
-        assert run(*TINY, *REFINE, IN_RUN, "refinement.epochs=1")[0] == 0
-        assert ran(before) == ["refine_resphys", "evaluate", "time", "report"]
-
-    def test_refinement_helps_a_poor_network(self, folder):
-        poor = [*TINY, "trainer.epochs=3", "trainer.linear_noise=null"]
-        assert run(*poor, *REFINE, "hydra.run.dir=run")[0] == 0
-        results, refined = metrics(), files()
-        assert results["networks"]["resphys_refined"]["epoch"] > 0
-        start = results["networks"]["resphys"]["validation_rollout_error_mm"]
-        assert results["networks"]["resphys_refined"]["validation_rollout_error_mm"] < 0.9 * start
-        assert list(results["seconds"]) == REFINED
-        assert run(*poor, IN_RUN)[0] == 0  # without it again
-        assert ran(refined) == ["evaluate", "time", "report"]
-        assert list(metrics()["seconds"]) == STAGES
-        assert results["errors_mm"]["resphys"]["mean"] < 0.9 * metrics()["errors_mm"]["resphys"]["mean"]
+        kept = results["networks"]["resphys"]
+        assert kept["epoch"] > start["epoch"]
+        assert kept["validation_rollout_error_mm"] < 0.9 * start["validation_rollout_error_mm"]
+        assert results["errors_mm"]["resphys"]["mean"] < 0.9 * first["errors_mm"]["resphys"]["mean"]
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
@@ -291,7 +276,7 @@ def options(group):
     return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml"))
 
 
-GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "refinement", "budget")
+GROUPS = ("mesh", "physics", "solver", "reconstruction", "network", "trainer", "budget")
 SIMULATED = [
     name for name in options("experiment") if name.startswith(("beam_oscillation", "beam_twist", "marker_ablation"))
 ]  # others: test_measured_configuration.py
@@ -332,8 +317,7 @@ class TestConfiguration:
         check_run(wanted)
         real, wrong = (build_simulator(wanted, material) for material in (wanted.target.material, wanted.simulation))
         assert real.material != wrong.material
-        stages = REFINED if option == "solver_in_the_loop" else STAGES
-        stages = ["generate", "ablation", "report"] if name == "marker_ablation" else stages
+        stages = ["generate", "ablation", "report"] if name == "marker_ablation" else STAGES
         assert [stage.name for stage in stages_of(wanted)] == stages
 
     @pytest.mark.parametrize("option", FROM_MARKERS)

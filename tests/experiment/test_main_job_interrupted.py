@@ -1,8 +1,6 @@
 """The main job, interrupted and killed: what it keeps, and how it goes on."""
 
-import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.main_job import IN_RUN, REFINE, REPOSITORY, TINY, errors, run, same_errors
+from support.main_job import IN_RUN, REPOSITORY, TINY, errors, run, same_errors
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.resumable import ResumableHDF5
 from warp_resphys.learning.reconstruction import LBFGSB
@@ -79,23 +77,6 @@ class TestInterruption:
         same_errors(errors(), errors("whole"))
         assert not [*Path("run").rglob("*.frames*"), *Path("run").glob("*_parts")]
         assert not list(Path("run").glob("train_*.safetensors"))
-
-    def test_ctrl_c_while_refining(self, finished, folder, interruption):
-        shutil.copytree(finished[0], "run")
-        shutil.copytree(finished[0], "whole")
-        assert run(*TINY, *REFINE, "hydra.run.dir=whole")[0] == 0
-        assert interruption.done["epochs"] == 3
-        interruption.done.clear()
-        interruption.at = ("epochs", 2)
-        code, err = run(*TINY, *REFINE, IN_RUN)
-        assert (code, "interrupted in stage 'refine_resphys'" in err) == (130, True)
-        interruption.at = None
-        assert run(*TINY, *REFINE, IN_RUN)[0] == 0
-        assert interruption.done["epochs"] in (3, 4)
-        first, second = (json.loads(Path(f"{name}/refinement_resphys.json").read_text()) for name in ("run", "whole"))
-        losses = [[r["train_loss"] for r in results["epochs"]] for results in (first, second)]
-        assert losses[0] == losses[1]
-        same_errors(errors(), errors("whole"))
 
     def test_twice_in_one_stage_and_before_the_first_frame(self, finished, folder, interruption):
         for at in (1, 2, 9):

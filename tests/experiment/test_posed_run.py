@@ -187,10 +187,8 @@ def test_a_law_is_identified_from_poses(poses, tmp_path):
     assert small_strain(found["constants"]).youngs_modulus == pytest.approx(MODULUS, rel=0.1)
 
 
-def test_refinement_knows_no_sessions():
+def test_parameters_of_sessions_need_sessions():
     tentacle = ["experiment=tentacle", "mesh.layers=4", "mesh.nodes=20"]
-    with pytest.raises(InputError, match=r"refinement knows one placement .* set refinement=none"):
-        check(composed(*tentacle, "data.folder=recordings", "refinement=solver_in_the_loop"))
     with pytest.raises(InputError, match=r"per is session, but no trial names one: set data\.trials\.NAME\.session"):
         check(
             composed(

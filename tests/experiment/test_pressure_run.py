@@ -236,7 +236,7 @@ def recorded(tmp_path, finished, change):
         (["simulation.youngs_modulus=264"], "is its unit millimetres"),
         (["+identify.parameters.stiffness={lower:0.0,upper:1.0}"], "identify.parameters names 'stiffness'"),
         (["+identify.parameters.attached_mass_factor={lower:0.5,upper:2.0}"], "'attached_mass_factor'"),
-        (["refinement=solver_in_the_loop", "refinement.window=12"], "it must be less than the data's 12 steps"),
+        (["+in_the_loop=windows", "in_the_loop.window=0"], "in_the_loop.window"),
         (["tune", "tune.model=sysid"], "tune.model"),
         (["data.train=-1"], "data.train"),
         (["data.folds=leave_one_out", "data.input_scales=[1.5]"], "data.input_scales"),
@@ -338,7 +338,7 @@ def test_the_configurations_of_every_experiment_with_pressures_are_accepted(tmp_
 @pytest.mark.parametrize(
     "overrides",
     [
-        ["refinement=solver_in_the_loop"],
+        ["+in_the_loop=windows"],
         ["+identify.first_guess.pressure_rise=0.04"],
         ["parallel.batch=null"],
         ["range_guard=false", "timing=true"],

@@ -114,11 +114,6 @@ def test_every_option_goes_with_recordings(group, option):
     check_run(settings("experiment=beam_real", f"{group}={option}", *more))
 
 
-@pytest.mark.parametrize("experiment", ["beam_real", "beam_synthetic", "beam_real_repeated"])
-def test_refinement_goes_with_recordings(experiment):
-    check_run(settings(f"experiment={experiment}", "refinement=solver_in_the_loop", "data.folder=recordings"))
-
-
 def test_a_trial_without_a_payload_carries_none(tmp_path):
     config = composed("experiment=beam_real", f"data.folder={tmp_path}", "data.rest=file", "release.sideways=0")
     config["data"]["trials"] = {"a": "a.c3d", "b": {"file": "b.c3d", "payload": 0.1, "begins": "released"}}

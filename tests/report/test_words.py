@@ -337,7 +337,8 @@ def test_trials_out_of_range_are_counted_where_they_belong():
 def test_it_is_said_whose_network_it_is(options, said):
     note = network_note(settings(*options))
     assert all(words in note for words in said)
-    assert network_note(settings(*options, "refinement=solver_in_the_loop")).startswith(note)
+    more = network_note(settings(*options, "+in_the_loop=windows"))
+    assert more == f"{note} Then trained through the simulator, on windows of 10 steps."
 
 
 def test_it_is_said_which_weights_were_taken():
@@ -346,9 +347,6 @@ def test_it_is_said_which_weights_were_taken():
     first = kept_note({"resphys": kept})
     assert "epoch 30, by roll-out error; its mean roll-out error on the validation split is 0.250 mm" in first
     assert "epoch 9, by validation loss; its roll-outs of the validation split diverge" in kept_note({"resphys": lost})
-    worse, better = {**kept, "epoch": 0}, {**kept, "epoch": 4, "validation_rollout_error_mm": 0.125}
-    assert "No epoch of the refinement was better" in kept_note({"resphys": kept, "resphys_refined": worse})
-    assert "epoch 4 of the refinement" in kept_note({"resphys": kept, "resphys_refined": better})
     assert kept_note({}) == ""
 
 

@@ -12,8 +12,6 @@ from warp_resphys import cli, pipeline
 
 REPOSITORY = Path(__file__).parents[2]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
-REFINED = [*STAGES[:3], "refine_resphys", *STAGES[3:]]
-REFINE = ["refinement=solver_in_the_loop", "refinement.window=4", "refinement.epochs=3"]
 LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
@@ -89,5 +87,5 @@ def ran(before):
     """Stages whose record has changed."""
     now = files()
     return [
-        s for s in REFINED if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")
+        s for s in STAGES if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")
     ]

@@ -31,7 +31,7 @@ def bending(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
     return positions
 
 
-def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps=STEPS, begins="given", refined=False):
+def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps=STEPS, begins="given"):
     """Writes every file that the report reads."""
     vertices = build_mesh(config.mesh).vertices
     names, test = list(TRIALS), list(TRIALS)[1:]
@@ -56,8 +56,6 @@ def write_run(folder: Path, config, *, models=tuple(PERIODS), diverged=(), steps
     write_errors(folder, test, runs, target[1:])
     for model in {"simfree", "resphys"} & set(models):
         write_history(folder / f"training_{model}.json", range(1, 30), 30)
-    if refined:
-        write_history(folder / "refinement_resphys.json", range(4), 3)
     seconds = {name: {"mean": 0.421, "std": 0.1} for name in ("simulation", "target", "resphys", "inference")}
     write_json(folder / "times.json", {"steps": steps, "seconds": seconds})
     for name, duration in {"acquire": 12.0, "train": 75.4}.items():

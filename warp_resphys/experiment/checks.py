@@ -218,10 +218,6 @@ def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
     tables = [run.recorded.trials] if run.recorded is not None else []
     tables += [run.laboratory.trials] if run.laboratory is not None else []
     named = any(trial.session for table in tables for trial in table.values())
-    if named and run.refinement is not None and identify.placement is not None:
-        raise InputError(
-            "refinement knows one placement of the markers, and trials name sessions: set refinement=none."
-        )
     placement, markers = identify.placement, run.markers
     if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
         raise InputError(

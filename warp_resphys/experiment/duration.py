@@ -31,7 +31,6 @@ from ..settings.stages import (
     LearningStage,
     MeshCheckStage,
     ReconstructStage,
-    RefineStage,
     ReportStage,
     TimeStage,
     TrainStage,
@@ -94,7 +93,7 @@ class ExpectedDuration:
 
 
 def may_be_long(stages: Sequence[Stage], folder: Path) -> bool:
-    """Whether stages may take over a minute: those that identify or refine, or reconstruct many steps.
+    """Whether stages may take over a minute: those that identify, or reconstruct many steps.
 
     Args:
         stages: of one split.
@@ -103,7 +102,7 @@ def may_be_long(stages: Sequence[Stage], folder: Path) -> bool:
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
     work = 0.0
     for settings in (stage.settings for stage in stages):
-        if isinstance(settings, IdentifyStage | RefineStage):
+        if isinstance(settings, IdentifyStage):
             return True
         if isinstance(settings, ReconstructStage):
             experiment, names = Experiment(settings, folder, "count"), settings.reconstructed
@@ -189,9 +188,6 @@ class _Pace:
                 return self._each(settings.model, settings.reconstructed, self._reconstructed_step)
             case TrainStage() as settings:
                 return self._train(settings)
-            case RefineStage() as settings:
-                evaluations = _ITERATIONS * settings.refinement.epochs
-                return evaluations * self._each(settings.model, settings.split.train, self._step_and_adjoint)
             case EvaluateStage() as settings:
                 return self._evaluate(settings)
             case TimeStage() as settings:
@@ -257,11 +253,15 @@ class _Pace:
         if loop is not None and model != SIMFREE:
             epoch = _ITERATIONS * self._each(model, split.train, self._step_and_adjoint)
             epoch += self._each(model, judged, self._step)
-            held_out = loop.hold_out and not split.validation and len(split.train) > 1
-            return loop.epochs * epoch * (len(split.train) if held_out else 1.0)
+            held_out = loop.start == "zero" and loop.hold_out and not split.validation and len(split.train) > 1
+            in_the_loop = loop.epochs * epoch * (len(split.train) if held_out else 1.0)
+            if loop.start == "zero":
+                return in_the_loop
+        else:
+            in_the_loop = 0.0
         trainer, rollouts = training.trainer, training.trainer.epochs / training.trainer.rollout_every
         rolled = 0.0 if model == SIMFREE else self._each(model, judged, self._step)
-        return trainer.epochs * self._epoch(settings) + rollouts * rolled
+        return in_the_loop + trainer.epochs * self._epoch(settings) + rollouts * rolled
 
     def _epoch(self, settings: TrainStage) -> float:
         """Duration of an epoch of a network on the steps of the training trials [s]."""

@@ -65,14 +65,14 @@ def reconstruction_file(model: str) -> str:
     return f"reconstruction_{model}.h5"
 
 
-def weights_file(model: str, refined: bool = False) -> str:
+def weights_file(model: str) -> str:
     """File of a model's trained weights."""
-    return f"{model}_refined.safetensors" if refined else f"{model}.safetensors"
+    return f"{model}.safetensors"
 
 
-def training_file(model: str, refined: bool = False) -> str:
-    """File of a model's training history, or of its refinement through the simulator."""
-    return f"refinement_{model}.json" if refined else f"training_{model}.json"
+def training_file(model: str) -> str:
+    """File of a model's training history."""
+    return f"training_{model}.json"
 
 
 def fold_folder(trial: str) -> str:

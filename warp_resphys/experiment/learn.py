@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,19 +15,17 @@ from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
 from ..io.stages import StageContext
-from ..learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
 from ..learning.predictors import Range
-from ..learning.refinement import RefinementBatch, SolverInTheLoop, WindowLoss
-from ..learning.replay import Replay
+from ..learning.replay import Replay, Windows
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
-from ..settings.stages import NetworkStage, RefineStage, TrainStage
+from ..settings.stages import NetworkStage, TrainStage
 from .build import choose_device
 from .experiment import LAW, Experiment
 from .files import DATASET, STATIC, reconstruction_file, training_file, weights_file
-from .models import SIMFREE, Learned, kind_of, load, rollout_error
-from .reconstruct import reconstructing_simulator
+from .models import SIMFREE, Learned, kind_of, rollout_error
 
 log = logging.getLogger(__name__)
 _CHECKPOINT_SECONDS = 10.0
@@ -139,9 +136,7 @@ class Learning:
         train = samples_of(self.experiment, self.model, split.train, device)
         if settings.in_the_loop is not None:
             return _in_the_loop(self.experiment, self.model, train, settings, settings.in_the_loop)
-        judged = split.validation or split.train
-        validation = samples_of(self.experiment, self.model, judged, device) if split.validation else train
-        return _supervised(self.experiment, self.model, train, validation, judged, settings)
+        return _supervised(self.experiment, self.model, train, settings)
 
 
 @dataclass(frozen=True)
@@ -180,15 +175,11 @@ def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSetting
     return network.changed(**dict.fromkeys(many, poses))
 
 
-def _supervised(
-    experiment: Experiment,
-    model: str,
-    train: Samples,
-    validation: Samples,
-    judged: Sequence[str],
-    settings: TrainingSettings,
-) -> Prepared:
-    """Prepares training on single steps, with validation by roll-outs."""
+def _supervised(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> Prepared:
+    """Prepares training on single steps, validated by roll-outs; without validation trials, of the training trials."""
+    split = experiment.settings.split
+    judged = split.validation or split.train
+    validation = samples_of(experiment, model, judged, train.q.device) if split.validation else train
     network = new_network(experiment, model, train, settings)
     learned = Learned(network, _range_of(experiment, model, network, train), experiment.settings.force_frame)
     error = rollout_error(dataclasses.replace(experiment, on_failure="count"), model, judged)
@@ -216,17 +207,18 @@ def _range_of(experiment: Experiment, model: str, network: StateMap, train: Samp
 def _in_the_loop(
     experiment: Experiment, model: str, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings
 ) -> Prepared:
-    """Prepares training on whole trials through the simulator.
+    """Prepares training through the simulator, on whole trials or on windows; weights are chosen on whole trials.
 
-    The reconstruction provides the modes of motions and forces. Without validation trials, the number of epochs is
-    found by cross-validation, holding out each training trial once; it may be zero.
+    The reconstruction provides the modes of motions and forces, the states at which windows begin, and the force to
+    begin with if it is not zero. From zero and without validation trials, the number of epochs is found by
+    cross-validation, holding out each training trial once; it may be zero.
     """
     split = experiment.settings.split
     parameters, simulator = experiment.parameters(model), experiment.model_simulator(model)
     replays = experiment.replays(simulator, split.train + split.validation, model)
     frames = experiment.frames(simulator)
 
-    def loss(names: Sequence[str]) -> MotionLoss:
+    def loss(names: Sequence[str], window: int | None = None) -> MotionLoss:
         watched = []
         for replay, start in replays:
             batch = replay.trials.names
@@ -235,7 +227,8 @@ def _in_the_loop(
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
                 inputs = experiment.conditions(part, parameters)
                 base = experiment.base(part.trials.names, simulator)
-                watched.append(TrialGroup(part, start.select(rows), inputs, frames, base))
+                windows = None if window is None else _windows(experiment, model, part, window)
+                watched.append(TrialGroup(part, start.select(rows), inputs, frames, base, windows))
         return MotionLoss(watched, parameters)
 
     def make_network() -> ResidualForce:
@@ -243,17 +236,42 @@ def _in_the_loop(
         assert isinstance(network, ResidualForce)
         return network.double()
 
-    epochs, train, validation = None, split.train, split.validation
-    if loop.hold_out and not validation and len(train) > 1:
-        parts = [(loss([name for name in train if name != out]), loss([out])) for out in train]
+    epochs, after, train, validation = None, 0, split.train, split.validation
+    if loop.start == "steps":
+        network, after = _trained_on_steps(experiment, model, samples, settings)
+    elif loop.hold_out and not validation and len(train) > 1:
+        parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
             epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
         log.info("%s: %d epochs are best for held-out trials", model, epochs)
-    judged = loss(validation) if validation else None
-    trainer = MarkersInTheLoop(make_network(), loss(train), judged, loop, epochs)
+        network = make_network()
+    else:
+        network = make_network()
+    trainer = InTheLoop(network, loss(train, loop.window), loss(validation or train), loop, epochs, after)
     trainer.begin()
     range_ = _range_of(experiment, model, trainer.model, samples)
     return Prepared(trainer, Learned(trainer.model, range_, experiment.settings.force_frame))
+
+
+def _trained_on_steps(
+    experiment: Experiment, model: str, samples: Samples, settings: TrainingSettings
+) -> tuple[ResidualForce, int]:
+    """Returns a residual force that was trained on reconstructed steps, and the epoch of its weights."""
+    trainer = _supervised(experiment, model, samples, settings).trainer
+    run_epochs(f"{model}: steps", trainer, lambda _: None)
+    network = trainer.use_best()
+    assert isinstance(network, ResidualForce)
+    return network.double().train(), trainer.state.best_epoch
+
+
+def _windows(experiment: Experiment, model: str, replay: Replay, steps: int) -> Windows:
+    """The known or reconstructed states of the trials of a replay."""
+    like = replay.simulator.rest_positions
+    if experiment.dataset.velocity is None:
+        q, v, *_ = _reconstructed(experiment, model, replay.trials.names, like.device)
+    else:
+        q, v, *_ = _simulated(experiment, replay.trials.names, like.device)
+    return Windows(q.to(like), v.to(like), steps)
 
 
 def takes_long(context: StageContext) -> bool:
@@ -272,59 +290,13 @@ def train(context: StageContext) -> None:
     fit(context, settings.model, learning.trainer(settings.training))
 
 
-def refine(context: StageContext) -> None:
-    """Refines a residual force through the simulator; writes <model>_refined.safetensors, refinement_<model>.json."""
-    settings: RefineStage = context.settings
-    model, experiment = settings.model, Experiment(settings, context.run_dir, "count")
-    simulator = experiment.model_simulator(model)
-    learned = load(context.run_dir, model, choose_device(settings.device))
-    network, refinement = learned.network, settings.refinement
-    assert isinstance(network, ResidualForce)
-    judged = settings.split.validation or settings.split.train
-    train_on, validate_on = (_motions(experiment, model, names) for names in (settings.split.train, judged))
-    error = rollout_error(experiment, model, judged)
-    loss = WindowLoss(
-        network,
-        partial(dataclasses.replace, simulator),  # A copy with a fresh solver.
-        refinement.window,
-        refinement.batch_size,
-        observe=experiment.observe_by(model),
-        parameters=experiment.parameters(model),
-        frames=experiment.frames(simulator, learned.force_frame),
-        range_=learned.range_,
-    )
-    trainer = SolverInTheLoop(network, loss, train_on, validate_on, lambda _: error(learned), refinement)
-    fit(context, model, Prepared(trainer, learned), refined=True)
-    left_out = trainer.state.history[0]["left_out"]
-    if left_out:
-        log.warning("%s: %d windows could not be simulated and were left out", context.name, left_out)
-
-
-def _motions(experiment: Experiment, model: str, names: Sequence[str]) -> list[RefinementBatch]:
-    """Start states and targets of training windows, one batch for trials that begin in the same way."""
-    motions = []
-    simulator = reconstructing_simulator(experiment, model)
-    for replay, start in experiment.replays(simulator, experiment.moving(names), model):
-        batch, target = replay.trials.names, experiment.targets(replay, start)
-        device = simulator.rest_positions.device
-        if experiment.dataset.velocity is not None:
-            q, v, *_ = _simulated(experiment, batch, device)
-        else:
-            q, v, *_ = _reconstructed(experiment, model, batch, device)
-        q, v = (field[:, : target.shape[1]].to(simulator.rest_positions) for field in (q, v))
-        inputs = experiment.conditions(replay, experiment.parameters(model))
-        motions.append(RefinementBatch(q, v, target, replay.trials, inputs, experiment.base(batch, simulator)))
-    return motions
-
-
-def fit(context: StageContext, model: str, prepared: Prepared, refined: bool = False) -> None:
+def fit(context: StageContext, model: str, prepared: Prepared) -> None:
     """Trains, resuming an interrupted run, and writes the selected weights and the history.
 
     Args:
         context: context of the stage.
         model: name of the model.
         prepared: the trainer with its model.
-        refined: whether this is the refinement of a trained model.
     """
     trainer = prepared.trainer
     checkpoint = context.run_dir / f"{context.name}.safetensors"
@@ -343,9 +315,9 @@ def fit(context: StageContext, model: str, prepared: Prepared, refined: bool = F
     }
     if kept["validation_rollout_error_mm"] is None:
         log.warning("%s: the selected weights diverge on the validation split", context.name)
-    write_json(context.run_dir / training_file(model, refined), {"kept": kept, "epochs": trainer.state.history})
+    write_json(context.run_dir / training_file(model), {"kept": kept, "epochs": trainer.state.history})
     write_checkpoint(
-        context.run_dir / weights_file(model, refined),
+        context.run_dir / weights_file(model),
         kind_of(model)[1],
         best.state_dict(),
         {**best.description(), **prepared.learned.description(), **kept, "fingerprint": context.fingerprint},

@@ -63,20 +63,19 @@ class Learned:
         return {"range": range_, "force_frame": self.force_frame}
 
 
-def load(folder: Path, model: str, device: torch.device, refined: bool = False) -> Learned:
+def load(folder: Path, model: str, device: torch.device) -> Learned:
     """Loads a trained model of `LEARNED` from its checkpoint.
 
     Args:
         folder: folder of the split.
         model: name of the model.
         device: device of the network.
-        refined: whether to load the weights that were refined through the simulator.
 
     Raises:
         DataFileError: the file is missing or damaged.
     """
     network_type, kind = kind_of(model)
-    tensors, description = read_checkpoint(folder / weights_file(model, refined), kind)
+    tensors, description = read_checkpoint(folder / weights_file(model), kind)
     network, limits = restore(network_type, tensors, description).to(device), description["range"]
     range_ = None if limits is None else Range.restore(limits, network.linear)
     return Learned(network, range_, str(description["force_frame"]))
@@ -268,5 +267,4 @@ def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> C
 def learned_of(experiment: Experiment, model: str) -> Learned | None:
     """Trained network of a model in this run; None for models without a network."""
     assert isinstance(experiment.settings, TestStage)
-    refined = model != SIMFREE and experiment.settings.refined
-    return load(experiment.folder, model, experiment.like.device, refined) if model in LEARNED else None
+    return load(experiment.folder, model, experiment.like.device) if model in LEARNED else None

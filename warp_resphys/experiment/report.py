@@ -86,7 +86,8 @@ def make_report(context: StageContext) -> None:
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
-    learned = "resphys" in metrics["errors_mm"] and run.in_the_loop is None
+    on_steps = run.in_the_loop is None or run.in_the_loop.start == "steps"
+    learned = "resphys" in metrics["errors_mm"] and on_steps
     assert run.tip is not None
     no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
@@ -106,8 +107,7 @@ def make_report(context: StageContext) -> None:
         **(read_stretches(folder, mesh, trials, film) if law else {}),
         start=data_sheet(run, identification),
         truth={**truth.get("material", {}), **true_contact(run)},
-        training=_histories(folder, False),
-        refinement=_histories(folder, True),
+        training=_histories(folder),
         network_note=network_note(run, on_law=bool(law.get("accepted"))) if learned else "",
         kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
@@ -154,9 +154,9 @@ def common_folder(folder: Path) -> Path:
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
-def _histories(folder: Path, refined: bool) -> dict[str, Any]:
-    """Training histories, or refinement histories, by model."""
-    files = {model: folder / training_file(model, refined) for model in LEARNED}
+def _histories(folder: Path) -> dict[str, Any]:
+    """Training histories by model."""
+    files = {model: folder / training_file(model) for model in LEARNED}
     return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
 
 
@@ -170,11 +170,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
         stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
-    files = {
-        f"{model}_refined" if refined else model: folder / training_file(model, refined)
-        for model in LEARNED
-        for refined in (False, True)
-    }
+    files = {model: folder / training_file(model) for model in LEARNED}
     identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     if law:

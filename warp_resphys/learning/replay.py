@@ -83,6 +83,31 @@ class Start:
         return markers if self.shift is None else markers - self.shift[:, None]
 
 
+@dataclass(frozen=True)
+class Windows:
+    """Known states of R trials, from which a simulation begins anew every few steps.
+
+    Where a state is unknown (NaN), the trial goes on from the simulated one. So does the memory of the energies, whose
+    gradient ends there, too.
+    """
+
+    q: torch.Tensor  # (R, K + 1, N, 3) positions at the steps [m]
+    v: torch.Tensor  # (R, K + 1, N, 3) velocities [m/s]
+    steps: int  # of a window
+
+    def begin(self, state: State, step: int) -> State:
+        """Returns the state at the beginning of a step: the known one in the first step of a window."""
+        if step == 0 or step % self.steps or step >= self.q.shape[1]:
+            return state
+        state, known = state.detach(), torch.isfinite(self.q[:, step]).flatten(1).all(1)[:, None, None]
+
+        def pair(at: int, q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return torch.where(known, self.q[:, at], q), torch.where(known, self.v[:, at], v)
+
+        previous = None if state.previous is None else pair(step - 1, *state.previous)
+        return State(*pair(step, state.q, state.v), previous, state.memory)
+
+
 class Replay:
     """Simulates observed trials.
 
@@ -205,7 +230,11 @@ class Replay:
         return round(last) if _on_steps(times, self.simulator.time_step) else max(math.ceil(last - 1e-6) + 1, 2)
 
     def __call__(
-        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
+        self,
+        start: Start,
+        parameters: Parameters | None = None,
+        force: StepForce | None = None,
+        windows: Windows | None = None,
     ) -> torch.Tensor:
         """(E, R, T, M, 3) simulated points at the times of the frames [m]; before its release a body stands still.
 
@@ -213,20 +242,27 @@ class Replay:
             start: of the R trials.
             parameters: (E,) values, by any of `parameter_names`; E = 1 if left out.
             force: (B, N, 3) added force [N] of the state and the number of the step.
+            windows: known states to begin anew at, with one set of parameters; None for none.
 
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        return self.at_frames(self.series(start, parameters, force), start).unflatten(0, (_count(parameters), -1))
+        series = self.series(start, parameters, force, windows)
+        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
 
     def series(
-        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
+        self,
+        start: Start,
+        parameters: Parameters | None = None,
+        force: StepForce | None = None,
+        windows: Windows | None = None,
     ) -> torch.Tensor:
         """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
         constants, inputs, resting = self.prepare(parameters)
         state = self.initial_state(start, constants, resting, _count(parameters), force)
         series = [self.observe(state.q)]
         for k in range(self.steps(start)):
+            state = state if windows is None else windows.begin(state, k)
             added = None if force is None else force(state, k)
             state, _ = self.simulator.step(state, inputs.at(k).plus(added), constants)
             series.append(self.observe(state.q))

@@ -28,7 +28,6 @@ _BASES: Final = {"simulation": "the uncorrected simulation", "sysid": "SysID", "
 _GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # Keys of the ranges in the group `identify`.
 _LEARNED: Final = ("simfree", "resphys")  # With published gains; the published identification has other parameters.
 _CLOSE: Final = 1e-4  # Distance from a bound or the first guess that counts as none, over a parameter's range.
-_REFINED: Final = "_refined"  # Suffix of a network refined through the simulator.
 INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
 _CALIBRATED: Final[Mapping[str, str]] = {  # Source of prediction intervals.
     "validation": "its errors on the validation trials",
@@ -174,14 +173,11 @@ def _by_amplitude(shares: Sequence[float | None]) -> str:
 
 
 def epochs_kept(metrics: Mapping[str, Any]) -> dict[str, list[int]]:
-    """Return the number of epochs of training and refinement of the kept weights, by model and fold."""
+    """Return the number of epochs of training of the kept weights, by model and fold."""
     folds = list(metrics.get("folds", {}).values()) or [metrics]
     networks: list[Mapping[str, Any]] = [fold.get("networks", {}) for fold in folds]
-    models = dict.fromkeys(model for fold in networks for model in fold if not model.endswith(_REFINED))
-    return {
-        model: [n[model]["epoch"] + n.get(f"{model}{_REFINED}", {}).get("epoch", 0) for n in networks if model in n]
-        for model in models
-    }
+    models = dict.fromkeys(model for fold in networks for model in fold)
+    return {model: [n[model]["epoch"] for n in networks if model in n] for model in models}
 
 
 def untrained(epochs: Mapping[str, Sequence[int]]) -> set[str]:

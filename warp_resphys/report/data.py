@@ -162,7 +162,6 @@ class RunReport:
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
     truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
-    refinement: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
     published_note: str = ""  # How the published errors differ from those of this run.
     notes: Sequence[str] = ()  # Sentences on the errors.
     network_note: str = ""  # Network of ResPhys and its training.

@@ -130,8 +130,9 @@ def network_note(settings: RunSettings, on_law: bool = False) -> str:
         f"ResPhys: {who}, in {basis}, {core}{linear}; trained "
         f"{how}, {trainer.epochs} epochs, weights chosen by {_SELECTED_BY[trainer.selection]}."
     )
-    if settings.refinement is not None:
-        text += f" Then refined through the simulator, over windows of {settings.refinement.window} steps."
+    if (loop := settings.in_the_loop) is not None:
+        over = "whole trials" if loop.window is None else f"windows of {loop.window} steps"
+        text += f" Then trained through the simulator, on {over}."
     if on_law:
         text += " It corrects the simulator with the identified law, and fades out outside its training range."
     return text
@@ -139,15 +140,10 @@ def network_note(settings: RunSettings, on_law: bool = False) -> str:
 
 def kept_note(networks: Mapping[str, Any]) -> str:
     """Return which weights of the residual force were kept, and their validation error; empty without any."""
-    kept, refined = networks.get("resphys"), networks.get("resphys_refined")
+    kept = networks.get("resphys")
     if kept is None:
         return ""
-    text = f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
-    if refined is None:
-        return text
-    if refined["epoch"] == 0:
-        return f"{text} No epoch of the refinement was better: the weights are those from before it."
-    return f"{text} Final weights: epoch {refined['epoch']} of the refinement; {_validated(refined)}."
+    return f"Kept: epoch {kept['epoch']}, by {_SELECTED_BY[kept['selection']]}; {_validated(kept)}."
 
 
 def _validated(kept: Mapping[str, Any]) -> str:

@@ -26,12 +26,9 @@ from .page import (
 from .verdict import published_growth
 
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
-_TRAINED: Final = {
-    "training": "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the "
-    "lowest.",
-    "refinement": "Refinement through the simulator: mean squared distance from the target over windows of a few "
-    "steps, in mm². Epoch 0 is the network after the training above.",
-}
+_TRAINED: Final = (
+    "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the lowest."
+)
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
@@ -236,11 +233,9 @@ def training_section(data: RunReport, canvas: Canvas) -> Part | None:
 
     blocks: list[Any] = []
     for model, (name, _) in MODELS.items():
-        for what, records in (("training", data.training.get(model)), ("refinement", data.refinement.get(model))):
-            if records:
-                blocks += [Text(name, heading=True)] if what == "training" else []
-                alt = f"Losses and validation roll-out error of the {what} of {name}, {len(records)} epochs."
-                draw = partial(learning_figures.training_curves, records)
-                blocks.append(canvas.figure(f"{what}_{model}", draw, alt, _TRAINED[what]))
+        if records := data.training.get(model):
+            alt = f"Losses and validation roll-out error of the training of {name}, {len(records)} epochs."
+            draw = partial(learning_figures.training_curves, records)
+            blocks += [Text(name, heading=True), canvas.figure(f"training_{model}", draw, alt, _TRAINED)]
     kept = [Text(data.kept_note, "kept")] if data.kept_note else []
     return Part("Training", [*blocks, *kept]) if blocks else None

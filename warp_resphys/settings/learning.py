@@ -244,32 +244,24 @@ class TrainerSettings(EpochSettings):
     sequence: Natural | None = setting(None, "steps of back-propagation through time, for recurrent networks")
 
 
-class FullBatchSettings(EpochSettings):
-    """L-BFGS through the simulator."""
+class InTheLoopSettings(EpochSettings):
+    """Training of the residual force on whole trials or windows of them, through the simulator, by L-BFGS."""
 
-    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
-
-
-class InTheLoopSettings(FullBatchSettings):
-    """Training of the residual force on whole trials, through the simulator."""
-
+    start: Literal["zero", "steps"] = setting(
+        "zero", "force from which it begins: none, or one that was trained on reconstructed steps by the group trainer"
+    )
+    window: Natural | None = setting(
+        None, "steps after which the simulation begins anew at the known or reconstructed state; null: whole trials"
+    )
     epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
     rollout_every: Natural = setting(1, "epochs between measurements of the error by which the weights are chosen")
     hold_out: bool = setting(
-        True, "without validation trials, choose the number of epochs by holding out each training trial once"
+        True,
+        "from zero, without validation trials, choose the number of epochs by holding out each training trial once",
     )
     patience: Natural = setting(3, "epochs without improvement on held-out trials, after which training ends")
     penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
-
-
-class RefinementSettings(FullBatchSettings):
-    """Further training of the residual force through the simulator, over windows."""
-
-    kind: Literal["solver_in_the_loop"] = setting("solver_in_the_loop", "kind of refinement")
-    epochs: Natural = setting(12, "iterations of L-BFGS")
-    rollout_every: Natural = setting(1, "epochs between roll-outs of the validation split, by which weights are chosen")
-    window: Natural = setting(10, "steps that the simulator takes from each start on the target trajectory")
-    batch_size: Natural = setting(32, "windows that are simulated at once")
+    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
 
 
 class TrainingSettings(Settings):
@@ -282,7 +274,8 @@ class TrainingSettings(Settings):
 
     @model_validator(mode="after")
     def _sequences(self) -> Self:
-        if self.network.recurrent is not None and self.in_the_loop is None and self.trainer.sequence is None:
+        on_steps = self.in_the_loop is None or self.in_the_loop.start == "steps"
+        if self.network.recurrent is not None and on_steps and self.trainer.sequence is None:
             raise ValueError("trainer.sequence is missing: a recurrent network needs it; trainer=sequences has one.")
         return self
 

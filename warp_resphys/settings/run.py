@@ -22,7 +22,6 @@ from .learning import (
     LawSettings,
     NetworkSettings,
     ReconstructionSettings,
-    RefinementSettings,
     ReleaseSettings,
     TrainerSettings,
     TrainingSettings,
@@ -117,7 +116,6 @@ class RunSettings(SimulatorSettings):
     in_the_loop: InTheLoopSettings | None = setting(
         None, "training of the force on whole trials through the simulator; null: on reconstructed steps"
     )
-    refinement: RefinementSettings | None = setting(None, "further training through the simulator; null: none")
     actuation: ActuationSettings = ActuationSettings()
     release: ReleaseSettings = ReleaseSettings()
     control: ControlSettings | None = setting(None, "paths that the robot follows; null: none")
@@ -315,23 +313,6 @@ class RunSettings(SimulatorSettings):
     def _training(self) -> Self:
         for model in ("resphys", "simfree"):
             self.training(model)
-        refinement = self.refinement
-        if refinement is None:
-            return self
-        if self.payload_string is not None:
-            raise ValueError(
-                "refinement starts anew in every window, where the state of a weight on a string is not known: set "
-                "refinement to none, or payload_string to null."
-            )
-        if self.network.recurrent is not None:
-            raise ValueError(
-                "refinement starts anew in every window, but network.recurrent needs the steps before it: set one of "
-                "them to none, or null."
-            )
-        if self.data.steps is not None and refinement.window >= self.data.steps:
-            raise ValueError(
-                f"refinement.window is {refinement.window}: it must be less than the data's {self.data.steps} steps."
-            )
         return self
 
     @model_validator(mode="after")

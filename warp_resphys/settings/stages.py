@@ -17,7 +17,6 @@ from .learning import (
     IdentifySettings,
     LawSettings,
     ReconstructionSettings,
-    RefinementSettings,
     ReleaseSettings,
     TrainingSettings,
 )
@@ -163,19 +162,10 @@ class TrainStage(NetworkStage):
     training: TrainingSettings
 
 
-class RefineStage(NetworkStage):
-    """Further training of a model through its simulator."""
-
-    model: str
-    refinement: RefinementSettings
-    seed: int
-
-
 class TestStage(NetworkStage):
     """Settings of all stages with roll-outs of models."""
 
     groups: dict[str, Many[str]]  # names of the test trials by scale of the inputs, ``1`` first
-    refined: bool  # whether networks were trained further through the simulator
 
 
 class EvaluateStage(TestStage):

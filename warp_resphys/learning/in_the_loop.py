@@ -1,7 +1,15 @@
-"""A residual force trained on marker motions: the loss is the error of the corrected simulator over whole motions.
+"""Training of a residual force through the simulator: the loss is the error of the corrected simulator over motions.
+
+Its gradient goes back through the implicit adjoint of every step (Um et al. 2020, "Solver-in-the-Loop"), over whole
+motions or over windows of some steps, which begin at known states (`replay.Windows`).
+
+An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by the learning rate,
+however small the gradient, which spoils a network that is nearly right; and where the loss comes from the simulator, a
+line search costs less than tuning a schedule of rates.
 
 Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
-simulator, and a penalty on the weights keeps it there as far as the motions allow.
+simulator, and a penalty on the weights keeps it there as far as the motions allow. A force that was trained on
+reconstructed steps may be the start instead.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,23 +23,26 @@ from typing_extensions import override
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
 from ..settings.learning import InTheLoopSettings
-from .full_batch import FullBatchTrainer
 from .networks import OwnNetwork, ResidualForce
 from .predictors import LearnedPredictor
-from .replay import Replay, Start
+from .replay import Replay, Start, Windows
+from .training import EpochTrainer
 
+_EVALUATIONS = 12  # of the loss, at most, in one epoch
 _FAILURE = 1e4  # loss of a failed simulation, from which the line search steps back
+_LEAST = 1e-30  # of the loss of the first weights, by which others are divided
 
 
 @dataclass(frozen=True)
 class TrialGroup:
-    """Trials that begin alike, with the arguments of `LearnedPredictor` for them."""
+    """Trials that begin alike, with the arguments of `LearnedPredictor` for them, and the windows of the loss."""
 
     replay: Replay
     start: Start
     context: torch.Tensor | None = None
     frames: VertexFrames | None = None
     base: BaseFrame | None = None
+    windows: Windows | None = None
 
 
 class MotionLoss:
@@ -59,7 +70,8 @@ class MotionLoss:
             force: Any = None
             if model is not None:
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
-            markers.append(group.replay(group.start, self._parameters or None, force=force)[0])
+            simulated = group.replay(group.start, self._parameters or None, force=force, windows=group.windows)
+            markers.append(simulated[0])
         return markers
 
     def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
@@ -83,17 +95,19 @@ class MotionLoss:
         return 1e3 * float(torch.cat([d / s for d, s in zip(distances, seen, strict=True)]).mean())
 
 
-class MarkersInTheLoop(FullBatchTrainer):
-    """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS from zero force.
+class InTheLoop(EpochTrainer[ResidualForce]):
+    """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS.
 
-    The last layers have no bias: a constant force would compensate how one trial was held, which does not generalise.
+    From zero force, the last layers have no bias: a constant force would compensate how one trial was held, which does
+    not generalise. From a trained force, the loss is divided by its first value.
 
     Args:
-        model: to train; its last layers and the mean force are set to zero.
+        model: to train; for a start from zero, its last layers and the mean force are set to zero.
         train: loss on the training motions.
-        validation: loss on the validation motions, which selects the weights; the training loss does if None.
-        settings: epochs, and the penalty on the weights.
-        epochs: in place of the configured number; 0 keeps the force at zero.
+        judge: loss whose error selects the weights, those of the start among them.
+        settings: start, epochs, and the penalty on the weights.
+        epochs: in place of the configured number; 0 keeps the start.
+        after: number of epochs that the model has been trained before, from which epochs are counted.
     """
 
     settings: InTheLoopSettings
@@ -102,46 +116,74 @@ class MarkersInTheLoop(FullBatchTrainer):
         self,
         model: ResidualForce,
         train: MotionLoss,
-        validation: MotionLoss | None,
+        judge: MotionLoss,
         settings: InTheLoopSettings,
         epochs: int | None = None,
+        after: int = 0,
     ) -> None:
-        judge = train if validation is None else validation
-        with torch.no_grad():
-            _remove_force(model)
-        super().__init__(
-            model, judge.error_mm, settings if epochs is None else settings.model_copy(update={"epochs": epochs})
-        )
+        if settings.start == "zero":
+            with torch.no_grad():
+                _remove_force(model)
         self._train = train
+        self._weights = [w for w in model.network.parameters() if w.requires_grad]
+        self._lbfgs = torch.optim.LBFGS(
+            self._weights,
+            max_iter=1,
+            max_eval=_EVALUATIONS,
+            history_size=settings.memory,
+            line_search_fn="strong_wolfe",
+            tolerance_grad=0.0,
+            tolerance_change=0.0,
+        )
+        last = after + (settings.epochs if epochs is None else epochs)
+        super().__init__(model, self._lbfgs, judge.error_mm, settings.model_copy(update={"epochs": last}))
+        self.state.epoch = after
+        self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     def begin(self) -> None:
-        """Records zero force as the first candidate, unless training has begun."""
+        """Records the start as the first candidate, unless training has begun."""
         if not self.state.history:
             error = self.rollout_error(self.model)
-            self._keep({"epoch": 0.0, "train_loss": self._loss_without_gradient(), "rollout_error_mm": error})
+            with torch.no_grad():
+                loss = float(self._loss())
+            self._keep({"epoch": float(self.state.epoch), "train_loss": loss, "rollout_error_mm": error})
 
     @override
     def _run_epoch(self) -> dict[str, float]:
+        """Makes one iteration."""
         self.begin()
-        return {"train_loss": self._iterate()}
+        self._lbfgs.step(self._evaluate)
+        return {"train_loss": float(self._evaluate()) * self._unit}
 
-    def _loss_without_gradient(self) -> float:
-        with torch.no_grad():
-            return float(self._train(self.model) + self._penalty())
+    @property
+    def _unit(self) -> float:
+        """Loss by which that of the optimiser is divided."""
+        return 1.0 if self.settings.start == "zero" else max(self.state.history[0]["train_loss"], _LEAST)
 
-    def _penalty(self) -> torch.Tensor:
+    def _loss(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]
-        return self.settings.penalty * torch.stack(squares).sum()
+        return self._train(self.model) + self.settings.penalty * torch.stack(squares).sum()
+
+    def _evaluate(self) -> torch.Tensor:
+        """Returns the loss and sets its gradient; cached, as L-BFGS evaluates the weights that it accepts twice."""
+        if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
+            self._lbfgs.zero_grad()
+            try:
+                loss = self._loss() / self._unit
+                loss.backward()
+            except ConvergenceError:
+                self._lbfgs.zero_grad()
+                loss = torch.tensor(_FAILURE, dtype=torch.float64)
+            gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
+            self._last = [w.detach().clone() for w in self._weights], gradients, loss.detach()
+        for weight, gradient in zip(self._weights, self._last[1], strict=True):
+            weight.grad = gradient.clone()
+        return self._last[2]
 
     @override
-    def _backward(self) -> float:
-        try:
-            loss = self._train(self.model) + self._penalty()
-            loss.backward()
-        except ConvergenceError:
-            self._lbfgs.zero_grad()
-            return _FAILURE
-        return float(loss.detach())
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        super().resume(tensors, metadata)
+        self._last = None
 
 
 def cross_validated_epochs(
@@ -163,7 +205,7 @@ def cross_validated_epochs(
         The number of epochs; 0 where training never improves on zero force.
     """
     settings = settings.changed(rollout_every=1)
-    trainers = [MarkersInTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
+    trainers = [InTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
     for trainer in trainers:
         trainer.begin()
     while True:

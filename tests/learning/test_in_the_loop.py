@@ -1,19 +1,23 @@
 """Learning from markers: observations at the steps, errors of roll-outs, and training through the simulator."""
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
+from warp_resphys.data.observation import WHOLE_STATE
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.markers_in_the_loop import MarkersInTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay, Start, Windows
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
@@ -23,6 +27,7 @@ TIP = select_vertices(MESH, x=0.1)
 POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024]])
 MARKERS = bind_markers(MESH, POINTS, ["a", "b"], kind="rigid", vertices=TIP)
 STEP = 0.01
+MATERIAL = Corotated(264e3, 0.45)
 LOADS = torch.tensor([[0.0], [0.05]], dtype=torch.float64)
 NETWORK = {
     "kind": "reduced",
@@ -162,12 +167,12 @@ def finish(trainer):
     return trainer
 
 
-class TestMarkersInTheLoop:
+class TestInTheLoop:
     @pytest.mark.parametrize("changes", [{}, {"layers": 1, "blocks": 2}, {"kind": "nodal"}])
     def test_training_starts_at_zero_force(self, loss, changes):
         model = network(**changes)
         assert float(loss(model).detach()) != pytest.approx(float(loss(None)), rel=1e-6)
-        trainer = MarkersInTheLoop(model, loss, None, CONFIG.changed(epochs=1))
+        trainer = InTheLoop(model, loss, loss, CONFIG.changed(epochs=1))
         rest = simulator().rest_state(2)
         assert not model(rest.q, rest.v + 1.0, LOADS).any()
         trainer.run_epoch()
@@ -198,7 +203,7 @@ class TestMarkersInTheLoop:
         assert checked >= 4
 
     def test_it_descends_and_keeps_the_best_weights(self, loss):
-        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG.changed(epochs=12)))
+        trainer = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=12)))
         losses = [record["train_loss"] for record in trainer.state.history]
         assert losses == sorted(losses, reverse=True)
         assert losses[-1] < 0.5 * losses[0]  # the way there hangs on rounding, from four epochs (0.53) to eight (0.42)
@@ -206,12 +211,12 @@ class TestMarkersInTheLoop:
         assert loss.error_mm(trainer.use_best()) == pytest.approx(min(errors), rel=1e-9)
 
     def test_it_goes_on_bit_for_bit(self, loss, tmp_path):
-        whole = finish(MarkersInTheLoop(network(), loss, loss, CONFIG))
-        part = MarkersInTheLoop(network(), loss, loss, CONFIG)
+        whole = finish(InTheLoop(network(), loss, loss, CONFIG))
+        part = InTheLoop(network(), loss, loss, CONFIG)
         for _ in range(2):
             part.run_epoch()
         write_checkpoint(tmp_path / "part.safetensors", "training", *part.snapshot())
-        again = MarkersInTheLoop(network(seed=1), loss, loss, CONFIG)
+        again = InTheLoop(network(seed=1), loss, loss, CONFIG)
         again.resume(*read_checkpoint(tmp_path / "part.safetensors", "training"))
         finish(again)
         assert again.state.history == whole.state.history
@@ -229,7 +234,7 @@ class TestMarkersInTheLoop:
             return call(self, model)
 
         monkeypatch.setattr(MotionLoss, "__call__", fragile)
-        trainer = finish(MarkersInTheLoop(network(), loss, loss, CONFIG.changed(epochs=2)))
+        trainer = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=2)))
         losses = [record["train_loss"] for record in trainer.state.history]
         assert losses[2] < losses[0]
         assert all(torch.isfinite(w).all() for w in trainer.model.network.parameters())
@@ -242,7 +247,7 @@ class TestMarkersInTheLoop:
         assert loss.error_mm(None) == float("inf")
 
     def test_no_constant_force_is_learned(self, loss):
-        model = finish(MarkersInTheLoop(network(), loss, None, CONFIG.changed(epochs=2))).model
+        model = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=2))).model
         rest = simulator().rest_state(2)
         assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
         assert not model(rest.q, rest.v, 0.0 * LOADS).any()
@@ -265,12 +270,12 @@ class TestMarkersInTheLoop:
             assert (chosen, len(seen)) == (0, spent)
         histories = []
         for held_out in (loss, other):
-            alone = finish(MarkersInTheLoop(network(), loss, held_out, config))
+            alone = finish(InTheLoop(network(), loss, held_out, config))
             histories.append([record["rollout_error_mm"] for record in alone.state.history])
         parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
         mean = np.average(histories, axis=0, weights=[2, 1])
         assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)
-        trainer = MarkersInTheLoop(network(), loss, None, config, epochs=0)
+        trainer = InTheLoop(network(), loss, loss, config, epochs=0)
         trainer.begin()
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
@@ -288,3 +293,107 @@ class TestMarkersInTheLoop:
             assert float(apart(force).detach()) == pytest.approx(float(loss(force).detach()), rel=1e-9)
             assert apart.error_mm(force) == pytest.approx(loss.error_mm(force), rel=1e-9)
         assert [len(markers) for markers in apart.markers(None)] == [1, 1]
+
+    def test_a_trained_force_is_the_first_candidate(self, loss, tmp_path):
+        """Whatever the scale of its loss, which is that of markers at micrometres here."""
+        config = CONFIG.changed(start="steps", penalty=0.0, epochs=3)
+        trained = InTheLoop(network(), loss, loss, CONFIG.changed(epochs=12))
+        model = finish(trained).use_best()
+        before = loss.error_mm(model)
+        whole = finish(InTheLoop(copy.deepcopy(model), loss, loss, config, after=12))
+        history = whole.state.history
+        assert [record["epoch"] for record in history] == [12, 13, 14, 15]
+        assert history[0]["rollout_error_mm"] == pytest.approx(before, rel=1e-12)
+        losses = [record["train_loss"] for record in history]
+        assert losses == sorted(losses, reverse=True)
+        assert losses[-1] < 0.99 * losses[0] == pytest.approx(0.99 * float(loss(model).detach()), rel=1e-9)
+        assert whole.best_error <= before
+
+        part = InTheLoop(copy.deepcopy(model), loss, loss, config, after=12)
+        part.run_epoch()
+        write_checkpoint(tmp_path / "part.safetensors", "training", *part.snapshot())
+        again = InTheLoop(copy.deepcopy(model), loss, loss, config, after=12)
+        again.resume(*read_checkpoint(tmp_path / "part.safetensors", "training"))
+        assert finish(again).state.history == history
+
+
+class TestWindows:
+    WINDOW, STEPS = 3, 7
+
+    def released(self, integrator, material=MATERIAL):
+        """Two trials of the beam under tip loads of which it is released, whose states are known, and their start."""
+        real = Simulator(
+            Body(MESH, select_vertices(MESH, x=0.0)),
+            material,
+            time_step=STEP,
+            integrator=integrator,
+            relative_tolerance=1e-12,
+        )
+        load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
+        load[:, TIP] = torch.tensor([[[0.0, 0.0, -0.02]], [[0.0, 0.01, 0.01]]], dtype=torch.float64)
+        result = real.rollout(real.static_equilibrium(Inputs(load)), self.STEPS)
+        q, v = (field.transpose(0, 1).contiguous() for field in (result.q, result.v))
+        times = (STEP * torch.arange(self.STEPS + 1, dtype=torch.float64)).expand(2, -1)
+        trials = Trials(("a", "b"), times, q, q[:, 0], Inputs())
+        start = Start(State(q[:, 0], v[:, 0]), torch.zeros(2, dtype=torch.float64))
+        return real, trials, start, Windows(q, v, self.WINDOW)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+    def test_windows_of_the_true_motion_are_the_true_motion(self, integrator):
+        """With creep, whose memory goes on from window to window."""
+        creeping = replace(MATERIAL, prony=[(0.5, 0.05)])
+        real, trials, start, windows = self.released(integrator, creeping)
+        again = Replay(real, WHOLE_STATE, trials)(start, windows=windows)[0]
+        torch.testing.assert_close(again, trials.observed, rtol=0.0, atol=1e-9)
+
+    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+    def test_each_begins_at_the_known_state(self, integrator):
+        """Of a simulator of another stiffness, they are as its steps from there; an unknown state begins none."""
+        _, trials, start, windows = self.released(integrator)
+        windows.q[1, 2 * self.WINDOW] = torch.nan
+        wrong = Simulator(
+            Body(MESH, select_vertices(MESH, x=0.0)),
+            replace(MATERIAL, youngs_modulus=120e3),
+            time_step=STEP,
+            integrator=integrator,
+            relative_tolerance=1e-12,
+        )
+        points = Replay(wrong, WHOLE_STATE, trials)(start, windows=windows)[0]
+        for row in range(2):
+            for first in (0, self.WINDOW, 2 * self.WINDOW):
+                if row == 1 and first == 2 * self.WINDOW:
+                    continue
+                before = None if first == 0 else (windows.q[row, None, first - 1], windows.v[row, None, first - 1])
+                state = State(windows.q[row, None, first], windows.v[row, None, first])
+                state = replace(state, previous=before if integrator == "bdf2" else None)
+                steps = min(self.WINDOW if row == 0 or first == 0 else self.STEPS, self.STEPS - first)
+                own = wrong.rollout(state, steps).q[1:, 0]
+                torch.testing.assert_close(points[row, first + 1 : first + 1 + steps], own, rtol=0.0, atol=1e-9)
+
+    def test_the_loss_has_the_gradient_of_separate_windows(self):
+        """No gradient passes the beginning of a window."""
+        real, trials, start, windows = self.released("implicit_euler")
+        torch.manual_seed(0)
+        model = build_model(
+            NetworkSettings(**NETWORK),
+            torch.as_tensor(MESH.vertices),
+            windows.q.flatten(0, 1),
+            windows.v.flatten(0, 1),
+            1e-3 * windows.v.flatten(0, 1),
+        ).double()
+        loss = MotionLoss([TrialGroup(Replay(real, WHOLE_STATE, trials), start, windows=windows)], {})
+        loss(model).backward()
+        gradients = [w.grad.clone() for w in model.network.parameters()]
+        for weight in model.network.parameters():
+            weight.grad = None
+        total = 0.0
+        for first in range(0, self.STEPS, self.WINDOW):
+            state = State(windows.q[:, first], windows.v[:, first])
+            for k in range(first, min(first + self.WINDOW, self.STEPS)):
+                state, _ = real.step(state, Inputs(model(state.q, state.v, None)))
+                squares = (state.q - windows.q[:, k + 1]).square().sum((1, 2))
+                total = total + (squares * trials.loss_weight).sum()
+        total.backward()
+        assert float(loss(model).detach()) == pytest.approx(float(total.detach()), rel=1e-9)
+        for weight, gradient in zip(model.network.parameters(), gradients, strict=True):
+            torch.testing.assert_close(weight.grad, gradient, rtol=1e-6, atol=1e-9 * float(gradient.abs().max()))

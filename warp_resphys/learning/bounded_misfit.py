@@ -60,11 +60,9 @@ class BoundedMisfit(ABC):
         bounds: see above.
         prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
         failure: message of the last simulation that failed.
-        differentiates_later: whether derivatives at parameters whose loss is known need no further simulation.
     """
 
     failure = ""
-    differentiates_later = False
 
     def __init__(self, bounds: Mapping[str, Bounds]) -> None:
         self.bounds, self.prior_weight = dict(bounds), 0.0
@@ -79,6 +77,15 @@ class BoundedMisfit(ABC):
             unit: the parameters, as fractions of their ranges.
             derivatives: whether to compute derivatives; they are zero otherwise.
         """
+
+    def objective(self, unit: FloatArray, derivatives: bool) -> tuple[float, FloatArray, FloatArray]:
+        """Returns the loss, its gradient (P,) and Gauss-Newton matrix (P, P), for `linalg.least_squares.UnitBox`."""
+        count = len(unit)
+        linear, slopes = self.linearise(unit, derivatives), (np.zeros(count), np.zeros((count, count)))
+        if linear is None or not math.isfinite(linear.loss):
+            return math.inf, *slopes
+        slopes = (linear.gradient, linear.gauss_newton) if derivatives else slopes
+        return linear.loss if np.isfinite(slopes[1]).all() else math.inf, *slopes
 
     @abstractmethod
     def forget(self) -> None:

@@ -1,7 +1,7 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
-A `Descent` minimises the `Misfit` within bounds, from the best of a coarse set of starts, with derivatives along the
-motions (`Replay.varied`).
+The `Misfit` is minimised within bounds, from the best of a coarse set of starts (`linalg.least_squares.UnitBox`), with
+derivatives along the motions (`Replay.varied`).
 """
 
 import math
@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from ..io.errors import ConvergenceError
-from ..linalg.least_squares import Point, minimise
+from ..linalg.least_squares import Point, UnitBox, minimise
 from .bounded_misfit import BoundedMisfit, FloatArray
 from .bounds import Bounds
-from .descent import AtOnce, Descent, Evaluated
 from .misfit import Misfit
 from .placement import Accuracy
 from .replay import Replay, Start
@@ -202,17 +201,16 @@ class ParameterSearch:
             "prior_weight": misfit.prior_weight,
         }
 
-    def _minimum(self, x: torch.Tensor, max_evaluations: int, tolerance: float, evaluated: Evaluated) -> Point:
+    def _minimum(
+        self, x: torch.Tensor, max_evaluations: int, tolerance: float, evaluated: Callable[[FloatArray, float], None]
+    ) -> Point:
         """Returns the minimum reached from parameters (1, P); its loss is infinite if there are no derivatives."""
-        linearise = self._misfit.linearise if self._misfit.differentiates_later else AtOnce(self._misfit.linearise)
-        descent = Descent(linearise, tolerance, evaluated)
-        start = descent.evaluate(x)
+        problem = UnitBox(self._misfit.objective, tolerance, evaluated)
+        start = problem.evaluate(x)
         if not math.isfinite(float(start.value)):
             return start
-        end = minimise(descent, start, tolerance, max_evaluations - 1).point
-        stuck_at = descent.stuck_at
-        is_stuck = stuck_at is not None and torch.equal(stuck_at, end.x) and torch.equal(end.x, x)
-        return replace(end, value=torch.full_like(end.value, torch.inf)) if is_stuck else end
+        end = minimise(problem, start, tolerance, max_evaluations - 1).point
+        return replace(end, value=torch.full_like(end.value, torch.inf)) if problem.differentiates is False else end
 
 
 class Identifier(ParameterSearch):

@@ -56,8 +56,6 @@ class Misfit(BoundedMisfit):
         InputError: an unknown parameter, or none; or a motion in which nothing moves.
     """
 
-    differentiates_later = True
-
     def __init__(
         self,
         replays: Sequence[tuple[Replay, Start]],

@@ -5,14 +5,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol
+from typing import Any, Generic
 
 import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
 from ..settings.learning import EpochSettings, TrainerSettings
-from .adam import Adam
 from .networks import Model, StateMap
 
 SCHEDULES = ("cosine", "step")
@@ -44,16 +43,6 @@ class TrainingState:
     best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights of the best score
 
 
-class Optimiser(Protocol):
-    """An optimiser whose state can be saved, as those of torch."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the state of each weight under ``state``."""
-
-    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Continues from a `state_dict`."""
-
-
 class EpochTrainer(ABC, Generic[Model]):
     """Trains epoch by epoch, and keeps the weights with the smallest roll-out error.
 
@@ -69,7 +58,7 @@ class EpochTrainer(ABC, Generic[Model]):
     def __init__(
         self,
         model: Model,
-        optimiser: Optimiser,
+        optimiser: torch.optim.Optimizer,
         rollout_error: Callable[[Model], float],
         settings: EpochSettings,
     ) -> None:
@@ -192,7 +181,8 @@ class Trainer(EpochTrainer[Model]):
         for name, samples in (("training", train), ("validation", validation)):
             if not len(samples.q):
                 raise InputError(f"the {name} split is empty: give it at least one trajectory.")
-        self._adam = Adam(model.network.parameters(), settings.weight_decay)
+        weights = [w for w in model.network.parameters() if w.requires_grad]
+        self._adam = torch.optim.Adam(weights, weight_decay=settings.weight_decay, fused=True)
         super().__init__(model, self._adam, rollout_error, settings)
         self.selection = settings.selection
         self._random = torch.Generator().manual_seed(seed)
@@ -217,11 +207,13 @@ class Trainer(EpochTrainer[Model]):
     @override
     def _run_epoch(self) -> dict[str, float]:
         rate = self.learning_rate(self.state.epoch)
+        self._adam.param_groups[0]["lr"] = rate
         self.model.train()
         total, count = torch.zeros((), device=self.model.rest.device), 0.0
         for loss, weight in self._batches():
-            gradients = torch.autograd.grad(loss, self._adam.weights, allow_unused=True, materialize_grads=True)
-            self._adam.step(gradients, rate)
+            self._adam.zero_grad()
+            loss.backward()
+            self._adam.step()
             total += loss.detach() * weight
             count += weight
         self.model.eval()

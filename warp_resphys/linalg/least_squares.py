@@ -9,6 +9,7 @@ section 15.6): along the floor of a valley a long step ends on the wall, and the
 Both are rejected if they decrease the objective by less than 5 %, as full steps may go to and fro across a minimum.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 Array = NDArray[np.float64]
-Objective = Callable[[Array], tuple[float, Array, Array]]
+Objective = Callable[[Array, bool], tuple[float, Array, Array]]
 Move = Callable[[torch.Tensor], torch.Tensor]
 
 _DECREASE, _INCREASE, _MAX_DAMPING = 0.1, 10.0, 1e12
@@ -124,24 +125,44 @@ class UnitBox(Problem):
     Gauss-Newton matrix gives their direction from the first step. The distance is the change of the objective over its
     value, or over 1e-4 if that is larger.
 
+    Derivatives, which cost more than residuals, are computed only at points from which a step is taken.
+
     Args:
-        objective: maps variables (P,) to the value, its gradient (P,) and the Gauss-Newton matrix 2 J^T J (P, P); the
-            value is infinite if the evaluation fails.
+        objective: maps variables (P,), and whether derivatives are needed, to the value, its gradient (P,) and the
+            Gauss-Newton matrix 2 J^T J (P, P); the value is infinite if the evaluation or the derivatives fail.
+        tolerance: relative decrease; a step from which the linearisation expects less is taken without an evaluation,
+            as the last.
+        evaluated: called with the variables and the objective after each step.
+
+    Attributes:
+        differentiates: whether there are derivatives at the start; None before the first step.
     """
 
     follows_valleys = True
 
-    def __init__(self, objective: Objective) -> None:
-        self._objective = objective
+    def __init__(
+        self, objective: Objective, tolerance: float = 0.0, evaluated: Callable[[Array, float], None] | None = None
+    ) -> None:
+        self._objective, self._tolerance, self._evaluated = objective, tolerance, evaluated
+        self.differentiates: bool | None = None
+        self._end: Point | None = None  # of the last step, if it needs no evaluation
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
-        value, gradient, matrix = self._objective(x[0].numpy())
-        return Point(x, x.new_tensor([value]), (x.new_tensor(gradient)[None], x.new_tensor(matrix)[None]))
+        point, self._end = self._end, None
+        if point is None or not torch.equal(x, point.x):
+            point = Point(x, x.new_tensor([self._objective(x[0].numpy(), False)[0]]))
+        if self._evaluated is not None:
+            self._evaluated(x[0].numpy(), float(point.value))
+        return point
 
     @override
     def linearise(self, point: Point) -> Move:
-        (x,), (gradient,), (gauss_newton,) = point.x, *point.kept
+        (x,) = point.x
+        value, *slopes = self._objective(x.numpy(), True)
+        gradient, gauss_newton = map(x.new_tensor, slopes) if math.isfinite(value) else (0.0 * x, torch.diag(0.0 * x))
+        if self.differentiates is None:
+            self.differentiates = math.isfinite(value)
         added = _RIDGE * float(gauss_newton.trace()) or 1.0
         matrix = gauss_newton + added * torch.eye(len(x), dtype=x.dtype)
         bounds = (-x).clamp_min(-_LARGEST_STEP).numpy(), (1.0 - x).clamp_max(_LARGEST_STEP).numpy()
@@ -150,7 +171,12 @@ class UnitBox(Problem):
             root = torch.linalg.cholesky(damped(matrix[None], damping)[0])
             right = -torch.linalg.solve_triangular(root, gradient[:, None], upper=False)[:, 0]
             change = scipy.optimize.lsq_linear(root.mT.numpy(), right.numpy(), bounds=bounds, method="bvls").x
-            return (x + torch.as_tensor(change)).clamp(0.0, 1.0)[None]
+            end = (x + torch.as_tensor(change)).clamp(0.0, 1.0)
+            change = end - x
+            expected = Point(end[None], point.value + change @ (gradient + 0.5 * gauss_newton @ change))
+            is_short = bool((self.distance(point, expected) <= self._tolerance) & (damping <= 1.0).all())
+            self._end = expected if is_short else None
+            return end[None]
 
         return step
 

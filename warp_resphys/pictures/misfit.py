@@ -74,20 +74,29 @@ class PictureMisfit(BoundedMisfit):
                 )
         self._first: list[Shape | None] = [None] * len(self.poses) if near is None else [*near]
         self._was_seen = False  # in every picture, with some parameters
+        self._last: tuple[FloatArray, tuple[float, FloatArray, FloatArray]] | None = None  # the last `objective`
         self.forget()
 
     @override
     def forget(self) -> None:
-        self._shapes = [*self._first]
+        self._shapes, self._last = [*self._first], None
 
     @override
     def update_prior_weight(self, unit: FloatArray) -> float:
         """As elsewhere, but from the known noise of clouds before the first search: a far guess has no small errors."""
+        self._last = None
         first, change = not self.prior_weight, super().update_prior_weight(unit)
         points = sum(len(photo.cloud.measured) for pose in self.poses for photo in pose.photos if photo.cloud)
         if first and points:
             self.prior_weight = min(self.prior_weight, 1.0 / points)
         return change
+
+    @override
+    def objective(self, unit: FloatArray, derivatives: bool) -> tuple[float, FloatArray, FloatArray]:
+        """As elsewhere, with derivatives in any case: they need shapes near that of the residuals, solved together."""
+        if self._last is None or not np.array_equal(self._last[0], unit):
+            self._last = unit.copy(), super().objective(unit, True)
+        return self._last[1]
 
     @staticmethod
     def _acts(name: str, pose: SeenPose) -> bool:

@@ -13,10 +13,9 @@ from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
 from warp_resphys.learning.networks import ACTIVATIONS
-from warp_resphys.learning.training import SCHEDULES, SELECTIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
 from warp_resphys.settings.control import Model
-from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
+from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.settings.reference import editor_schema, page
 from warp_resphys.settings.trials import MarkerSettings
 from warp_resphys.stepping.integrators import INTEGRATORS
@@ -55,8 +54,6 @@ def test_choices_in_the_settings_are_those_in_the_code():
         (MarkerSettings, "bind", KINDS),
         (MarkerSettings, "frame", FRAMES),
         (NetworkSettings, "activation", ACTIVATIONS),
-        (TrainerSettings, "schedule", SCHEDULES),
-        (TrainerSettings, "selection", SELECTIONS),
     ]
     for settings, key, words in pairs:
         assert {*get_args(settings.model_fields[key].annotation)} == {*words}

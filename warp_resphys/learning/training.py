@@ -14,9 +14,6 @@ from ..io.errors import InputError
 from ..settings.learning import EpochSettings, TrainerSettings
 from .networks import Model, StateMap
 
-SCHEDULES = ("cosine", "step")
-SELECTIONS = ("rollout", "validation_loss")
-
 
 @dataclass(frozen=True)
 class Samples:

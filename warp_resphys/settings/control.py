@@ -30,7 +30,7 @@ class PlanSettings(Settings):
 
     corrections: Count = setting(3, "with the robot's simulator")
     gradient: Literal["reduced", "adjoint"] = setting(
-        "reduced", "gradients of the corrections: of the reduced model, or by the simulator's adjoint"
+        "reduced", "of corrections: reduced model, or the simulator's adjoint"
     )
     reach: Positive = setting(1.0e-3, "largest distance of a path from reachable points", "m")
 
@@ -46,7 +46,7 @@ class ReductionSettings(Settings):
     """Samples for reduced models, `control.sampling.Sampling`."""
 
     modes: Annotated[Some[Natural], AfterValidator(different)] = setting(
-        (4, 6, 8), "numbers of coordinates of the reduced model, of which the one with the least error is chosen"
+        (4, 6, 8), "numbers of coordinates, of which the best is chosen"
     )
     equilibria: Natural = setting(192, "states at rest")
     tangents: Natural = setting(96, "number of these states whose vibrations are computed")
@@ -75,7 +75,7 @@ class ControlSettings(FigureSettings):
     models: Models = setting(
         ("simulation", "sysid", "resphys"), "models for plans of whole motions; others are compared with the last"
     )
-    receding: Models = setting(("resphys",), "those of the models that plan with a receding horizon")
+    receding: Models = setting(("resphys",), "those with a receding horizon")
     plan: PlanSettings = PlanSettings()
     horizon: Positive = setting(0.3, "of plans with a receding horizon", "s")
     feedback: FeedbackSettings = FeedbackSettings()

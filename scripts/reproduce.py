@@ -118,8 +118,10 @@ def main() -> None:
         runs = [beam_run(*pair, beyond, options.runs) for pair in beams]
         places = {name: _place(name, options.data) for name in robots}
         present = {name: place for name, place in places.items() if place is None or place.is_dir()}
-        if absent := places.keys() - present.keys():
-            print(f"no recordings in --data: {', '.join(sorted(absent))}", file=sys.stderr)
+        if absent := sorted(places.keys() - present.keys()):
+            print(f"--data has no recordings of {', '.join(absent)}", file=sys.stderr)
+            if not (present or beams):
+                sys.exit(USER_ERROR)
         kept = kept_results(options.results / "robots.json", present, beyond)
         robot_runs = [robot_run(name, place, beyond, options.runs) for name, place in present.items()]
         for run in (*runs, *robot_runs):

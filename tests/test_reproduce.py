@@ -90,12 +90,15 @@ def test_gains_and_the_best_models_are_those_of_the_trials(script):
     assert "- Tentacle failed: data.steps is -1" in page
 
 
-def test_rows_with_other_settings_and_other_recordings_are_refused(script, tmp_path):
+def test_rows_with_other_settings_and_other_recordings_are_refused(script, monkeypatch, capsys, tmp_path):
     with pytest.raises(ResphysError, match="has sopra with its own settings, not with budget=quick"):
         script.kept_results(DOCS / "robots.json", ["sopra"], ["budget=quick"])
     (tmp_path / "m1.csv").write_text("0,1")
     with pytest.raises(ResphysError, match="are not those of the page"):
         script.robot_run("tentacle", tmp_path, [], Path("runs"))
+    assert end_of(script, monkeypatch, "tentacle", "--data", tmp_path, "--results", tmp_path / "out") == 2
+    assert capsys.readouterr().err == "--data has no recordings of tentacle\n"
+    assert not (tmp_path / "out").exists()
     with pytest.raises(ResphysError, match="there is no starfish: choose from beams, robots, beam_oscillation"):
         script.selected(["starfish"])
 

@@ -23,9 +23,9 @@ from pydantic import ConfigDict
 from support.command_line import outcome
 from support.main_job import end_of
 from warp_resphys import __version__, cli, commands, launch
+from warp_resphys.cli import NOBODY_READS
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
-from warp_resphys.io.pipes import NOBODY_READS
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
 from warp_resphys.io.stages import StageInterrupted
@@ -395,7 +395,7 @@ class TestSettingsOfARun:
 
     def test_all_keys_are_shown_with_their_defaults_and_nothing_is_written(self, tmp_path):
         shown = OmegaConf.create(outcome("--cfg", "job", "seed=3", "mesh=rod").out)
-        assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.backend) == (3, "rod", 0.0, "local")
+        assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.processes) == (3, "rod", 0.0, 1)
         assert list(tmp_path.iterdir()) == []
 
 
@@ -435,7 +435,7 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "\nexperiment: beam_" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.imports", ".io.labels", ".io.pipes")
+        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.imports", ".io.labels")
         assert set(names) == {f"warp_resphys{name}" for name in ours}
         assert err == ""
 

@@ -35,7 +35,6 @@ from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
 from .io.labels import OWN_OPTIONS, run_label
-from .io.pipes import ends_where_nobody_reads
 from .io.settings import parse
 
 INTERRUPTED: Final = 130
@@ -65,19 +64,16 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         started = True
         try:
             if shown is not None:
-                with ends_where_nobody_reads():
-                    _show(config, shown)
+                _show(config, shown)
                 return None
             module, _, name = function.partition(":")
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
-            with ends_where_nobody_reads():
-                gc.collect()  # What an earlier job of a sweep has left would be kept for good.
-                with uncollected():
-                    run = getattr(import_module(f"{__package__}.{module}"), name)
-                gc.freeze()
-                settings, *_ = get_type_hints(run).values()
-                return run(parse(settings, values), folder)
+            gc.collect()  # What an earlier job of a sweep has left would be kept for good.
+            with uncollected():
+                run = getattr(import_module(f"{__package__}.{module}"), name)
+            settings, *_ = get_type_hints(run).values()
+            return run(parse(settings, values), folder)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:

@@ -4,7 +4,6 @@ The configuration determines the stages. The settings of a stage are exactly wha
 """
 
 import logging
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -52,7 +51,7 @@ from .experiment.identify import identify
 from .experiment.identify_law import identify_law
 from .experiment.importing import import_recordings, import_scaled
 from .experiment.laboratory import run_laboratory
-from .experiment.learn import takes_long, train
+from .experiment.learn import train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.prediction_intervals import intervals_of_folds
@@ -62,11 +61,9 @@ from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
 from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
-from .io.background import BackgroundProcess
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
-from .io.machine import available_cores
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
 from .report.conclusions import conclusions, errors_by_load, headline
@@ -183,16 +180,6 @@ def workers_of(run: RunSettings) -> Workers:
     return workers_for(run.parallel, run.parallel.processes, run.device)
 
 
-def background_of(run: RunSettings) -> BackgroundProcess | None:
-    """Returns the second process of a run; None if it is not wanted, no core is free, or networks are on a GPU.
-
-    On Windows there is none, as it would outlive a run that is killed.
-    """
-    free = available_cores() - workers_of(run).count
-    wanted = run.parallel.background and run.parallel.backend == "local" and sys.platform != "win32"
-    return BackgroundProcess() if wanted and free > 0 and choose_device(run.device).type == "cpu" else None
-
-
 def learning_stages(
     run: RunSettings, split: Split, shared: str, acquired: str, workers: Workers | None = None
 ) -> list[Stage]:
@@ -211,8 +198,7 @@ def learning_stages(
     stages: list[Stage] = []
 
     def add(name: str, work: Work, outputs: tuple[str, ...], settings: LearningStage, *upstream: str) -> None:
-        background = takes_long if isinstance(settings, TrainStage) else None
-        stages.append(Stage(name, work, outputs, settings, (*needs, *upstream), background))
+        stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
 
     if run.identify is not None:
         before = IdentifyStage.of(run, **common).model_copy(update={"with_law": False})
@@ -341,7 +327,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     if folds is None:
         stages = learning_stages(run, split_of(run), ".", acquired)
         _announce(run, stages, folder)
-        run_stages(stages, folder, background=background_of(run))
+        run_stages(stages, folder)
         metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
         metrics = _run_folds(run, folder, folds, first, acquired)
@@ -365,7 +351,7 @@ def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: fl
     left = unfinished(stages, folder)
     if not left or not may_be_long(left, folder):
         return
-    expected = estimate(left, folder, background_of(run) is not None)
+    expected = estimate(left, folder)
     if sentence := expected.sentence(remedies(left, run.budget == "quick"), times):
         log.info("%s", sentence)
 
@@ -381,7 +367,7 @@ def _run_folds(
     left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
     if left:
         _announce(run, left[0].stages(ALONE), left[0].folder, len(left) / workers_of(run).at_most(len(left)).count)
-    run_folds(folds, workers_of(run), background_of(run))
+    run_folds(folds, workers_of(run))
     metrics = {}
     for name, fold in folds.items():
         metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])

@@ -19,10 +19,10 @@ from warp_resphys.learning.training import EpochTrainer
 
 
 class Interruption:
-    """Sends SIGINT to this process at a chosen step or epoch, and counts the work done."""
+    """Sends a signal to this process at a chosen step or epoch, and counts the work done."""
 
     def __init__(self, monkeypatch):
-        self.at = None
+        self.at, self.signal = None, signal.SIGINT
         self.done = Counter()
         append, run_epoch = ResumableHDF5.append, EpochTrainer.run_epoch
 
@@ -41,7 +41,7 @@ class Interruption:
     def count(self, kind):
         self.done[kind] += 1
         if self.at == (kind, self.done[kind]):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(self.signal)
 
 
 @pytest.mark.usefixtures("no_report")
@@ -54,6 +54,7 @@ class TestInterruption:
 
     @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
     def test_ctrl_c_in_every_stage(self, folder, interruption, integrator):
+        """The last time by SIGTERM, with which clusters end a process."""
         arguments = [*TINY, f"integrator={integrator}"]
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = Counter(interruption.done)
@@ -62,7 +63,7 @@ class TestInterruption:
         cuts = {"simulate": ("simulate", 1), "reconstruct_resphys": ("reconstruct_resphys", 7)}
         cuts |= {"epochs": ("train_resphys", 25), "evaluate": ("evaluate", 18)}
         for kind, (stage, at) in cuts.items():
-            interruption.at = (kind, at)
+            interruption.at, interruption.signal = (kind, at), signal.SIGTERM if kind == "evaluate" else signal.SIGINT
             code, err = run(*arguments, IN_RUN)
             assert code == 130
             assert f"interrupted in stage '{stage}'" in err

@@ -39,7 +39,7 @@ TINY = [
         "in_the_loop.epochs=1",
         "simfree.network.position_modes=1",
     ),
-    *("~identify.parameters.density", "parallel.processes=1", "parallel.background=false", "markers.patch=0.05"),
+    *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
     *(
         "~identify.parameters.tendon_offset_2_first",
         "~identify.parameters.tendon_offset_2_second",

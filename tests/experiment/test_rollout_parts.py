@@ -73,4 +73,4 @@ def test_workers_of_clusters_are_counted_and_compute_on_cpus():
     assert workers_for(ParallelSettings(), 3, "cpu") == Workers(3, "local", None)
     assert workers_for(ParallelSettings(), None, "cpu").count >= 1
     with pytest.raises(InputError, match="dask cluster"):
-        workers_for(ParallelSettings(backend="dask"), None, "cpu")
+        workers_for(ParallelSettings(address="tcp://head:8786"), None, "cpu")

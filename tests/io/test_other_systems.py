@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from warp_resphys.io import atomic, children, memory, pipes
+from warp_resphys.io import atomic, fan_out, memory
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.machine import available_cores, hardware
 from warp_resphys.io.stages import run_lock
@@ -26,7 +26,6 @@ def test_the_package_imports_without_the_modules_of_unix():
         "kernel_cache",
         "machine",
         "memory",
-        "pipes",
         "resumable",
         "stages",
     ]
@@ -93,14 +92,8 @@ def test_files_are_written_where_folders_cannot_be_synchronised(tmp_path, monkey
 
 def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
-    with children.interrupts_blocked():
+    with fan_out.interrupts_blocked():
         pass
-
-
-def test_pipes_are_not_taken_for_unread_where_that_is_not_known(monkeypatch):
-    monkeypatch.delattr(pipes.select, "poll", raising=False)
-    with pytest.raises(BrokenPipeError), pipes.ends_where_nobody_reads():
-        raise BrokenPipeError
 
 
 def test_a_run_is_ended_where_it_cannot_be_interrupted(monkeypatch):

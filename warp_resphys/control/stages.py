@@ -13,9 +13,9 @@ from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN,
 from ..experiment.parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.files import write_json
+from ..io.files import write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import Field, forget_checkpoint, keep_checkpoint, resume_checkpoint
+from ..io.resumable import Field, resume_checkpoint
 from ..io.stages import StageContext
 from ..mesh.motion_files import input_columns, write_csv
 from ..robot.loading import load
@@ -107,7 +107,7 @@ def plan_motions(context: StageContext) -> None:
             followed = followers[seconds].follow(paths, progress.advance)
             plans |= dict(zip(_names(task, seconds), followed, strict=True))
             tensors, plain = plain_plans(plans)
-            keep_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
+            write_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
     write_plans(context.run_dir / plans_file(model), plans)
     driven = driven_input(robot)
     for name, motion in plans.items():
@@ -115,7 +115,7 @@ def plan_motions(context: StageContext) -> None:
         markers = motion.markers.reshape(len(motion.markers), -1, 3)
         times = robot.time_step * np.arange(len(markers), dtype=np.float64)
         write_csv(context.run_dir / plan_table(model, name), times, robot.labels, markers, columns)
-    forget_checkpoint(checkpoint)
+    checkpoint.unlink(missing_ok=True)
 
 
 def fit_baselines(context: StageContext) -> None:

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from ..io.errors import ResphysError
 from ..io.fan_out import ALONE, Advance, WorkerError, Workers, fan_out
 from ..io.progress import Progress
-from ..io.stages import Background, Stage, StageInterrupted, run_stages, up_to_date
+from ..io.stages import Stage, StageInterrupted, run_stages, up_to_date
 
 Stages = Callable[[Workers], list[Stage]]
 
@@ -30,7 +30,7 @@ class Fold:
     stages: Stages
 
 
-def run_folds(folds: Mapping[str, Fold], workers: Workers, background: Background | None = None) -> None:
+def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
     """Runs the folds that are not up to date, one per worker; a single remaining fold uses all workers.
 
     The results do not depend on the number of workers.
@@ -38,7 +38,6 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers, background: Backgroun
     Args:
         folds: by the trial that is left out.
         workers: share the folds.
-        background: second process of the stages of a fold, where one fold runs at a time.
 
     Raises:
         WorkerError: a fold failed; the other folds keep their results.
@@ -48,7 +47,7 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers, background: Backgroun
     if workers.alone or len(left) <= 1:
         with threadpool_limits(1):
             for fold in left:
-                run_stages(fold.stages(workers), fold.folder, background=background)
+                run_stages(fold.stages(workers), fold.folder)
         return
     total = sum(len(fold.stages(ALONE)) for fold in left)
     running: dict[str, str] = {}

@@ -12,9 +12,9 @@ import torch
 
 from ..data.rigid_bodies import corners_of, independent
 from ..io.errors import ConvergenceError
-from ..io.files import write_json
+from ..io.files import write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
+from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identifier, ParameterSearch
@@ -105,7 +105,7 @@ def identify(context: StageContext) -> None:
             identified[model] = identified[model] | own
     write_json(context.run_dir / IDENTIFICATION, identified)
     for part in kept.values():
-        forget_checkpoint(part.path)
+        part.path.unlink(missing_ok=True)
 
 
 def _bounds(experiment: Experiment, search: Mapping[str, RangeSettings], names: Sequence[str]) -> dict[str, Bounds]:
@@ -236,7 +236,7 @@ class Checkpoint:
     def keep(self, **content: Any) -> None:
         """Adds finished work."""
         self.content |= {"fingerprint": self._fingerprint, **content}
-        keep_checkpoint(self.path, "identify", {}, self.content)
+        write_checkpoint(self.path, "identify", {}, self.content)
 
     @property
     def evaluations(self) -> int:

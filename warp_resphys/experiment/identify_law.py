@@ -21,7 +21,6 @@ from ..dynamics.simulator import Simulator
 from ..energies.law_files import LAW_FORMAT, read_law, unit_of
 from ..io.files import write_json
 from ..io.progress import Progress
-from ..io.resumable import forget_checkpoint
 from ..io.stages import StageContext, package_versions
 from ..learning.bounds import Bounds
 from ..learning.identification import Identification, Identifier
@@ -56,7 +55,7 @@ def identify_law(context: StageContext) -> None:
     search = _LawSearch(context, experiment)
     content = search.run() if settings.law.file is None else search.given(settings.law.file)
     write_json(context.run_dir / LAW_FILE, content)
-    forget_checkpoint(search.kept.path)
+    search.kept.path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from ..dynamics.modes import RestStiffness
 from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import forget_checkpoint, keep_checkpoint, resume_checkpoint
+from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
@@ -24,12 +24,11 @@ from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSett
 from ..settings.stages import NetworkStage, TrainStage
 from .build import choose_device
 from .experiment import LAW, Experiment
-from .files import DATASET, STATIC, reconstruction_file, training_file, weights_file
+from .files import STATIC, reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, rollout_error
 
 log = logging.getLogger(__name__)
 _CHECKPOINT_SECONDS = 10.0
-_LEAST_SAMPLES = 100_000  # over all epochs, which take a few seconds
 
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
@@ -274,15 +273,6 @@ def _windows(experiment: Experiment, model: str, replay: Replay, steps: int) -> 
     return Windows(q.to(like), v.to(like), steps)
 
 
-def takes_long(context: StageContext) -> bool:
-    """Whether training on single steps takes longer than a process takes to start."""
-    settings: TrainStage = context.settings
-    with read_hdf5(context.run_dir / settings.shared / DATASET, "dataset") as file:
-        frames = file["observed"].shape[1]
-    samples = settings.training.trainer.epochs * len(settings.split.train) * frames
-    return settings.training.in_the_loop is None and samples > _LEAST_SAMPLES
-
-
 def train(context: StageContext) -> None:
     """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json."""
     settings: TrainStage = context.settings
@@ -304,7 +294,7 @@ def fit(context: StageContext, model: str, prepared: Prepared) -> None:
         trainer.resume(*snapshot)
 
     def save(kept: Snapshot) -> None:
-        keep_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+        write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
 
     run_epochs(context.name, trainer, save)
     best = trainer.use_best()
@@ -322,7 +312,7 @@ def fit(context: StageContext, model: str, prepared: Prepared) -> None:
         best.state_dict(),
         {**best.description(), **prepared.learned.description(), **kept, "fingerprint": context.fingerprint},
     )
-    forget_checkpoint(checkpoint)
+    checkpoint.unlink(missing_ok=True)
 
 
 def run_epochs(

@@ -168,18 +168,14 @@ def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> 
         device: device of the simulation.
 
     Raises:
-        InputError: a cluster without a number of workers, or one that cannot simulate on the device.
+        InputError: a cluster without a number of workers.
     """
     on_cpu = simulation_device(device).type == "cpu"
-    if parallel.backend != "local" and wanted is None:
-        raise InputError(f"parallel.processes is null: set the number of workers of the {parallel.backend} cluster.")
-    if parallel.backend == "ray" and not on_cpu:
-        raise InputError(
-            "parallel.backend is ray, which provides CPUs only: choose device=cpu, or parallel.backend=dask."
-        )
+    if parallel.address is not None and wanted is None:
+        raise InputError("parallel.processes is null: set the number of workers of the Dask cluster.")
     if wanted is None:
         wanted = available_cores() if on_cpu else 1
-    return Workers(wanted, parallel.backend, parallel.address)
+    return Workers(wanted, parallel.address)
 
 
 def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRollout], workers: Workers) -> None:
@@ -197,7 +193,7 @@ def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRol
     left, first = [part for part in parts if not part.done], parts[0]
     total, missing = (sum(part.frames * len(part.names) for part in subset) for subset in (parts, left))
     with Progress(first.context.name, total, "frames", total - missing) as progress:
-        if workers.alone or (workers.backend == "local" and len(parts) == 1):
+        if workers.alone or (workers.address is None and len(parts) == 1):
             with threadpool_limits(1):  # As in worker processes, for the same results.
                 for part in left:
                     part.write(make, progress.advance)

@@ -21,7 +21,6 @@ from ..energies.law_files import LAW_FORMAT, unit_of
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_json, write_json
 from ..io.progress import Progress
-from ..io.resumable import forget_checkpoint
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.bounds import Bounds
 from ..learning.identification import ParameterSearch
@@ -294,7 +293,7 @@ def identify_pictures(context: StageContext) -> None:
             "units": {key: unit_of(key) for key in constants},
         }
         write_json(context.run_dir / law_file(material), law)
-    forget_checkpoint(kept.path)
+    kept.path.unlink(missing_ok=True)
 
 
 def compare_pictures(context: StageContext) -> None:

@@ -16,7 +16,6 @@ from ..fem.stretches import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
-from ..io.resumable import forget_checkpoint
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors, summarise
 from ..mesh.mesh import select_vertices
@@ -64,7 +63,7 @@ def try_shapes(context: StageContext) -> None:
                 kept.keep(shapes=results)
                 progress.advance(1, body=name)
     write_json(context.run_dir / SHAPES, results)
-    forget_checkpoint(kept.path)
+    kept.path.unlink(missing_ok=True)
 
 
 def check_shape(shape: ShapeSettings) -> None:

@@ -1,8 +1,4 @@
-"""Atomic writes, and checksums that reveal later damage.
-
-A file is written under a temporary name, synchronised to the disk and then renamed. `write_sealed` stores a checksum of
-the whole file in its head, and `is_as_written` verifies it.
-"""
+"""Atomic writes: a file is written under a temporary name, synchronised to the disk and then renamed."""
 
 from __future__ import annotations
 
@@ -10,14 +6,11 @@ import contextlib
 import errno
 import hashlib
 import os
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from .errors import DataFileError
 
-_SEAL = b"warp_resphys CRC-32 "
-SEAL = (_SEAL + b"0" * 8).decode()  # placeholder for the checksum in the head of a file
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -82,30 +75,6 @@ def digest(path: str | Path) -> str:
         return hashlib.sha256(contents.encode()).hexdigest()
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def write_sealed(path: Path, head: bytes, content: bytes = b"") -> None:
-    """Writes a file and replaces `SEAL` in its head by the checksum of head and content."""
-    before, _, after = head.partition(SEAL.encode())
-    with path.open("wb") as file:
-        file.write(before + _SEAL + b"%08x" % zlib.crc32(content, zlib.crc32(head)) + after)
-        file.write(content)
-
-
-def is_as_written(path: str | Path, head_bytes: int) -> bool:
-    """Whether a file matches the checksum in its first bytes; true for files without a checksum.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
-    with open(path, "rb") as file:
-        before, seal, after = file.read(head_bytes).partition(_SEAL)
-        if not seal:
-            return True
-        crc = zlib.crc32(before + SEAL.encode() + after[8:])
-        while part := file.read(1 << 20):
-            crc = zlib.crc32(part, crc)
-    return after[:8] == b"%08x" % crc
 
 
 def read_error(path: str | Path, error: OSError) -> DataFileError:

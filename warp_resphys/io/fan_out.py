@@ -1,13 +1,14 @@
-"""Runs independent tasks in worker processes of this machine, or of a Ray or Dask cluster, with joblib.
+"""Runs independent tasks in worker processes of this machine, or of a Dask cluster, with joblib.
 
-Workers are single-threaded. Progress is reported through a small file for each task in a shared folder, so that the
-backends transfer only tasks and results. When a worker is lost, all tasks are submitted again: a task must resume from
+Workers are single-threaded. Progress is reported through a small file for each task in a shared folder, so that joblib
+transfers only tasks and results. When a worker is lost, all tasks are submitted again: a task must resume from
 its own files, and return at once if it was finished.
 """
 
 import json
 import logging
 import os
+import signal
 import socket
 import threading
 import time
@@ -18,14 +19,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 import torch
 import warp as wp
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
-from .children import begin_worker, end_imports, interrupts_blocked
 from .errors import InputError, ResphysError, ResphysWarning
 from .memory import WorkersMemory, forget_peak_memory, peak_memory_gib
 from .progress import be_quiet
@@ -39,10 +39,8 @@ _ATTEMPTS = 3
 _IDLE_SECONDS = 60.0  # after which an idle local worker ends
 _PROGRESS_SECONDS = 0.1  # interval of writing and of reading the progress
 _ANSWER_SECONDS = 10.0  # timeout of the connection to a cluster
-_LOST = {  # names of the errors that mean that a worker is lost
-    *("BrokenProcessPool", "KilledWorker", "CommClosedError", "RayActorError"),
-    *("WorkerCrashedError", "NodeDiedError", "OwnerDiedError", "ObjectLostError"),
-}
+_PARENT_SECONDS = 0.02  # interval at which a worker checks that its parent process lives
+_LOST = {"BrokenProcessPool", "KilledWorker", "CommClosedError"}  # errors that mean that a worker is lost
 
 
 class WorkerError(ResphysError, RuntimeError):
@@ -59,18 +57,16 @@ class Workers:
 
     Attributes:
         count: number of tasks at once.
-        backend: ``local`` processes, or those of a ``ray`` or ``dask`` cluster.
-        address: of the cluster; if omitted, a temporary one is started on this machine.
+        address: of a Dask cluster; processes of this machine if omitted.
     """
 
     count: int = 1
-    backend: str = "local"
     address: str | None = None
 
     @property
     def alone(self) -> bool:
         """Whether this process does all of the work itself."""
-        return self.count == 1 and self.backend == "local"
+        return self.count == 1 and self.address is None
 
     def at_most(self, count: int) -> "Workers":
         """Returns the same workers, limited to a number of tasks at once."""
@@ -100,7 +96,7 @@ def fan_out(
         memory: counts the memory of the workers.
 
     Raises:
-        InputError: the backend is not installed, or the cluster does not answer.
+        InputError: Dask is not installed, or the cluster does not answer.
         WorkerError: a task raised a ResphysError, whose message is kept, or workers were lost repeatedly.
         WorkerFaultError: a task raised another error.
     """
@@ -112,7 +108,7 @@ def fan_out(
         try:
             with (
                 TemporaryDirectory(prefix=".progress_", dir=folder, ignore_cleanup_errors=True) as place,
-                _BACKENDS[workers.backend](workers),
+                _local(workers) if workers.address is None else _dask(workers.address),
                 _followed(Path(place), reported, advance),
             ):
                 calls = [delayed(_work)(function, task, Path(place, str(at))) for at, task in enumerate(tasks)]
@@ -127,7 +123,7 @@ def fan_out(
                     f"worker processes were killed {attempt} times in a row, perhaps because memory ran out "
                     f"({type(error).__name__}): run the same command again, with fewer processes."
                 ) from error
-            workers = workers.at_most(workers.count // 2) if workers.backend == "local" else workers
+            workers = workers.at_most(workers.count // 2) if workers.address is None else workers
             log.warning("a worker process was lost: its work is repeated, %d tasks at once", workers.count)
             advance(-sum(total for total, _ in reported.values()))
     if memory is not None:
@@ -141,7 +137,7 @@ def fan_out(
 def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
     """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
     be_quiet()
-    begin_work()
+    _begin_work()
     forget_peak_memory()
     worker = (socket.gethostname(), os.getpid())
     if not progress.parent.is_dir():
@@ -158,9 +154,8 @@ def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) ->
         raise WorkerFaultError(f"a worker process failed:\n{traceback.format_exc()}") from None
 
 
-def begin_work() -> None:
+def _begin_work() -> None:
     """Prepares a worker process: one thread of torch, and no warnings that the parent process has shown."""
-    end_imports()
     warnings.simplefilter("ignore", ResphysWarning)
     torch.set_num_threads(1)
     wp.config.log_level = wp.LOG_WARNING
@@ -231,73 +226,58 @@ def _followed(folder: Path, reported: dict[str, _Status], advance: Advance) -> I
 
 
 @contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Blocks Ctrl-C in processes that start meanwhile, which leave it to this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # On Windows, Ctrl-C reaches the workers as well.
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with(parent: int) -> None:
+    """Lets this worker end with its parent process."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_PARENT_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+@contextmanager
 def _local(workers: Workers) -> Iterator[None]:
-    ends = {"initializer": begin_worker, "initargs": (os.getpid(),)}
+    ends = {"initializer": _end_with, "initargs": (os.getpid(),)}
     with warnings.catch_warnings(), parallel_config("loky", idle_worker_timeout=_IDLE_SECONDS, **ends):
         # loky replaces a worker that ended because it was idle or its memory had grown, and warns of that.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor")
-        with interrupts_blocked():  # Workers started here leave Ctrl-C to this process.
+        with interrupts_blocked():
             # loky ends a worker whose memory grows by 300 MB after its first call, which hence has all imports.
-            Parallel(n_jobs=max(workers.count, 2))(delayed(begin_work)() for _ in range(workers.count))
+            Parallel(n_jobs=max(workers.count, 2))(delayed(_begin_work)() for _ in range(workers.count))
         yield
 
 
 @contextmanager
-def _dask(workers: Workers) -> Iterator[None]:
+def _dask(address: str) -> Iterator[None]:
     """Connects to a Dask cluster, which resubmits lost work itself, up to three times."""
     try:
         from distributed import Client
     except ModuleNotFoundError:
-        raise InputError(_missing("dask")) from None
-    own = {"n_workers": workers.count, "threads_per_worker": 1, "dashboard_address": None}
+        raise InputError(
+            f"parallel.address is {address}, but Dask is not installed: run pip install 'warp-resphys[cluster]'."
+        ) from None
     try:
-        with interrupts_blocked():
-            client = Client(**own) if workers.address is None else Client(workers.address, timeout=_ANSWER_SECONDS)
+        client = Client(address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:
-        raise InputError(_unreachable(workers)) from error
+        raise InputError(
+            f"no Dask cluster answers at parallel.address={address}: start it, correct the address, or omit it to use "
+            "processes of this machine."
+        ) from error
     with client, parallel_config("dask"):
         if any(threads != 1 for threads in client.nthreads().values()):
-            raise InputError("a worker of the dask cluster has several threads: start each with --nthreads 1.")
+            raise InputError("a worker of the Dask cluster has several threads: start each with --nthreads 1.")
         yield
-
-
-@contextmanager
-def _ray(workers: Workers) -> Iterator[None]:
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ModuleNotFoundError:
-        raise InputError(_missing("ray")) from None
-    own = not ray.is_initialized()
-    if own:
-        local: dict[str, Any] = {"num_cpus": workers.count, "include_dashboard": False}
-        where = local if workers.address is None else {"address": workers.address}
-        try:
-            if workers.address not in (None, "auto"):  # Ray itself would wait for minutes.
-                host, _, port = str(workers.address).removeprefix("ray://").rpartition(":")
-                socket.create_connection((host, int(port)), _ANSWER_SECONDS).close()
-            with interrupts_blocked():
-                ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
-        except (OSError, ValueError, RuntimeError) as error:
-            raise InputError(_unreachable(workers)) from error
-    register_ray()
-    try:
-        with parallel_config("ray", ray_remote_args={"num_cpus": 1}):
-            yield
-    finally:
-        if own:
-            ray.shutdown()
-
-
-_BACKENDS: Final = {"local": _local, "ray": _ray, "dask": _dask}
-
-
-def _missing(backend: str) -> str:
-    return f"parallel.backend is {backend}, which is not installed: run pip install 'warp-resphys[cluster]'."
-
-
-def _unreachable(workers: Workers) -> str:
-    return (
-        f"no {workers.backend} cluster answers at parallel.address={workers.address}: start it, correct the address, "
-        "or omit it to start a cluster on this machine."
-    )

@@ -8,14 +8,9 @@ from contextlib import contextmanager
 @contextmanager
 def uncollected() -> Iterator[None]:
     """Spares the garbage collector the objects of modules that are imported meanwhile."""
-    if not gc.isenabled():
-        yield
-        return
     gc.disable()
     try:
         yield
     finally:
-        if not gc.get_freeze_count():
-            gc.freeze()
-            gc.unfreeze()  # All objects are old now, which only a full collection searches.
+        gc.freeze()
         gc.enable()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable
 from types import TracebackType
 
 from rich.console import Console
@@ -17,7 +16,6 @@ _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
 _AT_MOST = " at most"  # of units of work that may end early
 _shown = True
-_output: Callable[[str], object] | None = None  # in place of stderr
 _running: list[Progress] = []  # innermost last; a terminal has room for one bar
 
 
@@ -25,28 +23,6 @@ def be_quiet() -> None:
     """Disables progress output in this process, such as a worker whose parent shows the progress of all."""
     global _shown
     _shown = False
-
-
-def print_to(output: Callable[[str], object]) -> None:
-    """Passes the lines of all progress of this process to a function, as if stderr were a log file."""
-    global _output
-    _output = output
-
-
-def print_line(line: str) -> None:
-    """Prints a line on stderr, above the bar if a terminal shows one."""
-    _print(_running[-1].console if _running else _console(), line)
-
-
-def _print(console: Console, line: str) -> None:
-    if _output is not None:
-        _output(line)
-    else:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _console() -> Console:
-    return Console(stderr=True, quiet=not _shown, force_terminal=None if _output is None else False)
 
 
 class Progress:
@@ -77,7 +53,7 @@ class Progress:
         self._after, self._ended = after, False
         self.description, self.total, self.unit, self.done = description, total, unit, start_at
         self._start_at, self._shown = start_at, -1
-        self.console = _console() if console is None else console
+        self.console = Console(stderr=True, quiet=not _shown) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
         self._marks = ((0.0, 0), (0.0, 0))  # times at which the units done had doubled, and these units
@@ -151,7 +127,7 @@ class Progress:
             self._bars.update(self._task, completed=self.done, status=self.status())
             self._next = now + _BAR_SECONDS
         else:
-            _print(self.console, f"{self.description}: {self.status()}")
+            self.console.print(f"{self.description}: {self.status()}", markup=False, highlight=False, soft_wrap=True)
             self._next = now + _LINE_SECONDS
 
 

@@ -1,13 +1,12 @@
 """Checkpoints, from which interrupted work resumes.
 
-`keep_checkpoint` is for work with a single state: a new checkpoint replaces the previous one. `ResumableHDF5` is for
-frames that are computed one by one and all kept: every ten seconds it writes a checkpoint with the new frames and the
-state after them, and finally one HDF5 file of all frames.
+Work with a single state writes one file, which a new checkpoint replaces (`files.write_checkpoint`). `ResumableHDF5` is
+for frames that are computed one by one and all kept: every ten seconds it writes a checkpoint with the new frames and
+the state after them, and finally one HDF5 file of all frames.
 """
 
 import glob
 import logging
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from .files import atomic_hdf5, create, read_checkpoint, read_hdf5, write_checkp
 log = logging.getLogger(__name__)
 
 KEEP_SECONDS = 10.0  # between two checkpoints
-_LAYOUT = 2  # of the content of checkpoints
 
 
 @dataclass(frozen=True)
@@ -184,41 +182,16 @@ def is_final(path: Path, kind: str, fingerprint: str) -> bool:
         return str(file.attrs.get("fingerprint")) == fingerprint
 
 
-def keep_checkpoint(path: Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
-    """Writes a checkpoint; the previous one is kept as well, in case this one gets damaged.
-
-    Raises:
-        DataFileError: the file cannot be written.
-    """
-    if path.exists():
-        os.replace(path, _before(path))
-    write_checkpoint(path, kind, tensors, {**metadata, "layout": _LAYOUT})
-
-
 def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
-    """Reads the last undamaged checkpoint of `keep_checkpoint` with this fingerprint; None if there is none."""
-    for candidate in (path, _before(path)):
-        if not candidate.exists():
-            continue
-        try:
-            tensors, metadata = read_checkpoint(candidate, kind)
-        except DataFileError as error:
-            log.warning("a checkpoint cannot be used: %s", error)
-            continue
-        if metadata.get("layout") != _LAYOUT:
-            log.warning("%s is not used: another version of warp_resphys wrote it", candidate)
-        elif metadata.get("fingerprint") != fingerprint:
-            log.warning("%s is not used: it belongs to other settings", candidate)
-        else:
-            return tensors, metadata
-    return None
-
-
-def forget_checkpoint(path: Path) -> None:
-    """Removes the checkpoints of `keep_checkpoint`."""
-    path.unlink(missing_ok=True)
-    _before(path).unlink(missing_ok=True)
-
-
-def _before(path: Path) -> Path:
-    return path.with_suffix(f".before{path.suffix}")
+    """Reads a checkpoint of work with this fingerprint; None if there is none that can be used."""
+    if not path.exists():
+        return None
+    try:
+        tensors, metadata = read_checkpoint(path, kind)
+    except DataFileError as error:
+        log.warning("a checkpoint cannot be used: %s", error)
+        return None
+    if metadata.get("fingerprint") != fingerprint:
+        log.warning("%s is not used: it belongs to other settings", path)
+        return None
+    return tensors, metadata

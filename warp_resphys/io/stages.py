@@ -11,14 +11,14 @@ import json
 import logging
 import platform
 import time
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -56,28 +56,6 @@ class Stage:
     outputs: tuple[str, ...]  # paths of the files that it writes, relative to the run folder
     settings: Any  # everything that the outputs depend on, and no more: a `Settings` object or nested plain data
     upstream: tuple[str, ...] = ()  # names of the stages whose outputs it reads
-    # whether it is worth a second process, in which it runs while earlier stages run in this one; None: never
-    background: Callable[[StageContext], bool] | None = None
-
-
-class Background(Protocol):
-    """A second process that runs one stage at a time, see `io.background`."""
-
-    @property
-    def stage(self) -> str | None:
-        """Name of the stage that was started and whose result was not asked for; None if there is none."""
-
-    def start(self, stage: Stage, context: StageContext) -> None:
-        """Starts a stage."""
-
-    def check(self) -> None:
-        """Raises the error of the stage, if it has failed."""
-
-    def result(self) -> float:
-        """Waits for the stage; returns its duration [s], or raises its error."""
-
-    def stop(self) -> None:
-        """Interrupts the stage, if one runs, and waits until it has written its checkpoint."""
 
 
 class StageInterrupted(KeyboardInterrupt):
@@ -103,19 +81,14 @@ def run_stages(
     run_dir: str | Path,
     wait: bool = False,
     begins: Callable[[str], None] = lambda name: None,
-    background: Background | None = None,
 ) -> dict[str, float]:
     """Runs the stages whose outputs are missing, damaged or of other settings.
-
-    A stage that may run in the background starts there as soon as its upstream stages are finished and another stage
-    runs here. It is waited for at its place in the order.
 
     Args:
         stages: in the order in which they run; a stage comes after its upstream stages.
         run_dir: the run folder, created if missing; one process at a time may use it.
         wait: whether to wait for another process that uses it, instead of raising.
         begins: called with the name of a stage before it is checked and run.
-        background: second process; None to run one stage after the other.
 
     Returns:
         The duration of each stage, summed over interrupted runs [s].
@@ -128,47 +101,18 @@ def run_stages(
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
         _plan(stages, Path(run_dir) / _PLANNED)
-        left = list(_contexts(stages, Path(run_dir)))
-        try:
-            while left:
-                stage, context = left.pop(0)
+        for stage, context in _contexts(stages, Path(run_dir)):
+            try:
                 begins(stage.name)
-                if background is not None and background.stage == stage.name:
-                    seconds[stage.name] = background.result()
-                elif (took := _valid_seconds(stage, context)) is not None:
-                    seconds[stage.name] = took
-                else:
-                    if background is not None:
-                        _start_another(left, seconds, background)
-                    seconds[stage.name] = run_stage(stage, context)
-                if background is not None:
-                    background.check()
-        except KeyboardInterrupt as error:
-            names = [stage.name, *([] if background is None else [background.stage])]
-            raise _interrupted([*dict.fromkeys(name for name in names if name)], [*seconds]) from error
-        finally:
-            if background is not None:
-                background.stop()
+                took = _valid_seconds(stage, context)
+                seconds[stage.name] = _run_stage(stage, context) if took is None else took
+            except KeyboardInterrupt as error:
+                kept = f"finished and kept: {', '.join(seconds)}; " if seconds else ""
+                raise StageInterrupted(
+                    f"interrupted in stage '{stage.name}' ({kept}checkpoints of '{stage.name}' are kept); the same "
+                    "command resumes there"
+                ) from error
     return seconds
-
-
-def _start_another(
-    left: Sequence[tuple[Stage, StageContext]], finished: Container[str], background: Background
-) -> None:
-    """Starts the first of the stages left that may run in the background, has its inputs and is out of date."""
-    for stage, context in left:
-        ready = background.stage is None and all(name in finished for name in stage.upstream)
-        if ready and stage.background is not None and _is_unfinished(stage, context) and stage.background(context):
-            background.start(stage, context)
-
-
-def _interrupted(running: Sequence[str], finished: Sequence[str]) -> StageInterrupted:
-    names = " and ".join(f"'{name}'" for name in running)
-    kept = f"finished and kept: {', '.join(finished)}; " if finished else ""
-    return StageInterrupted(
-        f"interrupted in {'stages' if len(running) > 1 else 'stage'} {names} ({kept}checkpoints of {names} are kept); "
-        "the same command resumes there"
-    )
 
 
 def _plan(stages: Sequence[Stage], path: Path) -> None:
@@ -213,7 +157,7 @@ def _record(run_dir: Path, name: str) -> Path:
     return run_dir / "stages" / f"{name}.json"
 
 
-def run_stage(stage: Stage, context: StageContext) -> float:
+def _run_stage(stage: Stage, context: StageContext) -> float:
     """Runs one stage and writes its record; returns its duration, including interrupted runs [s]."""
     interrupted = _record(context.run_dir, stage.name).with_suffix(".interrupted.json")
     before = read_json(interrupted) if interrupted.is_file() else {}

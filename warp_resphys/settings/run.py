@@ -63,14 +63,11 @@ class ParallelSettings(Settings):
     """Processes that share the work."""
 
     processes: Natural | None = setting(1, "number of processes; null: one for each core")
-    backend: Literal["local", "ray", "dask"] = setting(
-        "local", "processes of this machine, or of a cluster with the same folders"
+    address: Word | None = setting(
+        None,
+        "address of a Dask cluster with the same folders, such as tcp://head:8786; null: this machine",
     )
-    address: Word | None = setting(None, "address of the cluster, such as ray://head:10001; null: a local cluster")
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
-    background: bool = setting(
-        True, "whether a network is trained in a second process beside other stages, where a core is free"
-    )
 
 
 class PublishedSettings(Settings):

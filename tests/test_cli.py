@@ -23,7 +23,7 @@ from pydantic import ConfigDict
 from support.command_line import outcome
 from support.main_job import end_of
 from warp_resphys import __version__, cli, commands, launch
-from warp_resphys.cli import NOBODY_READS
+from warp_resphys.commands import NOBODY_READS
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.labels import run_label
 from warp_resphys.io.setting_errors import keys

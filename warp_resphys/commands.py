@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -19,6 +21,22 @@ from .io.labels import OWN_OPTIONS
 
 CONFIG_PACKAGE: Final = "warp_resphys.conf"
 USER_ERROR: Final = 2  # exit code of an error that the user can fix
+NOBODY_READS: Final = 141  # exit code where the reader of the output has closed the pipe: 128 + SIGPIPE
+
+
+@contextmanager
+def ends_where_nobody_reads() -> Iterator[None]:
+    """Ends the process silently when the reader of its output has closed the pipe, as `head` does."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        try:
+            print(flush=True)  # Another pipe may have broken.
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes again at exit.
+            raise SystemExit(NOBODY_READS) from None
+        raise
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from .commands import CONFIG_PACKAGE, USER_ERROR, configuration
+from .commands import CONFIG_PACKAGE, USER_ERROR, configuration, ends_where_nobody_reads
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
@@ -64,7 +64,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         started = True
         try:
             if shown is not None:
-                _show(config, shown)
+                with ends_where_nobody_reads():
+                    _show(config, shown)
                 return None
             module, _, name = function.partition(":")
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -73,7 +74,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             with uncollected():
                 run = getattr(import_module(f"{__package__}.{module}"), name)
             settings, *_ = get_type_hints(run).values()
-            return run(parse(settings, values), folder)
+            with ends_where_nobody_reads():
+                return run(parse(settings, values), folder)
         except Exception as error:
             sentence = _explain(error, started)
             if sentence is None or full_error:

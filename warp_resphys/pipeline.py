@@ -21,7 +21,7 @@ from .energies.law_files import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
-from .experiment.duration import estimate, may_be_long, remedies
+from .experiment.duration import announcement
 from .experiment.evaluate import check_mesh, evaluate, time_models
 from .experiment.experiment import LEARNED
 from .experiment.files import (
@@ -326,7 +326,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     folds = folds_of(run)
     if folds is None:
         stages = learning_stages(run, split_of(run), ".", acquired)
-        _announce(run, stages, folder)
+        _announce(run, stages, folder, workers_of(run))
         run_stages(stages, folder)
         metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
@@ -339,20 +339,10 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     _print(metrics, folder, run)
 
 
-def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, times: float = 1.0) -> None:
-    """Logs how long the unfinished stages of a split take, unless that is short.
-
-    Args:
-        run: settings of the run.
-        stages: of a split.
-        folder: of the split.
-        times: factor of the duration, as of several folds.
-    """
+def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, workers: Workers, times: float = 1.0) -> None:
+    """Logs how long the unfinished stages of a split take, unless that is short; see `announcement`."""
     left = unfinished(stages, folder)
-    if not left or not may_be_long(left, folder):
-        return
-    expected = estimate(left, folder)
-    if sentence := expected.sentence(remedies(left, run.budget == "quick"), times):
+    if left and (sentence := announcement(left, folder, run.budget == "quick", workers, times)):
         log.info("%s", sentence)
 
 
@@ -366,7 +356,8 @@ def _run_folds(
     }
     left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
     if left:
-        _announce(run, left[0].stages(ALONE), left[0].folder, len(left) / workers_of(run).at_most(len(left)).count)
+        times = len(left) / workers_of(run).at_most(len(left)).count
+        _announce(run, left[0].stages(ALONE), left[0].folder, ALONE, times)
     run_folds(folds, workers_of(run))
     metrics = {}
     for name, fold in folds.items():

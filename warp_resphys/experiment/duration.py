@@ -1,30 +1,24 @@
-"""The expected duration of a run: a few steps of its simulators on its trials, times the steps of its stages.
+"""The expected duration of a run: the time of a step and of a reconstructed one, times their numbers.
 
-The bodies move as fast as if they had fallen a tenth of their length. Forces are reconstructed that support a fifth of
-their weight, from rest, as bodies that start fast need far more iterations in the first step. Networks are trained for
-an epoch on random samples. Reports, laws of materials, other bodies and control have no estimate.
+The steps are those of bodies that fall from rest, under the inputs in the middle of the trials; the reconstructed
+forces support a fifth of their weight. Reports, laws of materials, other bodies and control have no estimate.
 """
 
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
-from typing import Any, Final
 
 import torch
 
-from ..dynamics.simulator import Simulator
 from ..io.errors import number_of
+from ..io.fan_out import ALONE, Workers
 from ..io.stages import Stage
-from ..learning.parameters import configured_parameters, split_name
 from ..learning.reconstruction import make_reconstructor
-from ..learning.replay import Replay, Start
-from ..learning.training import Samples, SequenceTrainer, Trainer
 from ..report.page import duration_text
-from ..settings.learning import RangeSettings
 from ..settings.stages import (
     EvaluateStage,
     IdentifyStage,
@@ -35,376 +29,153 @@ from ..settings.stages import (
     TimeStage,
     TrainStage,
 )
-from ..stepping.state import State
-from .build import choose_device
 from .experiment import MODELS, Experiment
-from .learn import new_network
 from .models import SIMFREE
-from .prediction_intervals import INTERVAL_MODELS
 from .trials import evenly
 
 log = logging.getLogger(__name__)
 
-LEAST_SECONDS: Final = 60.0  # of the estimates that are shown
-_CALLS, _MEASURED = 3, 0.5  # calls that are timed, and seconds after which no further one begins
-_MOST_TRIALS = 16  # that are simulated for the estimate
-_FALL, _SUPPORTED = 0.1, 0.2
-_EVALUATIONS = 0.5  # typical number of evaluations of a search, over the largest
-_ITERATIONS = 1.3  # evaluations of the loss in an iteration of L-BFGS
-_SHOWN = 3  # stages
-_SHORT = 1e6  # steps times vertices of all reconstructed trials that take about a minute
+_LEAST_SECONDS = 60.0  # of the estimates that are shown
+_SHORT = 8e6  # steps times vertices that take less than that
+_RECONSTRUCTION = 8.0  # steps that take as long as a reconstructed one, before that is timed
+_VARIED, _GRADIENT = 0.2, 1.5  # time of one more set of parameters, and of a step with its gradient, over a step's
+_ITERATION = 1.3  # losses in an iteration of L-BFGS
+_BATCH, _RATE = 1e-3, 5e10  # time of a batch of a small network [s], and operations a second
+_SUPPORTED, _MOST_TRIALS = 0.2, 16  # share of the weight, and trials that are timed
 
 
-@dataclass(frozen=True)
-class ExpectedDuration:
-    """Expected duration of the stages of one split.
-
-    Attributes:
-        seconds: by stage [s].
-        without: names of stages that have no estimate.
-        vertices: of the simulated body.
-        at_once: time during which two stages run [s].
-    """
-
-    seconds: Mapping[str, float]
-    without: Sequence[str] = ()
-    vertices: int = 0
-    at_once: float = 0.0
-
-    @property
-    def total(self) -> float:
-        """From the first stage with an estimate to the last [s]."""
-        return sum(self.seconds.values()) - self.at_once
-
-    def sentence(self, remedies: Sequence[str], times: float = 1.0) -> str:
-        """Returns the estimate in words; empty for less than a minute.
-
-        Args:
-            remedies: changes of the configuration that make the run shorter.
-            times: factor of the duration, as of several folds.
-        """
-        if self.total * times < LEAST_SECONDS:
-            return ""
-        longest = sorted(self.seconds, key=lambda name: -self.seconds[name])[:_SHOWN]
-        parts = ", ".join(f"{name} {duration_text(times * self.seconds[name])}" for name in longest)
-        without = f", without {', '.join(self.without)}" if self.without else ""
-        took = f"about {duration_text(times * self.total)} more for {self.vertices:,} vertices"
-        return f"{took}{without} (longest: {parts}); shorter with {', '.join(remedies)}."
-
-
-def may_be_long(stages: Sequence[Stage], folder: Path) -> bool:
-    """Whether stages may take over a minute: those that identify, or reconstruct many steps.
+def announcement(
+    stages: Sequence[Stage], folder: Path, quick: bool, workers: Workers = ALONE, times: float = 1.0
+) -> str:
+    """Returns the expected duration of stages in words, and what makes them shorter; empty for less than a minute.
 
     Args:
-        stages: of one split.
-        folder: of the split; its dataset exists.
+        stages: of one split, in a folder with its dataset.
+        folder: of the split.
+        quick: whether the run is a first look already.
+        workers: of reconstructions and roll-outs.
+        times: factor of the duration, as of several folds.
     """
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
-    work = 0.0
-    for settings in (stage.settings for stage in stages):
-        if isinstance(settings, IdentifyStage):
-            return True
-        if isinstance(settings, ReconstructStage):
-            experiment, names = Experiment(settings, folder, "count"), settings.reconstructed
-            steps = _Pace(experiment, {}).steps(experiment.simulator("simulation"), names)
-            work += steps * len(names) * experiment.body.n_vertices
-    return work > _SHORT
+    own = {one.name: one.settings for one in stages if isinstance(one.settings, LearningStage)}
+    experiments = {name: Experiment(settings, folder, "count") for name, settings in own.items()}
+    works = {name: work for name, one in experiments.items() if (work := work_of(one)) is not None}
+    amount = times * sum(steps + _RECONSTRUCTION * forces for steps, forces, _ in works.values())
+    vertices = next(iter(experiments.values())).body.n_vertices if works else 0
+    if amount * vertices < _SHORT:
+        return ""
+    paces, seconds = dict[bool, float](), dict[str, float]()
+    for name, (steps, forces, training) in works.items():
+        try:
+            for reconstructed, number in ((False, steps), (True, forces)):
+                if number and reconstructed not in paces:
+                    paces[reconstructed] = pace_of(experiments[name], reconstructed)
+        except Exception as error:  # An estimate never ends a run.
+            log.debug("%s has no estimate: %s", name, error)
+            continue
+        shared = min(workers.count, _parts(experiments[name].settings))
+        seconds[name] = times * (steps * paces.get(False, 0.0) + forces * paces.get(True, 0.0) + training) / shared
+    if sum(seconds.values()) < _LEAST_SECONDS:
+        return ""
+    longest = sorted(seconds, key=lambda name: -seconds[name])[:3]
+    parts = ", ".join(f"{name} {duration_text(seconds[name])}" for name in longest)
+    others = [one.name for one in stages if one.name not in seconds and not isinstance(one.settings, ReportStage)]
+    without = f", without {', '.join(others)}" if others else ""
+    shorter = ["a coarser mesh", "fewer or shorter trials"]
+    most = max((len(one.identify.parameters) for one in own.values() if isinstance(one, IdentifyStage)), default=0)
+    shorter += [f"fewer of the {number_of(most, 'parameter')} of identify.parameters"] if most > 1 else []
+    shorter += [] if quick else ["or at first budget=quick"]
+    took = f"about {duration_text(sum(seconds.values()))} more for {vertices:,} vertices"
+    return f"{took}{without} (longest: {parts}); shorter with {', '.join(shorter)}."
 
 
-def estimate(stages: Sequence[Stage], folder: Path, background: bool = False) -> ExpectedDuration:
-    """Measures a few steps and returns the expected duration of stages of one split.
-
-    Args:
-        stages: to estimate.
-        folder: of the split; its dataset exists.
-        background: whether a second process trains networks.
-    """
-    seconds, without, vertices = dict[str, float](), list[str](), 0
-    known = dict[tuple[Any, ...], float]()
-    for stage in stages:
-        settings = stage.settings
-        own = None
-        if isinstance(settings, LearningStage):
-            pace = _Pace(Experiment(settings, folder, "count"), known)
-            vertices = pace.experiment.body.n_vertices
-            try:
-                own = pace.stage()
-            except Exception as error:  # An estimate never ends a run.
-                log.debug("%s has no estimate: %s", stage.name, error)
-        if own is not None:
-            seconds[stage.name] = own
-        elif not isinstance(settings, ReportStage):
-            without.append(stage.name)
-    at_once = sum(seconds.values()) - _elapsed(stages, seconds) if background else 0.0
-    return ExpectedDuration(seconds, without, vertices, at_once)
-
-
-def _elapsed(stages: Sequence[Stage], seconds: Mapping[str, float]) -> float:
-    """Time that stages take [s] if a second process runs some of them, in the order of `io.stages.run_stages`."""
-    left, now, ends = {stage.name for stage in stages}, 0.0, dict[str, float]()
-    for number, stage in enumerate(stages):
-        if stage.name in ends:
-            now = max(now, ends[stage.name])
-        else:
-            for other in stages[number + 1 :]:
-                if other.background is not None and not left & {*ends, *other.upstream}:
-                    ends[other.name] = now + seconds.get(other.name, 0.0)
-            now += seconds.get(stage.name, 0.0)
-        left.remove(stage.name)
-    return now
-
-
-def remedies(stages: Sequence[Stage], quick: bool) -> list[str]:
-    """Changes of the configuration that make stages shorter.
-
-    Args:
-        stages: of one split.
-        quick: whether the run is a first look already.
-    """
-    named = ["a coarser mesh", "fewer or shorter trials"]
-    count = max((len(own.settings.identify.parameters) for own in stages if own.name == "identify"), default=0)
-    named += [f"fewer of the {number_of(count, 'parameter')} of identify.parameters"] if count > 1 else []
-    return named if quick else [*named, "or at first budget=quick"]
+def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
+    """Returns the numbers of steps and of reconstructed steps of single trials, and the time of other training [s]."""
+    settings = experiment.settings
+    train, judged = settings.split.train, settings.split.validation or settings.split.train
+    match settings:
+        case IdentifyStage(identify=wanted):
+            names = train if wanted.trials is None else evenly(train, wanted.trials)
+            evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
+            candidates = wanted.candidates if wanted.starts > 1 else 0
+            searches = {"sysid": len(wanted.parameters), "sysid_elastic": len(wanted.elastic or {})}
+            each = {m: evaluations * (1.0 + _VARIED * number) + candidates for m, number in searches.items() if number}
+            points = [axis.points for axis in dict(wanted.grid or {}).values() if axis is not None]
+            shown = math.prod(points) * steps_of(experiment, "sysid", names) if wanted.landscape and points else 0.0
+            return sum(number * steps_of(experiment, m, names) for m, number in each.items()) + shown, 0.0, 0.0
+        case ReconstructStage():
+            return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
+        case TrainStage(model=model, training=training):
+            trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
+            looped, loop = 0.0, training.in_the_loop
+            if loop is not None and model != SIMFREE:
+                held_out = loop.start == "zero" and loop.hold_out and not settings.split.validation
+                epoch = _ITERATION * _GRADIENT * trained + rolled
+                looped = (loop.epochs + 1) * epoch * (len(train) if held_out else 1)
+                if loop.start == "zero":
+                    return looped, 0.0, 0.0
+            network, trainer = training.network, training.trainer
+            coder = 9 * experiment.body.n_vertices if network.kind == "nodal" else 0
+            weights = network.width * (network.blocks * network.layers * network.width + coder)
+            batch = _BATCH + 6.0 * weights * trainer.batch_size / _RATE
+            replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
+            return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * batch
+        case EvaluateStage():
+            tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
+            return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
+        case TimeStage():  # Three rows, one trial at a time, which takes about twice as long.
+            return 6.0 * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
+        case MeshCheckStage():
+            finer = 1.0 + settings.mesh_check**3
+            return finer * steps_of(experiment, "simulation", settings.groups["1"]), 0.0, 0.0
+    return None
 
 
-@dataclass(frozen=True)
-class _Pace:
-    """Durations of the parts of a stage.
+def steps_of(experiment: Experiment, model: str, names: Sequence[str]) -> float:
+    """Returns the number of steps of a model's simulator in trials, the longest of those that begin alike; 1 a pose."""
+    settings, total = experiment.settings, 0.0
+    kind = MODELS[model][0]
+    time_step = experiment.settings_of("simulation" if kind == "law" else kind).time_step
+    for batch in experiment.batches(names):
+        limits = [float(experiment.trials(batch).times.max()), settings.trial_seconds]
+        limits += [settings.identify.seconds] if isinstance(settings, IdentifyStage) else []
+        seconds = min(limit for limit in limits if limit is not None)
+        total += len(batch) * max(math.ceil(seconds / time_step - 1e-6), 1)
+    return total
 
-    Attributes:
-        experiment: of the settings of the stage.
-        known: durations that were measured for other stages [s].
-    """
 
-    experiment: Experiment
-    known: dict[tuple[Any, ...], float]
+def _parts(settings: LearningStage) -> int:
+    """Number of parts of a stage that workers can do at the same time."""
+    names = settings.reconstructed if isinstance(settings, ReconstructStage) else ()
+    names = settings.groups["1"] if isinstance(settings, EvaluateStage) else names
+    return max(math.ceil(len(names) / (settings.batch or len(names) or 1)), 1)
 
-    def stage(self) -> float | None:
-        """Duration of the stage [s]; None if it is unknown."""
-        match self.experiment.settings:
-            case IdentifyStage() as settings:
-                return self._identify(settings)
-            case ReconstructStage() as settings:
-                return self._each(settings.model, settings.reconstructed, self._reconstructed_step)
-            case TrainStage() as settings:
-                return self._train(settings)
-            case EvaluateStage() as settings:
-                return self._evaluate(settings)
-            case TimeStage() as settings:
-                names = self.experiment.moving(settings.groups["1"])
-                return 3.0 * sum(self._each("simulation", [name], self._step) for name in names)
-            case MeshCheckStage() as settings:
-                whole = self._each("simulation", settings.groups["1"], self._step)
-                return whole * (1.0 + settings.mesh_check**3)
-        return None
 
-    def _evaluate(self, settings: EvaluateStage) -> float:
-        """Duration of the roll-outs of the test trials, and of those for the prediction intervals [s]."""
-        tested = [name for group in settings.groups.values() for name in group]
-        models = [model for model in self.experiment.models if model != SIMFREE]
-        seconds = sum(self._each(model, tested, self._step) for model in models)
-        calibrated = [model for model in INTERVAL_MODELS if model in models]
-        return seconds + sum(self._each(model, settings.calibration, self._step) for model in calibrated)
-
-    def _identify(self, settings: IdentifyStage) -> float:
-        wanted, names = settings.identify, settings.split.train
-        names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
-        searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-        candidates = wanted.candidates if wanted.starts > 1 else 0
-        points = 1
-        for axis in dict(wanted.grid).values() if wanted.landscape and wanted.grid is not None else ():
-            points *= axis.points if axis is not None else 1
-        seconds = 0.0
-        for model, search in searches.items():
-            if search:
-                evaluations = _EVALUATIONS * wanted.starts * wanted.max_evaluations
-                released = any(self.experiment.begins(name) == "released" for name in names)
-                evaluations *= 1.5 if released else 1.0  # Releases are estimated again.
-                seconds += evaluations * self._evaluation(model, search, names)
-                seconds += candidates * self._each(model, names, self._step)
-        landscape = points * self._each("sysid", names, self._step) if points > 1 else 0.0
-        return seconds + landscape
-
-    def _evaluation(self, model: str, search: Mapping[str, RangeSettings], names: Sequence[str]) -> float:
-        """Duration of the loss and its derivatives by all parameters [s]."""
-        simulator, sets = self.experiment.simulator(MODELS[model][0]), 1 + len(search)
-        values = configured_parameters(simulator, [split_name(name)[0] for name in search])
-        settings = self.experiment.settings
-        assert isinstance(settings, IdentifyStage)
-        values = {name: settings.identify.first_guess.get(name, value) for name, value in values.items()}
-        parameters = {name: simulator.tensor([value] * sets) for name, value in values.items()}
-
-        def calls(replay: Replay) -> Callable[[], Any]:
-            short = Replay(simulator, replay.observe, replay.trials.first((_CALLS + 0.5) * simulator.time_step))
-            if short.is_static:
-                start = Start.resting(simulator.rest_positions.expand(len(short.trials.names), -1, -1))
-                return lambda: short.varied(start, parameters)
-            state = _moving(simulator, len(short.trials.names))
-            start = Start(state, state.q.new_zeros(state.batch))
-            steps = max(short.steps(start), 1)
-            return lambda: [short.varied(start, parameters) for _ in range(max(_CALLS // steps, 1))]
-
-        return self._each(model, names, calls, together=_CALLS, parameters=len(search))
-
-    def _train(self, settings: TrainStage) -> float:
-        training, model, split = settings.training, settings.model, settings.split
-        judged = split.validation or split.train
-        loop = training.in_the_loop
-        if loop is not None and model != SIMFREE:
-            epoch = _ITERATIONS * self._each(model, split.train, self._step_and_adjoint)
-            epoch += self._each(model, judged, self._step)
-            held_out = loop.start == "zero" and loop.hold_out and not split.validation and len(split.train) > 1
-            in_the_loop = loop.epochs * epoch * (len(split.train) if held_out else 1.0)
-            if loop.start == "zero":
-                return in_the_loop
-        else:
-            in_the_loop = 0.0
-        trainer, rollouts = training.trainer, training.trainer.epochs / training.trainer.rollout_every
-        rolled = 0.0 if model == SIMFREE else self._each(model, judged, self._step)
-        return in_the_loop + trainer.epochs * self._epoch(settings) + rollouts * rolled
-
-    def _epoch(self, settings: TrainStage) -> float:
-        """Duration of an epoch of a network on the steps of the training trials [s]."""
-        experiment, training = self.experiment, settings.training
-        simulator = experiment.model_simulator(settings.model)
-        count = sum(self.steps(simulator, [name]) for name in settings.split.train)
-        rest = experiment.like.to(choose_device(settings.device), torch.float32)
-        used = min(count, 4 * training.trainer.batch_size)
-        q, v, force = (torch.randn(used, *rest.shape).to(rest) for _ in range(3))
-        names = settings.split.train[:1]
-        inputs = experiment.conditions(experiment.replay(simulator, names), {}, settings.model == SIMFREE)
-        actuation = None if inputs is None else inputs.flatten(0, -2)[:1].to(rest).expand(used, -1)
-        samples = Samples(rest + 1e-3 * q, v, (force, v) if settings.model == SIMFREE else (force,), actuation, (used,))
-        network = new_network(experiment, settings.model, samples, training)
-        kind = Trainer if network.recurrent is None else SequenceTrainer
-        trainer = kind(network, samples, samples, lambda _: 0.0, training.trainer, 0)
-        return _timed(trainer.run_epoch) * count / used
-
-    def _each(
-        self,
-        model: str,
-        names: Sequence[str],
-        calls: Callable[[Replay], Callable[[], Any]],
-        together: int = 1,
-        parameters: int = 0,
-    ) -> float:
-        """Duration of the steps of trials [s].
-
-        Args:
-            model: whose simulator is used.
-            names: of the trials.
-            calls: returns a function of some trials, whose calls are timed.
-            together: number of steps of a call.
-            parameters: number of parameters that a call differentiates by.
-        """
-        seconds, simulator = 0.0, self._simulator(model)
-        for batch in self.experiment.batches(names):
-            size = min(self.experiment.settings.batch or len(batch), len(batch))
-            probed = batch[: min(size, _MOST_TRIALS)]
-            replay = self.experiment.replay(simulator, probed)
-            steps = 1.0 if replay.is_static else self.steps(simulator, batch) / together
-            same = (calls.__name__, parameters, repr(simulator), simulator.integrator, replay.is_static)
-            seconds += self._a_call(same, len(probed), partial(calls, replay)) * len(batch) / len(probed) * steps
-        return seconds
-
-    def _a_call(self, same: tuple[Any, ...], trials: int, make: Callable[[], Callable[[], Any]]) -> float:
-        """Duration of a call for some trials [s]; slow ones are measured for one number of trials alone."""
-        slow = {n: t for (*key, n), t in self.known.items() if tuple(key) == same and t > _MEASURED}
-        if (*same, trials) not in self.known and slow:
-            most = max(slow)
-            return slow[most] * trials / most
-        if (*same, trials) not in self.known:
-            self.known[*same, trials] = _timed(make())
-        return self.known[*same, trials]
-
-    def _simulator(self, model: str) -> Simulator:
-        """Simulator of a model, without a law, which is not identified yet."""
-        kind = MODELS[model][0]
-        plain = kind in ("law", "identified") and self.experiment.settings.identified is None
-        return self.experiment.simulator("simulation" if plain else kind)
-
-    def steps(self, simulator: Simulator, names: Sequence[str]) -> int:
-        """Number of steps of the longest trial; the end of the dataset for those that are read in part."""
-        replay = self.experiment.trials(names)
-        limit = float(replay.times.max())
-        if isinstance(self.experiment.settings, IdentifyStage):
-            limits = (limit, self.experiment.settings.trial_seconds, self.experiment.settings.identify.seconds)
-            limit = min(own for own in limits if own is not None)
-        return max(math.ceil(limit / simulator.time_step - 1e-6), 1)
-
-    def _step(self, replay: Replay) -> Callable[[], Any]:
-        """Function that simulates a step; that of poses solves for their equilibrium."""
-        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
-        if replay.is_static:
-            return lambda: simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names))
-        state = _moving(simulator, len(replay.trials.names))
-
-        def step() -> None:
-            nonlocal state
-            state = simulator.step(state, inputs.at(0), constants)[0]
-
-        return torch.no_grad()(step)
-
-    def _step_and_adjoint(self, replay: Replay) -> Callable[[], Any]:
-        """Function that simulates a step and computes its gradient."""
-        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
-        state = _moving(simulator, len(replay.trials.names))
-
-        def step() -> None:
-            force = torch.zeros_like(state.q).requires_grad_()
-            if replay.is_static:
-                new = simulator.static_equilibrium(resting.plus(force), constants)
-            else:
-                new = simulator.step(state, inputs.at(0).plus(force), constants)[0]
-            new.q.sum().backward()
-
-        return step
-
-    def _reconstructed_step(self, replay: Replay) -> Callable[[], Any]:
-        """Function that reconstructs the forces of a step."""
-        settings = self.experiment.settings
+def pace_of(experiment: Experiment, reconstructed: bool) -> float:
+    """Returns the time of a step of one of several trials, or of the reconstruction of its forces [s]."""
+    settings = experiment.settings
+    names = experiment.batches(settings.split.train)[0][: min(settings.batch or _MOST_TRIALS, _MOST_TRIALS)]
+    replay = experiment.replay(experiment.simulator("simulation"), names)
+    simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
+    if replay.is_static:
+        simulator = replace(simulator, time_step=1e6, integrator="implicit_euler")
+    state, method, seconds = simulator.rest_state(len(names)), None, list[float]()
+    if reconstructed:
         assert isinstance(settings, ReconstructStage)
-        simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
-        if replay.is_static:
-            simulator, inputs = replace(simulator, time_step=1e6, integrator="implicit_euler"), resting
         method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
         method = method.with_constants(constants)
-        state = simulator.rest_state(len(replay.trials.names))
-        support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None]
-        acting = inputs if replay.is_static else inputs.at(0)
-
-        def step() -> None:
-            nonlocal state
-            with torch.no_grad():
-                target = simulator.step(state, acting.plus(support.expand_as(state.q)), constants)[0]
-            state = method.step(state, replay.observe(target.q), acting).state.detach()
-
-        return step
-
-
-def _moving(simulator: Simulator, batch: int) -> State:
-    """Undeformed bodies that swing sideways, the faster the farther from where they are fixed."""
-    state = simulator.rest_state(batch)
-    q = simulator.rest_positions
-    size = q.amax(0) - q.amin(0)
-    held = q[simulator.fixed].mean(0) if len(simulator.fixed) else q.mean(0)
-    away = (q - held).norm(dim=1)
-    speed = math.sqrt(2.0 * 9.81 * _FALL * float(size.max()))
-    v = torch.zeros_like(q)
-    v[:, int(size.argmin())] = speed * away / away.max()
-    v[simulator.fixed] = 0.0
-    return replace(state, v=v.expand_as(state.q).clone())
-
-
-def _timed(call: Callable[[], Any]) -> float:
-    """Mean duration of a few calls after a first one, which may compile kernels [s]."""
-    begin = time.perf_counter()
-    call()
-    first = time.perf_counter()
-    if first - begin > _MEASURED:
-        return first - begin
-    count = 0
-    while count < _CALLS and time.perf_counter() - first < _MEASURED:
-        call()
-        count += 1
-    return (time.perf_counter() - first) / count
+    support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None] * torch.ones_like(state.q)
+    middle = round(float(replay.trials.times.max()) / simulator.time_step) // 2  # where inputs act
+    for k in count():
+        acting = resting if replay.is_static else inputs.at(middle + k)
+        begin = time.perf_counter()
+        with torch.no_grad():
+            target = simulator.step(state, acting if method is None else acting.plus(support), constants)[0]
+        if method is not None:
+            begin = time.perf_counter()
+            target = method.step(state, replay.observe(target.q), acting).state.detach()
+        state = state if replay.is_static else target
+        seconds.append(time.perf_counter() - begin)
+        if k == 4 or sum(seconds[1:]) > 0.5:  # The first step may compile kernels.
+            return sum(seconds[1:]) / k / len(names)
+    raise AssertionError

@@ -69,8 +69,8 @@ def test_shorter_trials_end_with_nan():
     assert padded([np.ones((1, 2), int)]).dtype == int
 
 
-def test_workers_of_clusters_are_counted_and_compute_on_cpus():
-    assert workers_for(ParallelSettings(), 3, "cpu") == Workers(3, "local", None)
+def test_workers_of_clusters_are_counted():
+    assert workers_for(ParallelSettings(), 3, "cpu") == Workers(3, None)
     assert workers_for(ParallelSettings(), None, "cpu").count >= 1
-    with pytest.raises(InputError, match="dask cluster"):
+    with pytest.raises(InputError, match="workers of the Dask cluster"):
         workers_for(ParallelSettings(address="tcp://head:8786"), None, "cpu")

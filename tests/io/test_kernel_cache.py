@@ -1,5 +1,6 @@
 """Warp's cache of compiled kernels if it is not writable, as in many containers."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -7,6 +8,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import warp as wp
+
+from warp_resphys.io.errors import InputError
+from warp_resphys.io.kernel_cache import ensure_kernel_cache
 
 PROGRAM = """
 import subprocess, sys
@@ -25,6 +30,7 @@ if len(sys.argv) == 1:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["HOME", "WARP_CACHE_PATH"])
 def test_a_cache_that_cannot_be_made_is_a_temporary_one(name, tmp_path):
     """No folder can be created below a regular file, not even by root."""
@@ -49,38 +55,32 @@ def test_a_cache_that_cannot_be_made_is_a_temporary_one(name, tmp_path):
     assert "Traceback" not in run.stderr
 
 
-READ_ONLY = """
-import errno, os, sys, tempfile
-from pathlib import Path
-import warp as wp
-from warp_resphys.io.kernel_cache import ensure_kernel_cache
+@pytest.fixture
+def read_only(tmp_path, monkeypatch):
+    """A cache with a kernel, in which no file can be made; a folder for temporary files."""
 
-def refuse(*_, **__):
-    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-tempfile.TemporaryFile, tempfile.tempdir = refuse, sys.argv[1]
-kernels = Path(os.environ["WARP_CACHE_PATH"], wp.config.version, "wp_warp_resphys.float64_0")
-kernels.mkdir(parents=True)
-(kernels / "kernels.o").write_text("compiled")
-ensure_kernel_cache()
-assert os.environ["WARP_CACHE_PATH"] == wp.config.kernel_cache_dir
-print(Path(wp.config.kernel_cache_dir, wp.config.version, kernels.name, "kernels.o").read_text())
-"""
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "cache"))
+    kernels = tmp_path / "cache" / wp.config.version / "wp_warp_resphys.float64_0"
+    kernels.mkdir(parents=True)
+    (kernels / "kernels.o").write_text("compiled")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return kernels
 
 
-def in_a_read_only_cache(tmp_path, temporary):
-    """Output and errors of a process in whose cache no file can be made."""
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
-    command = [sys.executable, "-c", READ_ONLY, str(temporary)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    return done.stdout, done.stderr
+def test_kernels_of_a_cache_that_can_only_be_read_are_used(read_only, capsys):
+    ensure_kernel_cache()
+    folder = Path(wp.config.kernel_cache_dir)
+    assert os.environ["WARP_CACHE_PATH"] == str(folder) != str(read_only.parents[1])
+    assert (folder / wp.config.version / read_only.name / "kernels.o").read_text() == "compiled"
+    assert "Read-only file system" in capsys.readouterr().err
 
 
-def test_kernels_of_a_cache_that_can_only_be_read_are_used(tmp_path):
-    out, err = in_a_read_only_cache(tmp_path, tmp_path)
-    assert out == "compiled\n"
-    assert "Read-only file system" in err
-
-
-def test_without_any_writable_folder_it_is_an_error(tmp_path):
-    assert "InputError: Warp's cache" in in_a_read_only_cache(tmp_path, tmp_path / "nowhere")[1]
+def test_without_any_writable_folder_it_is_an_error(read_only, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(read_only / "nowhere"))
+    with pytest.raises(InputError, match="Warp's cache"):
+        ensure_kernel_cache()

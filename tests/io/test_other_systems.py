@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from warp_resphys.io import atomic, fan_out, memory
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.machine import available_cores, hardware
-from warp_resphys.io.stages import run_lock
 from warp_resphys.studies import runs
 
 UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
@@ -55,19 +53,6 @@ def test_cores_and_processor_without_linux(monkeypatch):
     monkeypatch.setattr("warp_resphys.io.machine._CPU_INFO", Path("missing"))
     assert available_cores() == os.cpu_count()
     assert hardware()["processor"]
-
-
-def test_a_locked_run_folder_is_refused_by_filelock(tmp_path):
-    path = str(tmp_path / ".lock")
-    program = f"import filelock, time; lock = filelock.FileLock({path!r}); lock.acquire(); print(1, flush=True); "
-    with subprocess.Popen([sys.executable, "-c", program + "time.sleep(60)"], stdout=subprocess.PIPE) as other:
-        other.stdout.readline()
-        with pytest.raises(InputError, match="another process is writing"), run_lock(tmp_path):
-            pass
-        other.kill()
-        other.wait()
-        with run_lock(tmp_path):
-            pass
 
 
 def test_files_are_written_where_folders_cannot_be_synchronised(tmp_path, monkeypatch):

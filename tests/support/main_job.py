@@ -41,7 +41,7 @@ def end_of(program, *arguments):
 def without_reports():
     """Replaces reports and estimates of durations, which take most of a tiny run's time and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "may_be_long", lambda stages, folder: False)
+        patch.setattr(pipeline, "announcement", lambda *arguments: "")
         for name in ("make_report", "make_folds_report"):
             patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
         yield

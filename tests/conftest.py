@@ -36,10 +36,17 @@ LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_ru
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", choices=["cpu", "cuda"], help="device of the tests marked validation")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if item.path.parent.name in NUMERICAL:
+        folder = item.path.parent.name
+        if folder in NUMERICAL:
             item.add_marker("numerics")
+        elif folder == "validation":
+            item.add_marker("validation")
 
 
 @pytest.fixture(params=DEVICES)

@@ -314,7 +314,7 @@ class TestCommands:
             module, function = f"warp_resphys.{entry.function}".split(":")
             monkeypatch.setitem(sys.modules, module, sys.modules.get(module, types.ModuleType(module)))
             monkeypatch.setattr(sys.modules[module], function, recorder(name), raising=False)
-        for name in ("verify", "verify_gradients", "view_film"):
+        for name in ("check", "inspect", "view_film"):
             (config_dir / f"{name}.yaml").write_text("defaults: [config, _self_]\nfiles: []\nrun: null")
         return called
 
@@ -325,9 +325,9 @@ class TestCommands:
             ("run", "run", 0),
             ("seed=1", "run", 1),
             ("view film seed=2", "view film", 2),
-            ("seed=3 verify gradients", "verify gradients", 3),
-            ("--run verify +extra=1 ~material gradients", "verify gradients", 0),
-            ("--config-dir . verify", "verify", 0),
+            ("seed=3 view film", "view film", 3),
+            ("--run view +extra=1 ~material film", "view film", 0),
+            ("--config-dir . check", "check", 0),
         ],
     )
     def test_the_first_words_are_the_command(self, command, calls, arguments, name, seed):
@@ -336,11 +336,10 @@ class TestCommands:
 
     def test_words_after_it_are_values_of_the_key_that_takes_them(self, command, calls, tmp_path):
         (tmp_path / "runs" / "beam" / "seed=1").mkdir(parents=True)
-        assert command("verify", "seed=1", "a.npz", "b c's [1],.npz", "--run") == (0, "")
+        assert command("inspect", "seed=1", "a.npz", "b c's [1],.npz", "--run") == (0, "")
         assert calls[0][1]["files"] == ["a.npz", "b c's [1],.npz"]
         assert command("view", "film", "runs/beam/seed=1") == (0, "")
         assert calls[1][1]["run"] == "runs/beam/seed=1"
-        assert command("verify", "gradients", "a.npz")[1].startswith("error: cannot read the override 'a.npz'")
         assert command("view", "film", "a", "b")[1].startswith("error: cannot read the override 'b'")
         assert len(calls) == 2
 

@@ -147,7 +147,7 @@ for command, entry in commands.COMMANDS.items():
 print(json.dumps(helps))
 """
     helps = json.loads(call(installed / "python", "-c", program, folder=tmp_path))
-    keys = {"run": "seed", "tune": "tune", "inspect": "recording", "verify": "files", "view film": "run"}
+    keys = {"run": "seed", "tune": "tune", "inspect": "recording", "check": "device", "view film": "run"}
     assert keys.keys() < helps.keys()
     for command, (purpose, text, config) in helps.items():
         assert f"warp-resphys {command}: {purpose}\n" in text or command == "run"

@@ -71,16 +71,9 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         ),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),
         "view film": Command("a film of a trial of a run, with any of its models", "studies.film:film", word="run"),
-        "verify": Command(
-            "simulate reference trajectories, and compare every vertex", "studies.verification:verify", words="files"
+        "check": Command(
+            "compare a device with the CPU, and time both, in two minutes", "studies.check:check", word="device"
         ),
-        "verify gradients": Command(
-            "compare adjoint gradients with central differences", "studies.gradient_check:gradcheck"
-        ),
-        "verify device": Command(
-            "compare a device with the CPU, and time both: a page of results", "studies.device_check:check_device"
-        ),
-        "verify contact": Command("contact beside theory: a page of results", "studies.contact_check:contact_check"),
         "train-policy": Command(
             "learn a policy on a run's robot, and try it on its laboratory",
             "studies.policy:train_policy",

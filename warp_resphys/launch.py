@@ -39,7 +39,7 @@ from .io.settings import parse
 
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
-TYPED: Final = ("run", "tune", "verify gradients", "verify device")
+TYPED: Final = ("run", "tune")
 _FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that replace the package's configuration
 # Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")

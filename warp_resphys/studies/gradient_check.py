@@ -2,50 +2,22 @@
 
 import math
 from collections.abc import Callable, Container, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
-import warp as wp
 
 from ..dynamics.simulator import Simulator
-from ..experiment.build import build_simulator
-from ..io.errors import InputError
-from ..io.settings import Count, Natural, Positive, Settings, Some, setting
 from ..mesh.poses import twisted
-from ..settings.body import SimulationSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .tables import Sheet, show
 
 Pose = Literal["rest", "bent", "twisted"]
 POSES: tuple[Pose, ...] = get_args(Pose)
 _HALVINGS = 6  # of the step of a difference
 _ACCURACY = 1e-8  # relative, at which a difference is good enough
 _LEAST = 1e-3  # of the largest derivative, below which one is compared alone
-
-
-class GradientSettings(Settings):
-    """The group ``gradcheck``; ``conf/verify_gradients.yaml`` explains its keys."""
-
-    poses: Some[Pose]
-    poissons_ratios: Some[float]
-    steps: Natural
-    batch: Natural
-    seed: Count
-    change: Positive
-    tolerance: Positive
-    relative_tolerance: Positive
-    mass_damping: Positive = setting(unit="1/s")
-    stiffness_damping: Positive = setting(unit="s")
-
-
-class GradientCheck(SimulationSettings):
-    """The configuration ``verify_gradients``: the simulator whose gradients are checked, and how."""
-
-    gradcheck: GradientSettings
 
 
 @dataclass(frozen=True)
@@ -251,42 +223,3 @@ class _Problem:
         error = total - sum(share * adjoints[k] for k, share in shares.items())
         for k, share in shares.items():
             yield GradientRow(cases[k].title, adjoints[k], adjoints[k] + error / share, abs(uncertainty / share))
-
-
-def gradcheck(settings: GradientCheck, folder: Path) -> None:
-    """Prints a table for every Poisson's ratio and pose; exits with 1 where an error exceeds the tolerance.
-
-    Raises:
-        ResphysError: a value that cannot be simulated, float32, whose rounding error hides differences, or no
-            convergence.
-    """
-    wp.config.log_level = wp.LOG_WARNING
-    check = settings.gradcheck
-    if settings.dtype != "float64":
-        raise InputError(f"dtype is {settings.dtype!r}: gradients are checked in float64.")
-    solver = settings.solver.changed(relative_tolerance=check.relative_tolerance)
-    simulator = build_simulator(settings.changed(solver=solver), settings.simulation)
-    damping = {"mass_damping": check.mass_damping, "stiffness_damping": check.stiffness_damping}
-    largest = 0.0
-    for poissons_ratio in check.poissons_ratios:
-        changed: dict[str, Any] = {"poissons_ratio": poissons_ratio, **damping}
-        materials = {region: replace(material, **changed) for region, material in simulator.materials.items()}
-        checked = replace(simulator, material=materials.get("", materials))
-        for name in check.poses:
-            rows = check_gradients(checked, name, check.steps, check.batch, check.seed, check.change, together=False)
-            show(gradient_sheet(rows, f"nu = {poissons_ratio:g}, {name}", check.tolerance))
-            largest = max([largest, *(row.relative_error for row in rows)])
-    show(f"Largest relative error: {largest:.1e}, {check.tolerance:.0e} allowed.")
-    if not largest <= check.tolerance:
-        raise SystemExit(1)
-
-
-def gradient_sheet(rows: list[GradientRow], title: str, tolerance: float) -> Sheet:
-    """Table of adjoint, difference, its uncertainty and relative error; rows beyond the tolerance are red."""
-    cells = [
-        [row.parameter, f"{row.adjoint:.6e}", f"{row.difference:.6e}", f"{row.uncertainty:.1e}"]
-        + [f"{row.relative_error:.1e}"]
-        for row in rows
-    ]
-    failed = [number for number, row in enumerate(rows) if not row.relative_error <= tolerance]
-    return Sheet(title, ["parameter", "adjoint", "difference", "uncertain\nby", "relative\nerror"], cells, failed)

@@ -17,46 +17,30 @@ Journal of the Mechanics and Physics of Solids 56, 2008.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
 
 import numpy as np
+import pytest
+import scipy.linalg
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz
 
-from ..dynamics.simulator import Simulator
-from ..energies.contact import Contact, vertex_areas
-from ..energies.materials import StableNeoHookean
-from ..energies.obstacles import Cylinder, Obstacle, ObstacleSet, Pose, Sphere
-from ..fem.body import Body
-from ..mesh.mesh import Mesh, box_hexahedra
+from support.contact import pressure
+from warp_resphys import Body, Contact, Mesh, Simulator, StableNeoHookean, box_hexahedra
+from warp_resphys.energies.contact import vertex_areas
+from warp_resphys.energies.obstacles import Cylinder, Sphere
 
 FloatArray = NDArray[np.float64]
 YOUNG, POISSON = 264e3, 0.45  # Pa, -
-GROWTH: Final = 1.4  # of the cells away from the contact, from one to the next
+GROWTH = 1.4  # of the cells away from the contact, from one to the next
 SPHERE_RADIUS, SPHERE_DEPTH = 0.02, 0.5e-3  # m
-CYLINDER_RADIUS: Final = 0.2  # m
-DEPTHS: Final = np.linspace(2e-5, 5e-5, 8)  # of the cylinder; each contact ends elsewhere between vertices [m]
-_ALONG: Final = (0.0, 1.0, 2.0, 4.0, 6.0)  # vertices along the cylinder, over the thickness of the layer
-_POINTS: Final = 2**14  # of the surface of a layer
+CYLINDER_RADIUS = 0.2  # m
+DEPTHS = np.linspace(2e-5, 5e-5, 8)  # of the cylinder; each contact ends elsewhere between vertices [m]
+_ALONG = (0.0, 1.0, 2.0, 4.0, 6.0)  # vertices along the cylinder, over the thickness of the layer
+_POINTS = 2**14  # of the surface of a layer
 
 
-def pressure(s: Any) -> Any:
-    """Pressure over kappa at the distance s D, for s <= 1."""
-    return 2.0 * (s - 1.0) * np.log(s) + (s - 1.0) ** 2 / s
-
-
-def measured(obstacle: Obstacle, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances (B, P) [m] and normals (B, P, 3) of positions (B, P, 3) from an obstacle at its place."""
-    place, turn = x.new_tensor([obstacle.position]), x.new_tensor(obstacle.turn[None])
-    pose = Pose(*(value.expand(len(x), *value.shape) for value in (place, turn, x.new_zeros(1))))
-    d, n = ObstacleSet((obstacle,), 1.0, x.device).distances(x, pose)
-    return d[..., 0], n[:, :, 0]
-
-
-def sphere_error(cell: float, device: torch.device) -> float:
+def sphere_error(cell: float, device: str) -> float:
     """Relative error of the force on a sphere, for a size of the cells below it [m], which grow with the distance."""
     lines = _lines(cell, GROWTH, 0.03)
     mesh, ball = _block(lines, lines, lines), Sphere(radius=SPHERE_RADIUS)
@@ -65,7 +49,7 @@ def sphere_error(cell: float, device: torch.device) -> float:
     return float(force.sum()) / hertz_force(SPHERE_RADIUS, depth, lines[-1], YOUNG, POISSON) - 1.0
 
 
-def cylinder_errors(cell: float, device: torch.device) -> FloatArray:
+def cylinder_errors(cell: float, device: str) -> FloatArray:
     """Relative errors of the force on a cylinder at `DEPTHS`, for a size of the cells below it [m].
 
     The growth of the cells is refined with their size. The force is that on the middle of a block twelve times as long
@@ -102,10 +86,10 @@ def _block(x: FloatArray, y: FloatArray, depth: FloatArray) -> Mesh:
 def press(
     obstacle: Sphere | Cylinder,
     mesh: Mesh,
-    depths: Sequence[float] | FloatArray,
+    depths,
     distance: float,
     stiffness: float,
-    device: torch.device,
+    device: str,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Presses an obstacle at depths [m] below z = 0 into a block with a fixed base.
 
@@ -128,8 +112,11 @@ def press(
     with torch.no_grad():
         q = s.static_equilibrium(None, {"obstacle_z": -down}, after=s.state(start)).q
     q[..., 2] += down
-    d, normal = (value.cpu().numpy() for value in measured(obstacle, q))
-    forces = -stiffness * vertex_areas(mesh) * pressure(np.minimum(d / distance, 1.0)) * normal[..., 2]
+    away = q.cpu().numpy() - obstacle.position
+    away[..., 1] *= isinstance(obstacle, Sphere)
+    far = np.linalg.norm(away, axis=-1)
+    d = far - radius
+    forces = -stiffness * vertex_areas(mesh) * pressure(np.minimum(d / distance, 1.0)) * away[..., 2] / far
     return list(zip(forces, d, strict=True))
 
 
@@ -167,7 +154,63 @@ def layer_force(radius: float, depth: float, thickness: float, youngs_modulus: f
     x = spacing * np.arange(-half, half + 1)
     into = depth - radius + np.sqrt(radius**2 - x**2)
     while True:
-        own = solve_toeplitz(green[: len(into)], into)
+        own = scipy.linalg.solve_toeplitz(green[: len(into)], into)
         if own.min() >= 0.0:
             return float(own.sum() * spacing)
         into = into[own >= 0.0]
+
+
+def test_a_thick_layer_is_a_half_space():
+    """The correction of Dimitriadis et al., whose first term for an incompressible layer is 1.133 chi."""
+    hertz = 4.0 / 3.0 * 1e5 / (1.0 - 0.25) * math.sqrt(0.01) * 1e-4**1.5
+    assert hertz_force(0.01, 1e-4, 1e3, 1e5, 0.5) == pytest.approx(hertz, rel=2e-6)
+    chi = math.sqrt(0.01 * 1e-4) / 0.01
+    series = 1.0 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
+    assert hertz_force(0.01, 1e-4, 0.01, 1e5, 0.5) / hertz == pytest.approx(series, abs=1e-4)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+def test_the_response_of_a_layer_solves_the_equations_of_plane_strain(nu):
+    """For u_x = U sin kx, u_z = W cos kx and the stresses at constant z, their derivatives by z are linear in them."""
+    young, thickness = 2.0, 0.7
+    shear, modulus = young / (2.0 + 2.0 * nu), young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    lame = modulus - 2.0 * shear
+    for k in (0.3, 2.0, 9.0):
+        slopes = [
+            [0.0, k, 1.0 / shear, 0.0],
+            [-lame * k / modulus, 0.0, 0.0, 1.0 / modulus],
+            [k**2 * (modulus - lame**2 / modulus), 0.0, 0.0, lame * k / modulus],
+            [0.0, 0.0, -k, 0.0],
+        ]
+        to_surface = scipy.linalg.expm(thickness * np.array(slopes))[:, 2:]  # from the stresses at the base
+        displacement = to_surface[1] @ np.linalg.solve(to_surface[2:], [0.0, 1.0])
+        assert layer_response(np.array([k]), thickness, young, nu) == pytest.approx(displacement, rel=1e-10)
+
+
+def test_a_cylinder_on_a_thin_layer_presses_columns_and_on_a_thick_one_a_half_space():
+    """Columns of nu = 0 carry E d / t; on a half-space, the depth falls with the distance as ln, by Hertz's force."""
+    radius, depth, young = 0.05, 1e-5, 2e5
+    columns = young / 1e-4 * 4.0 / 3.0 * math.sqrt(2.0 * radius * depth) * depth
+    assert layer_force(radius, depth, 1e-4, young, 0.0) == pytest.approx(columns, rel=1e-3)
+    # With 4 R F = pi a^2 E*, the depth is F / (pi E*) (2 ln (t / a) + c) (Johnson 1985), where c depends on nu alone.
+    constants = []
+    for depth in (1e-6, 4e-6, 1.6e-5):
+        force = layer_force(radius, depth, 0.02, young, 0.3)
+        stiffness = math.pi * young / (1.0 - 0.09)
+        a = math.sqrt(4.0 * radius * force / stiffness)
+        constants.append(stiffness * depth / force - 2.0 * math.log(0.02 / a))
+    assert constants == pytest.approx([constants[0]] * 3, abs=0.02)
+
+
+def test_the_force_on_a_sphere_is_that_of_hertz(device):
+    """For a sphere of 20 mm, 0.5 mm deep, within 2 % with cells of 0.18 mm."""
+    assert abs(sphere_error(1.8e-4, device)) < 0.02
+
+
+def test_the_force_on_a_cylinder_is_that_of_plane_strain(device):
+    """At eight depths within 2 % with cells of 0.35 mm, and of almost second order in their size."""
+    cells = (1e-3, 7e-4, 5e-4, 3.5e-4)
+    errors = [cylinder_errors(cell, device) for cell in cells]
+    assert np.abs(errors[-1]).max() < 0.02
+    means = [np.sqrt(np.mean(error**2)) for error in errors]
+    assert np.polyfit(np.log(cells), np.log(means), 1)[0] > 1.5

@@ -1,0 +1,75 @@
+"""Deflections of a pneumatic arm at rest, by element: quadratic elements do not lock, coarse linear ones do.
+
+The converged tip, extrapolated from 8-node hexahedra of 10 and 3.3 mm, is 31.63 mm aside under gravity with a base
+tilted by 20 degrees.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, find_chambers
+from warp_resphys.mesh.arm import mesh_arm
+from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.mesh import quadratic
+
+RUBBER = Corotated(264e3, 0.499, density=1070.0)
+CONVERGED = 31.63  # mm, under gravity
+
+
+def deflections(mesh, device, tilt=20.0):
+    """Ways of the tip towards +x [mm], of gravity with a base tilted by an angle [degrees], and of pressure."""
+    heights, chambers = mesh.vertices[:, 2], find_chambers(mesh)
+    fixed, tip = (np.flatnonzero(np.abs(heights - end) < 1e-6) for end in (heights.max(), heights.min()))
+    pressed = Pressure(chambers)
+    fibres = Fibres(chambers, (8.0, -8.0), 2e-3, stiffness=1e4)
+    ways, solver = [], SolverSettings(relative_tolerance=1e-6)
+    load = torch.zeros(1, len(chambers), dtype=torch.float64)
+    load[0, 0] = 1e4  # Pa
+    for energies, angle, inputs in (([pressed], tilt, Inputs()), ([pressed, fibres], 0.0, Inputs(pressure=load))):
+        pull = 9.80709 * np.array([math.sin(math.radians(angle)), 0.0, -math.cos(math.radians(angle))])
+        body = Body(mesh, fixed, energies=energies)
+        simulator = Simulator(body, RUBBER, gravity=pull.tolist(), solver=solver, device=device)
+        moved = simulator.static_equilibrium(inputs).q - simulator.rest_positions
+        ways.append(1e3 * float(moved[0, tip, 0].mean()))
+    return ways
+
+
+MESHES = {  # size of elements and layers [mm], nodes of a cell, and ways of the tip: the table of docs/results
+    "coarse linear hexahedra": (10.0, 24.0, 8, 29.10, -11.95),
+    "linear hexahedra of the arm": (6.5, 10.0, 8, 30.80, -13.34),
+    "20-node hexahedra": (10.0, 60.0, 20, 31.14, -13.06),
+    "27-node hexahedra": (10.0, 60.0, 27, 31.30, -12.92),
+    "linear tetrahedra": (30.0, None, 4, 25.50, -9.55),
+    "quadratic tetrahedra": (30.0, None, 10, 31.43, -12.89),
+}
+
+
+def arm(size, layers, nodes):
+    cells = "hexahedra" if layers else "tetrahedra"
+    mesh = mesh_arm(ArmGeometry(), 1e-3 * size, cells, 1e-3 * layers if layers else None)[0]
+    return mesh if nodes in (4, 8) else quadratic(mesh, f"{'hexahedron' if layers else 'tetrahedron'}{nodes}")
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_an_arm_bends_as_far_as_its_elements_allow(name, device):
+    """The figures by which elements are recommended; quadratic ones are within 2 % under gravity."""
+    *mesh, gravity, pressure = MESHES[name]
+    aside, bent = deflections(arm(*mesh), device)
+    assert aside == pytest.approx(gravity, rel=2e-3)
+    assert bent == pytest.approx(pressure, rel=4e-3)
+    assert (abs(aside / CONVERGED - 1.0) < 0.02) == (mesh[2] > 8)
+
+
+def test_linear_hexahedra_converge_at_second_order(device):
+    """Richardson's extrapolation of the way of the tip from two meshes, one twice as fine, is the converged one."""
+    coarse, fine = (deflections(arm(*sizes, 8), device)[0] for sizes in ((10.0, 24.0), (5.0, 12.0)))
+    assert fine + (fine - coarse) / 3.0 == pytest.approx(CONVERGED, rel=5e-3)
+    assert abs(fine - CONVERGED) < 0.35 * abs(coarse - CONVERGED)
+
+
+def test_gravity_pulls_towards_its_side(device):
+    mesh = arm(10.0, 60.0, 8)
+    assert deflections(mesh, device, -20.0)[0] == pytest.approx(-deflections(mesh, device)[0], rel=0.02)

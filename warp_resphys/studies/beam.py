@@ -1,7 +1,7 @@
 """The beam that the studies share: a box of any element along x, whose face at the smallest x is fixed."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Strict
 
@@ -10,15 +10,6 @@ from ..io.settings import Natural, Positive, Settings, Some, Vector, setting
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
 
 Element = Literal["hexahedron8", "hexahedron20", "hexahedron27", "tetrahedron4", "tetrahedron10"]
-ELEMENT_NAMES: Final[dict[Element, str]] = {
-    "hexahedron8": "8-node hexahedra",
-    "hexahedron20": "20-node hexahedra",
-    "hexahedron27": "27-node hexahedra",
-    "tetrahedron4": "4-node tetrahedra",
-    "tetrahedron10": "10-node tetrahedra",
-}
-
-
 Divisions = Annotated[tuple[Natural, Natural, Natural], Strict(False)]  # of a box, along x, y and z
 
 

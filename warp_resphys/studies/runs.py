@@ -101,7 +101,7 @@ def made(command: str, hidden: Sequence[str] = ()) -> Part:
     """The section on how a page was made: command, machine and versions of packages.
 
     Args:
-        command: its name, as in "verify device".
+        command: its name, as in "reproduce".
         hidden: keys whose values are folders of that machine; they are left out.
     """
     entries = {**hardware(), "commit": commit() or "not known", **package_versions()}

@@ -1,9 +1,9 @@
-"""Tables of the studies: in a terminal, on a page, as text and as CSV."""
+"""Tables of the commands: in a terminal, as text and as CSV."""
 
 import csv
 import io
 import sys
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +12,6 @@ from rich.console import Console, RenderableType
 from rich.table import Table as TerminalTable
 
 from ..io.files import write_text
-from ..report.page import Cell, PageTable, Part, Row
 
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
 
@@ -26,19 +25,12 @@ def show(*parts: RenderableType) -> None:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table of text, for a terminal (rich prints it) and for a page."""
+    """A table of text, which rich prints."""
 
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
     failed: Collection[int] = ()  # rows that are red in a terminal
-    note: str = ""  # below the table on a page
-
-    @classmethod
-    def of(cls, title: str, columns: str, rows: Iterable[Mapping[str, Any]]) -> "Sheet":
-        """Formats rows by a template of a line, such as ``solver {name} | time, ms {time:.2f}``."""
-        headings, forms = zip(*(column.strip().rsplit(" ", 1) for column in columns.split("|")), strict=True)
-        return cls(title, headings, [[form.format(**row) for form in forms] for row in rows])
 
     def __rich__(self) -> TerminalTable:
         table = TerminalTable(title=self.title)
@@ -47,12 +39,6 @@ class Sheet:
         for number, row in enumerate(self.rows):
             table.add_row(*row, style="red" if number in self.failed else None)
         return table
-
-    def for_page(self) -> Part:
-        """The table as a section of a page."""
-        first, *others = (heading[:1].upper() + heading[1:] for heading in self.headings)
-        rows = [Row(name, [Cell(value) for value in values]) for name, *values in self.rows]
-        return Part(self.title, [PageTable(first, others, rows, note=self.note)])
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:

@@ -1,17 +1,12 @@
-"""Tables of the commands: in a terminal, as text and as CSV."""
+"""Tables of the commands: in a terminal and as text."""
 
-import csv
-import io
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from rich.console import Console, RenderableType
 from rich.table import Table as TerminalTable
-
-from ..io.files import write_text
 
 _LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
 
@@ -51,12 +46,3 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
         ).rstrip()
         for row in rows
     )
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes rows as CSV, with a column for every key that any of them has."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())

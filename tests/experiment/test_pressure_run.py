@@ -438,7 +438,7 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     lost[1, 3:] = np.nan
     left = {"resphys": np.array([-1, 3])}
     markers = {"sysid": good, "resphys": lost}
-    own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}, "refined": False}
+    own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}}
     own |= {"files": {}, "shared": ".", "acquired": "", "groups": {"1": ["a", "b"]}, "calibration": []}
     stage = EvaluateStage.of(settings("experiment=sopra"), **own)
     experiment = Experiment(stage, tmp_path)

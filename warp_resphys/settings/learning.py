@@ -54,8 +54,7 @@ class RangeSettings(SpanSettings):
     prior: PriorSettings | None = setting(None, "prior knowledge")
     per: Literal["all", "session", "trial", "material", "lens"] = setting(
         "all",
-        "trials that share a value; session, trial: a value of each, near the mean of the prior, that of all others; "
-        "material, lens: of pictures, a value of each material or lens",
+        "what shares a value; session, trial: values near the mean of the prior; material, lens: for pictures",
     )
 
     @model_validator(mode="after")
@@ -90,7 +89,7 @@ class GridTable(Settings):
 class PlacementSettings(Settings):
     """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
 
-    markers: Positive | None = setting(None, "deviation of a coordinate of a marker's or rigid body's position", "m")
+    markers: Positive | None = setting(None, "deviation of a coordinate of a position", "m")
     mounting: Positive | None = setting(
         None, "deviation of a component of a rigid body's rotation on its part", "degrees"
     )
@@ -119,14 +118,12 @@ class IdentifiedSettings(Settings):
 class IdentifySettings(IdentifiedSettings):
     """Physical parameters to identify."""
 
-    parameters: Ranges = setting(
-        {}, "ranges by name, listed in docs/identification; null, or ~identify.parameters.NAME, takes one out"
-    )
+    parameters: Ranges = setting({}, "ranges by name; null, or ~identify.parameters.NAME, takes one out")
     placement: PlacementSettings | None = setting(None, "identify positions of markers and pose of the recordings")
-    first_guess: Guesses = setting({}, "first guess of parameters without a value in the data sheet; null removes one")
+    first_guess: Guesses = setting({}, "of parameters without a value in the data sheet")
     trials: Natural | None = setting(None, "training trials, evenly chosen; null: all")
     seconds: Positive | None = setting(None, "duration of each that is used; null: all", "s")
-    starts: Natural = setting(1, "searches: from the first guess, and from the best random candidates")
+    starts: Natural = setting(1, "searches: from the first guess and random candidates")
     candidates: Count = setting(4, "random candidates")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its gradient per start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
@@ -151,16 +148,16 @@ class LawSettings(Settings):
     A path in place of the group, law=FILE, takes the law that another run has written in law.json.
     """
 
-    file: Word | None = setting(None, "law of another run, or a silicone's name, in place of an identification")
+    file: Word | None = setting(None, "law of another run, or a silicone's name")
     terms: Many[Word] = setting(
         ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
-    branches: Count = setting(13, "relaxation times that are tried, with markers at most two; 0: none")
+    branches: Count = setting(13, "relaxation times that are tried")
     relaxation_times: Annotated[Pair[Positive], AfterValidator(rising)] = setting(
         (0.01, 1.0), "shortest and longest", "s"
     )
     families: Count = setting(1, "largest number of families of fibres; with markers at most one")
-    trials: Natural | None = setting(3, "training trials, evenly chosen, through the simulator; null: all")
+    trials: Natural | None = setting(3, "training trials, evenly chosen; null: all")
     seconds: Positive | None = setting(1.0, "duration of each that is used; null: all", "s")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its derivatives in a search")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which the search ends")
@@ -170,7 +167,7 @@ class ReconstructionSettings(Settings):
     """Forces that fit the simulator to observations: min |q+ - target|^2 + regularisation |f|^2."""
 
     method: Literal["gauss_newton", "levenberg_marquardt", "lbfgsb"] = setting(
-        "gauss_newton", "levenberg_marquardt takes smaller steps, for markers; lbfgsb is the published, slow method"
+        "gauss_newton", "levenberg_marquardt takes smaller steps; lbfgsb is as published, and slow"
     )
     regularisation: NotNegative = setting(
         1.0e-10, "weight of the forces; the published 1e-4 leaves up to 0.3 mm", "m^2/N^2"
@@ -184,22 +181,22 @@ class NetworkSettings(Settings):
     """The network of the residual force, or of the next state."""
 
     kind: Literal["reduced", "nodal"] = setting(
-        "reduced", "input and output in a reduced basis, stable in closed loop; nodal: of every vertex, as published"
+        "reduced", "reduced basis, stable in closed loop; nodal: every vertex, as published"
     )
     position_modes: Count = setting(6, "modes of the positions in the input")
     velocity_modes: Count = setting(6, "modes of the velocities in the input")
     force_modes: Natural = setting(12, "modes of the force")
     force_basis: Literal["force", "displacement"] = setting(
-        "force", "modes of the forces; displacement: of the displacements that they cause"
+        "force", "modes of forces, or of the displacements that they cause"
     )
     blocks: Annotated[int, Field(ge=1, le=100)] = setting(1, "residual blocks")
     layers: Annotated[int, Field(ge=0, le=100)] = setting(3, "hidden layers of a block")
     width: Size = setting(256, "width of a layer")
     activation: Literal["normalised_elu", "silu"] = setting(
-        "normalised_elu", "layer normalisation and ELU, as published; silu, without, is smoother"
+        "normalised_elu", "layer normalisation and ELU, as published; silu is smoother"
     )
     recurrent: Annotated[int, Field(ge=1, le=1_024)] | None = setting(
-        None, "size of a hidden state that is kept over the roll-out; it needs trainer=sequences"
+        None, "size of a hidden state; needs trainer=sequences"
     )
     core: ClassSettings | None = setting(
         None, "map between the coders by a class of another package, in place of blocks and layers"
@@ -235,11 +232,9 @@ class TrainerSettings(EpochSettings):
     linear_noise: Positive | None = setting(
         1.0e-3, "noise of the inputs for which the linear part is fitted; null: no linear part"
     )
-    scale_weight: NotNegative = setting(
-        0.0, "power of the deviation of an output that is its weight in the loss: 0 equal, 1 as in the force field"
-    )
+    scale_weight: NotNegative = setting(0.0, "weights of outputs in the loss: 0 equal, 1 as in the force field")
     selection: Literal["rollout", "validation_loss"] = setting(
-        "rollout", "weights that are kept: those of the least validation roll-out error, or of the least loss"
+        "rollout", "keep the weights of the least validation roll-out error, or loss"
     )
     sequence: Natural | None = setting(None, "steps of back-propagation through time, for recurrent networks")
 
@@ -254,12 +249,12 @@ class InTheLoopSettings(EpochSettings):
         None, "steps after which the simulation begins anew at the known or reconstructed state; null: whole trials"
     )
     epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
-    rollout_every: Natural = setting(1, "epochs between measurements of the error by which the weights are chosen")
+    rollout_every: Natural = setting(1, "epochs between roll-outs that choose the weights")
     hold_out: bool = setting(
         True,
-        "from zero, without validation trials, choose the number of epochs by holding out each training trial once",
+        "from zero, without validation trials, hold out each training trial to choose the epochs",
     )
-    patience: Natural = setting(3, "epochs without improvement on held-out trials, after which training ends")
+    patience: Natural = setting(3, "epochs without improvement after which training ends")
     penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
     memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
 
@@ -293,25 +288,19 @@ class ActuationSettings(Settings):
     filter_time_constants: Many[Positive] = setting(
         (), "time constants of exponential means of the inputs, for bodies that creep", "s"
     )
-    sees_payload: bool = setting(False, "whether the payload is an input of the network, for trials with many payloads")
+    sees_payload: bool = setting(False, "the payload is an input of the network")
 
 
 class ReleaseSettings(Settings):
     """Estimation of the start of a motion: the state at a release, from the held markers, or the delay of inputs."""
 
-    hold_modes: Count = setting(
-        6, "vibration modes whose inertial forces hold it; 0 starts from equilibrium under gravity and payload"
-    )
+    hold_modes: Count = setting(6, "vibration modes that hold it; 0: equilibrium under gravity and payload")
     window: Positive = setting(
         0.13, "duration after the release for estimating delay and sideways displacement: about a period", "s"
     )
     noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
-    delay: NotNegative = setting(
-        0.0, "expected deviation of the release, or of a trial's inputs, from the detected time; 0 uses that", "s"
-    )
-    sideways: NotNegative = setting(
-        0.0, "expected displacement, across gravity, of a body that is held nearly undeformed; 0 for none", "m"
-    )
+    delay: NotNegative = setting(0.0, "expected deviation from the detected time; 0 uses that", "s")
+    sideways: NotNegative = setting(0.0, "expected deflection across gravity of a held body", "m")
 
 
 class AblationSettings(Settings):
@@ -319,5 +308,5 @@ class AblationSettings(Settings):
 
     counts: Annotated[Some[Natural], AfterValidator(different)] = setting(description="numbers of markers")
     draws: Natural = setting(10, "random sets of each number")
-    processes: Natural | None = setting(None, "processes that share the numbers; null: one per core, and one on a GPU")
+    processes: Natural | None = setting(None, "processes; null: one per core, one on a GPU")
     modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")

@@ -117,21 +117,16 @@ class RunSettings(SimulatorSettings):
     release: ReleaseSettings = ReleaseSettings()
     control: ControlSettings | None = setting(None, "paths that the robot follows; null: none")
     ablation: AblationSettings | None = setting(None, "study of the number of markers, in place of learning")
-    correct_uncorrected: bool = setting(
-        False, "whether a force is learned for the simulator without identification as well"
-    )
+    correct_uncorrected: bool = setting(False, "also learn a force for the simulator without identification")
     force_frame: Literal["corotated", "world"] = setting(
         "world",
-        "world: residual forces keep their directions, as published; corotated: they rotate with the body at each "
-        "vertex",
+        "corotated: residual forces rotate with the body; world: they keep their directions, as published",
     )
-    range_guard: bool = setting(
-        True, "inputs of networks are limited to their range in training, and roll-outs record when they exceed it"
-    )
+    range_guard: bool = setting(True, "limit the inputs of networks to their training range")
     mesh_check: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(
-        None, "refinement, such as 1.5 or 2, of a mesh that shows the discretisation error of the test trials"
+        None, "refinement of a second mesh, which shows the discretisation error"
     )
-    timing: bool = setting(True, "whether models are timed, one trial at a time")
+    timing: bool = setting(True, "time the models, one trial at a time")
     parallel: ParallelSettings = ParallelSettings()
     budget: Word = setting("full", "full or quick")
 

@@ -6,11 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from warp_resphys.io import atomic, fan_out, memory
 from warp_resphys.io.machine import available_cores, hardware
-from warp_resphys.studies import runs
 
 UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
@@ -79,14 +76,3 @@ def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
     with fan_out.interrupts_blocked():
         pass
-
-
-def test_a_run_is_ended_where_it_cannot_be_interrupted(monkeypatch):
-    program = "import time; print('ready', flush=True); time.sleep(60)"
-    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", program], **pipe) as child:
-        child.stdout.readline()
-        monkeypatch.setattr(runs.os, "name", "nt")
-        monkeypatch.setattr(child, "send_signal", lambda number: pytest.fail("there is no such signal"))
-        monkeypatch.setattr(child, "terminate", lambda: os.kill(child.pid, signal.SIGTERM))
-        assert runs._stop(child) == ""

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of text, tables and figures, the same in Markdown, and the formats of numbers."""
+"""Self-contained HTML pages of text, tables and figures, and the formats of numbers."""
 
 import base64
 import hashlib
@@ -85,11 +85,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Items:
-    """A list; with `code`, of commands."""
+    """A list."""
 
     items: Sequence[str]
     name: str = ""
-    code: bool = False
 
 
 @dataclass(frozen=True)
@@ -248,13 +247,6 @@ def write_page(
         duration=duration_text,
     )
     write_text(path, page)
-
-
-def markdown(title: str, verdict: str, parts: Sequence[Part], folder: str) -> str:
-    """Return a page in Markdown, with its figures as PNG files in a folder beside it."""
-    kind_of = {"kind_of": lambda block: type(block).__name__}
-    page = _template("study.md").render(title=title, verdict=verdict, parts=parts, folder=folder, **kind_of)
-    return page.replace(NO_BREAK_SPACE, " ") + "\n"
 
 
 def experiment_kicker(name: str) -> Markup:

@@ -19,8 +19,6 @@ from hydra.core.hydra_config import HydraConfig
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.exceptions import StorageInternalError
 from optuna.trial import Trial, TrialState
-from rich.console import Console
-from rich.table import Table
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
@@ -33,6 +31,7 @@ from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import number_text
 from ..settings.learning import TrainingSettings
 from ..settings.run import RunSettings
+from .tables import Sheet, show
 
 log = logging.getLogger(__name__)
 _SHOWN = 5  # trials
@@ -189,17 +188,16 @@ def _print(study: optuna.Study, search: Tune) -> None:
     if not done:
         raise InputError("every trial diverged: choose a tune.space closer to settings that work.")
     done.sort(key=lambda trial: (trial.value, trial.number))
-    table = Table(title="Best trials: roll-out error on the validation split")
-    for heading in ("trial", "error [mm]", *(key.rpartition(".")[2] for key in done[0].params)):
-        table.add_column(heading, justify="right")
-    for trial in done[:_SHOWN]:
-        table.add_row(str(trial.number), number_text(trial.value), *map(_text, trial.params.values()))
-    Console().print(table)
+    headings = ["trial", "error [mm]", *(key.rpartition(".")[2] for key in done[0].params)]
+    rows = [
+        [str(trial.number), number_text(trial.value), *map(_text, trial.params.values())] for trial in done[:_SHOWN]
+    ]
+    table = Sheet("Best trials: roll-out error on the validation split", headings, rows)
     given = [override.lstrip("+") for override in HydraConfig.get().overrides.task]
     kept = [override for override in given if not override.lstrip("~").startswith("tune.")]
     prefix = "simfree." if search.model == "simfree" else ""
     found = [f"{prefix}{key}={value}" for key, value in (_dotted(search.settings) | done[0].params).items()]
-    print(f"A run with the best settings: {shlex.join(['warp-resphys', *kept, *found])}")
+    show(table, f"A run with the best settings: {shlex.join(['warp-resphys', *kept, *found])}")
 
 
 def _text(value: Any) -> str:

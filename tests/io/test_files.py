@@ -62,6 +62,13 @@ class TestAtomicFiles:
         with pytest.raises(FileNotFoundError), atomic.atomic_path(tmp_path / "a.json"):
             (tmp_path / "other").read_text()
 
+    def test_a_full_disk_is_named_and_the_old_file_stays(self, tmp_path):
+        path = tmp_path / "a.json"
+        files.write_json(path, 1)
+        with pytest.raises(DataFileError, match=r"disk is full while writing .*a\.json"), atomic.atomic_path(path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        assert files.read_json(path) == 1
+
     def test_disk_full_is_recognised_by_number_and_by_text(self):
         for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             assert atomic.is_disk_full(OSError(code, ""))

@@ -12,6 +12,7 @@ from warp_resphys.io.machine import available_cores, hardware
 UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
 
+@pytest.mark.slow
 def test_the_package_imports_without_the_modules_of_unix():
     names = [
         "atomic",

@@ -118,6 +118,7 @@ class TestResumable:
             with pytest.raises(ValueError, match="0 of 10 frames"):
                 file.finish()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
     def test_a_killed_process_resumes_from_a_whole_frame(self, tmp_path, end):
         program = """
@@ -151,6 +152,7 @@ class TestResumable:
             assert int(file.state["last"]) == file.done - 1
 
 
+@pytest.mark.slow
 class TestDiskFull:
     program = """
         import resource, signal, sys

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from warp_resphys.io import atomic, fan_out, memory
 from warp_resphys.io.machine import available_cores, hardware
 

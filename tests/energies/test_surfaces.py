@@ -297,6 +297,9 @@ def test_crossings_are_seen(device):
     assert count[0] == count[2] == 0 < count[1]
 
 
+some_or_many = pytest.mark.parametrize("count", [4, pytest.param(16, marks=pytest.mark.slow)])
+
+
 def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", **options):
     """A cube, of which a `rigid` layer or the whole is rigid, above a plate that is held below."""
     low = CUBE.vertices[CUBE.cells].mean(1)[:, 2] < 0.01
@@ -320,26 +323,27 @@ def thrown(simulator, velocity, spin, batch=1):
     return State(rest.q, v)
 
 
+@some_or_many
 @pytest.mark.parametrize(
     ("integrator", "rigid"), [("implicit_euler", ""), ("bdf2", ""), ("implicit_euler", "layer"), ("bdf2", "whole")]
 )
-def test_gradients_of_an_oblique_impact(integrator, rigid, device):
-    """Sixteen throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
+def test_gradients_of_an_oblique_impact(integrator, rigid, count, device):
+    """Throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
     simulator = landing(integrator=integrator, rigid=rigid, device=device)
     random = np.random.default_rng(0)
-    velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (16, 3)))
-    weights = simulator.tensor(random.normal(size=(2, 16, simulator.body.n_vertices, 3)))
+    velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (count, 3)))
+    weights = simulator.tensor(random.normal(size=(2, count, simulator.body.n_vertices, 3)))
     values = {
         "velocity": velocity,
-        "spin": simulator.tensor(np.linspace(-5.0, 5.0, 16)),
-        "surface_friction": simulator.tensor(np.linspace(0.1, 0.9, 16)[:, None]),
-        "surface_stiffness": simulator.tensor(np.full((16, 1), KAPPA)),
-        "plate_youngs_modulus": simulator.tensor(np.full((16, 1), 2.5e5)),
+        "spin": simulator.tensor(np.linspace(-5.0, 5.0, count)),
+        "surface_friction": simulator.tensor(np.linspace(0.1, 0.9, count)[:, None]),
+        "surface_stiffness": simulator.tensor(np.full((count, 1), KAPPA)),
+        "plate_youngs_modulus": simulator.tensor(np.full((count, 1), 2.5e5)),
     }
 
     def loss(given):
         parameters = {name: given[name] for name in given if name not in ("velocity", "spin")}
-        start = thrown(simulator, given["velocity"], given["spin"], 16)
+        start = thrown(simulator, given["velocity"], given["spin"], count)
         path = simulator.rollout(start, 7, parameters=parameters)
         return (1e2 * path.q[-1] * weights[0]).sum((1, 2)) + (path.v[-1] * weights[1]).sum((1, 2))
 
@@ -347,9 +351,11 @@ def test_gradients_of_an_oblique_impact(integrator, rigid, device):
     slopes = dict(zip(given, torch.autograd.grad(loss(given).sum(), list(given.values())), strict=True))
     ways, parts = {}, {}
     for name, value in values.items():
-        size = {"surface_stiffness": 1e-4, "spin": 1e-5}.get(name, 1e-6) * float(value.abs().max())
-        way = simulator.tensor([0.6, -0.5, 0.6]).expand(16, 3) if name == "velocity" else torch.ones_like(value)
-        ways[name], parts[name] = size * way, (slopes[name] * size * way).reshape(16, -1).sum(1)
+        size = {"surface_stiffness": 1e-4, "spin": 1e-5, "plate_youngs_modulus": 1e-5}.get(name, 1e-6) * float(
+            value.abs().max()
+        )
+        way = simulator.tensor([0.6, -0.5, 0.6]).expand(count, 3) if name == "velocity" else torch.ones_like(value)
+        ways[name], parts[name] = size * way, (slopes[name] * size * way).reshape(count, -1).sum(1)
     least = min(float(part.abs().max()) for part in parts.values())
     factors = random.uniform(0.5, 1.0, len(parts))  # all contribute about the same, and errors do not cancel
     shares = {
@@ -377,6 +383,7 @@ def directional(loss, values, sizes):
         assert float((slopes[name] * way).sum()) == pytest.approx(expected, rel=1e-6), name
 
 
+@pytest.mark.slow
 def test_gradients_of_a_ball_that_rolls():
     """A ball that is thrown along a plate without spin: it slides, and rolls after some steps."""
     ball = thing_mesh("ball", 0.01, 2)
@@ -415,6 +422,7 @@ def test_gradients_of_a_ball_that_rolls():
     )
 
 
+@pytest.mark.slow
 def test_gradients_of_a_body_that_rubs_on_itself():
     """The ends of a clip are pressed together, and one of them is pulled along the other."""
     mesh = clip()
@@ -442,7 +450,7 @@ def test_gradients_of_a_body_that_rubs_on_itself():
 
 def test_regions_have_their_own_friction():
     """Two cubes on a slope: one slides, and the other one stands on a rough part of the plate."""
-    plate = box_hexahedra((0.12, 0.06, 0.01), (12, 6, 1))
+    plate = box_hexahedra((0.12, 0.06, 0.01), (8, 4, 1))
     rough = select_cells(plate, y=(0.03, 0.06))
     plate = replace(plate, regions={"rough": rough})
     bodies = {"plate": Body(plate, fixed=select_vertices(plate, z=0.0))}
@@ -458,8 +466,7 @@ def test_regions_have_their_own_friction():
     with torch.no_grad():
         half = simulator.rollout(simulator.rest_state(), 20)
         path = simulator.rollout(half.final, 20)
-        before = simulator.rollout(half.final, 19).final
-        forces = simulator.contacts(before, simulator.step(before)[0])["surfaces"]
+        forces = simulator.contacts(State(path.q[-2], path.v[-2]), path.final)["surfaces"]
     for own, expected in ((a, 0.005 * float(path.v[-1, 0, a, 0].mean())), (b, 0.0)):
         on = torch.isin(forces.vertices, torch.arange(own.start, own.stop)) & (forces.gap[0] < D)
         assert forces.slide[0, on].numpy() == pytest.approx(expected, rel=0.05, abs=5e-6)
@@ -479,7 +486,7 @@ def test_regions_have_their_own_friction():
     swapped = dict(reversed(pairs.items()))
     other = replace(simulator, body=Scene(bodies, SurfaceContact(2e4, 0.2, pairs=swapped)))
     with torch.no_grad():
-        held, slides = (s.rollout(s.rest_state(), 20).v[-1, 0, b, 0].mean() for s in (both, other))
+        held, slides = (s.rollout(s.rest_state(), 10).v[-1, 0, b, 0].mean() for s in (both, other))
     assert float(held) < 1e-3 < 0.1 < float(slides)  # the first pair that fits counts
     with pytest.raises(InputError, match="the pair 'pad' of a contact"):
         Simulator(Scene({"a": bodies["a"]}, contact))
@@ -567,16 +574,17 @@ def test_a_body_touches_itself(device):
         assert float(forces.normal.norm()) > 0.01
 
 
+@some_or_many
 @pytest.mark.parametrize("rigid", ["", "layer", "whole"])
-def test_batch_is_what_its_environments_are_alone(rigid, device):
-    """Sixteen environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
+def test_batch_is_what_its_environments_are_alone(rigid, count, device):
+    """Environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)
-    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (16, 3)))
-    spin = torch.linspace(-4.0, 4.0, 16, dtype=torch.float64)
+    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (count, 3)))
+    spin = torch.linspace(-4.0, 4.0, count, dtype=torch.float64)
     settings = SolverSettings(linear_solver="banded" if device == "cpu" else "tiled")
     together, alone = (landing(rigid=rigid, solver=settings, device=device) for _ in range(2))
-    path = together.rollout(thrown(together, velocity, spin, 16), 12)
-    for b in range(16):
+    path = together.rollout(thrown(together, velocity, spin, count), 12)
+    for b in range(count):
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
         if device == "cpu":
             assert torch.equal(own.q[:, 0], path.q[:, b])

@@ -43,6 +43,17 @@ def test_sag_of_the_beam(integration, sag_mm, tolerance_mm):
     assert 1e3 * sag == pytest.approx(sag_mm, abs=tolerance_mm)
 
 
+def test_a_slender_beam_sags_as_euler_and_bernoulli_say():
+    """A tip's sag of rho g A L^4 / (8 E I) under the beam's weight."""
+    length, width, modulus, density, g = 0.2, 0.01, 1e7, 1000.0, 9.80709
+    mesh = box_hexahedra((length, width, width), (20, 1, 1), nodes=27)
+    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+    simulator = Simulator(body, Corotated(modulus, 0.0, density=density), gravity=(0.0, 0.0, -g))
+    moved = simulator.static_equilibrium().q[0] - simulator.rest_positions
+    expected = density * g * width**2 * length**4 / (8.0 * modulus * width**4 / 12.0)
+    assert float(moved[select_vertices(mesh, x=length), 2].mean()) == pytest.approx(-expected, rel=0.01)
+
+
 def test_sag_with_ten_node_tetrahedra_is_within_two_percent_on_275_vertices():
     mesh = box_tetrahedra(BEAM, (5, 2, 2), order=2)
     assert len(mesh.vertices) == 275

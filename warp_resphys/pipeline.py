@@ -342,7 +342,12 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
 def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, workers: Workers, times: float = 1.0) -> None:
     """Logs how long the unfinished stages of a split take, unless that is short; see `announcement`."""
     left = unfinished(stages, folder)
-    if left and (sentence := announcement(left, folder, run.budget == "quick", workers, times)):
+    try:
+        sentence = announcement(left, folder, run.budget == "quick", workers, times)
+    except Exception as error:  # An estimate never ends a run.
+        log.debug("no estimate: %s", error)
+        return
+    if sentence:
         log.info("%s", sentence)
 
 

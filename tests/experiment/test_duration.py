@@ -66,7 +66,7 @@ def test_an_identification_counts_trials_evaluations_and_parameters(data):
 
 
 def test_a_sentence_says_how_long_and_what_helps(data, monkeypatch):
-    """Folds multiply the duration, workers share the reconstruction; a stage that cannot be measured has none."""
+    """Folds multiply the duration, workers share the reconstruction."""
     folder, _ = data
     stages = [one for one in stages_of(data, "parallel.batch=2") if one.name in ("reconstruct_resphys", "evaluate")]
     assert announcement(stages, folder, quick=True) == ""
@@ -80,16 +80,6 @@ def test_a_sentence_says_how_long_and_what_helps(data, monkeypatch):
     assert announcement(stages, folder, quick=False).endswith("trials, or at first budget=quick.")
     assert "reconstruct_resphys 3 min 12 s" in announcement(stages, folder, quick=True, times=2.0)
     assert "reconstruct_resphys 24.0 s" in announcement(stages, folder, quick=True, workers=Workers(4))
-
-    def failing(experiment, reconstructed):
-        if reconstructed:
-            raise MemoryError
-        return 1.0
-
-    monkeypatch.setattr(duration, "pace_of", failing)
-    assert announcement(stages, folder, quick=True).startswith(
-        "about 24.0 s more for 20 vertices, without reconstruct_"
-    )
 
 
 def test_only_unfinished_stages_are_announced(data, tmp_path, monkeypatch, caplog):
@@ -105,6 +95,16 @@ def test_only_unfinished_stages_are_announced(data, tmp_path, monkeypatch, caplo
         before = len(caplog.messages)
         _announce(run, stages, tmp_path, Workers())
     assert len(caplog.messages) == before
+
+
+def test_an_estimate_that_fails_ends_no_run(data, monkeypatch, caplog):
+    def failing(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(duration, "_SHORT", 0.0)
+    monkeypatch.setattr(duration, "pace_of", failing)
+    _announce(settings(*TINY), stages_of(data), data[0], Workers())
+    assert not caplog.messages
 
 
 def test_a_step_is_timed_and_a_reconstructed_one_takes_longer(data):

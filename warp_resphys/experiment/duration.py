@@ -4,7 +4,6 @@ The steps are those of bodies that fall from rest, under the inputs in the middl
 forces support a fifth of their weight. Reports, laws of materials, other bodies and control have no estimate.
 """
 
-import logging
 import math
 import time
 from collections.abc import Sequence
@@ -33,8 +32,6 @@ from .experiment import MODELS, Experiment
 from .models import SIMFREE
 from .trials import evenly
 
-log = logging.getLogger(__name__)
-
 _LEAST_SECONDS = 60.0  # of the estimates that are shown
 _SHORT = 8e6  # steps times vertices that take less than that
 _RECONSTRUCTION = 8.0  # steps that take as long as a reconstructed one, before that is timed
@@ -62,17 +59,13 @@ def announcement(
     works = {name: work for name, one in experiments.items() if (work := work_of(one)) is not None}
     amount = times * sum(steps + _RECONSTRUCTION * forces for steps, forces, _ in works.values())
     vertices = next(iter(experiments.values())).body.n_vertices if works else 0
-    if amount * vertices < _SHORT:
+    if not works or amount * vertices < _SHORT:
         return ""
     paces, seconds = dict[bool, float](), dict[str, float]()
     for name, (steps, forces, training) in works.items():
-        try:
-            for reconstructed, number in ((False, steps), (True, forces)):
-                if number and reconstructed not in paces:
-                    paces[reconstructed] = pace_of(experiments[name], reconstructed)
-        except Exception as error:  # An estimate never ends a run.
-            log.debug("%s has no estimate: %s", name, error)
-            continue
+        for reconstructed, number in ((False, steps), (True, forces)):
+            if number and reconstructed not in paces:
+                paces[reconstructed] = pace_of(experiments[name], reconstructed)
         shared = min(workers.count, _parts(experiments[name].settings))
         seconds[name] = times * (steps * paces.get(False, 0.0) + forces * paces.get(True, 0.0) + training) / shared
     if sum(seconds.values()) < _LEAST_SECONDS:
@@ -176,6 +169,6 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
             target = method.step(state, replay.observe(target.q), acting).state.detach()
         state = state if replay.is_static else target
         seconds.append(time.perf_counter() - begin)
-        if k == 4 or sum(seconds[1:]) > 0.5:  # The first step may compile kernels.
-            return sum(seconds[1:]) / k / len(names)
+        if k == 4 or sum(seconds[1:]) > 0.5 or seconds[0] > 2.0:  # The first step may compile kernels.
+            return (sum(seconds[1:]) or seconds[0]) / max(k, 1) / len(names)
     raise AssertionError

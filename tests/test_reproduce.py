@@ -21,7 +21,7 @@ SMALL_ROBOT = [
     *("mesh.layers=3", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20", "data.rest_seconds=0.01"),
     *("data.horizons=[0.06,0.12]", "data.cutoff=20.0", "laboratory.sequences.rest=0.01", "identify.trials=1"),
     *("laboratory.sequences.correlation_time=0.03", "identify.seconds=0.1", "identify.max_evaluations=2"),
-    *("identify.grid=null", "mesh_check=1.4", "network.position_modes=2", "network.velocity_modes=0"),
+    *("mesh_check=1.4", "network.position_modes=2", "network.velocity_modes=0"),
     *("network.force_modes=2", "network.width=8", "trainer.epochs=4", "trainer.rollout_every=2"),
 ]
 

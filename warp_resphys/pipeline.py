@@ -66,11 +66,11 @@ from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
-from .report.conclusions import conclusions, errors_by_load, headline
 from .report.control_section import controller_name
-from .report.data import other_trials
-from .report.page import number_text
-from .report.shapes_section import shapes_table, shapes_text
+from .report.data import errors_by_load, other_trials, trial_errors
+from .report.law_section import shapes_table
+from .report.page import number_text, ratio_text
+from .report.verdict import known_errors, standings, verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
 from .settings.run import RunSettings
@@ -395,13 +395,17 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     columns = {name: errors for name, errors in columns.items() if errors != whole}
     what = "vertices" if run.markers is None else "markers"
     title = f"Error of the {what} in the test trials" + "; x: times the inputs" * ("scales" in metrics)
-    table = Table(
-        Column("model", min_width=max(map(len, whole))), "mean [mm]", "std [mm]", *columns, "diverged", title=title
-    )
+    places = standings(known_errors(trial_errors(metrics)))
+    heads = ("mean, mm", "90 % interval", "vs. best other", *columns, "diverged")
+    table = Table(Column("model", min_width=max(map(len, whole))), *heads, title=title)
     for model, summary in whole.items():
         means = [number_text(errors[model]["mean"]) if model in errors else "" for errors in columns.values()]
-        std = "" if summary["std"] is None else number_text(summary["std"])
-        table.add_row(model, number_text(summary["mean"]), std, *means, str(summary["diverged"]))
+        interval, ratio = places.get(model, (None, None))
+        shown = (
+            "" if interval is None else " to ".join(map(number_text, interval)),
+            "" if ratio is None else ratio_text(ratio),
+        )
+        table.add_row(model, number_text(summary["mean"]), *shown, *means, str(summary["diverged"]))
     console = Console()
     console.print(table)
     if folds and not columns:
@@ -419,8 +423,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
         console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
     if metrics.get("shapes"):
         console.print(_of_shapes(metrics["shapes"]))
-        console.print(shapes_text(metrics["shapes"]), soft_wrap=True)
-    for sentence in (*headline(metrics, run), *conclusions(metrics, run)):
+    for sentence in verdict(metrics, run):
         console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 

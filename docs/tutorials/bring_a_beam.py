@@ -128,7 +128,6 @@ identify:
   elastic: {{poissons_ratio: null}}
   starts: 1
   max_evaluations: 6
-  grid: null
 in_the_loop: {{epochs: 2, hold_out: false}}
 simfree: {{trainer: {{epochs: 40, rollout_every: 20}}}}
 correct_uncorrected: false

@@ -45,7 +45,7 @@ laboratory:
   sequences: {rest: 0.01, correlation_time: 0.06}
 actuation: {filter_time_constants: [0.1]}
 data: {sequences: 6, steps: 60, train: 4, validation: 1, test: 1, horizons: [], rest_seconds: 0.01, cutoff: 20.0}
-identify: {trials: 4, seconds: 0.6, max_evaluations: 12, grid: null}
+identify: {trials: 4, seconds: 0.6, max_evaluations: 12}
 network: {position_modes: 2, velocity_modes: 2, force_modes: 2, width: 16}
 trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
 timing: false

@@ -45,7 +45,7 @@ CONTROL = [
     *("data.steps=40", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1"),
     *("data.horizons=[]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}"),
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "identify.grid=null"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3"),
     "+identify.parameters.tendon_tension_factor={lower:0.5,upper:1.5}",
     "+identify.parameters.tendon_tension_delay={lower:0.0,upper:0.05}",
     "+identify.parameters.tendon_tension_rise={lower:0.001,upper:0.1,logarithmic:true}",

@@ -238,7 +238,6 @@ def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
         "parameters": own["identify"]["parameters"],
         "elastic": None,
         "first_guess": {},
-        "grid": None,
     }
     check(config)
     run = parse(RunSettings, config)

@@ -74,7 +74,6 @@ WHOLE = {"lower": 0.0, "upper": 1.0}
         ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
         ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),
         ("identify/parameters/density", {"lower": 2.0, "upper": 1.0}, "identify.parameters.density.lower is 2"),
-        ("identify/grid/youngs_modulus/lower", 1e9, "identify.grid.youngs_modulus.lower is 1e"),
         ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50: .* from 0 to 10"),
         ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
     ],
@@ -190,7 +189,6 @@ def test_the_quick_budget_wins_over_the_experiment_and_the_command_line_over_bot
     run = settings(*repeated, "budget=quick")
     check_run(run)
     assert run.identify.starts * run.identify.max_evaluations <= 8
-    assert not run.identify.landscape
     assert (run.in_the_loop.epochs, run.in_the_loop.penalty) == (2, 1e-3)
     assert run.data.seconds == 0.7
     given = settings(*repeated, "budget=quick", "in_the_loop.epochs=7", "data.seconds=1")

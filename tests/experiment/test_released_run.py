@@ -15,7 +15,6 @@ import pytest
 
 from support.configured import settings
 from support.main_job import run
-from warp_resphys.experiment import identify
 from warp_resphys.experiment.experiment import LAW, LEARNED
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.folds import Fold, run_folds
@@ -25,7 +24,6 @@ from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.metrics import marker_errors
-from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report import run_page
@@ -41,9 +39,6 @@ TINY = [
     "~identify.first_guess.mass_damping",
     "identify.starts=1",
     "identify.max_evaluations=6",
-    "identify.landscape=true",
-    "identify.grid.youngs_modulus.points=2",
-    "identify.grid.poissons_ratio.points=1",
     "in_the_loop.epochs=2",
     "simfree.trainer.epochs=10",
     "simfree.trainer.rollout_every=10",
@@ -68,7 +63,6 @@ FOLDS = [
     "~data.trials.load101",
     "identify.max_evaluations=3",
     "identify.elastic=null",
-    "identify.landscape=false",
     "correct_uncorrected=false",
     "in_the_loop.epochs=1",
     "parallel.processes=1",  # in this process, where no report is drawn
@@ -141,8 +135,6 @@ class TestCompleteRun:
             assert search["loss"] < losses[0]
             assert search["loss"] in losses
             assert len(losses) <= 4 * 6  # The release was estimated again, up to three times.
-        assert np.isfinite(results["landscape"]["loss"]).all()
-        assert np.shape(results["landscape"]["loss"]) == (2, 1)
         assert np.shape(results["sysid"]["uncertainty"]["correlation"]) == (2, 2)
 
     def test_errors(self, finished):
@@ -299,57 +291,6 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
     assert descents == [*own[:2], *own[1:]]
     history = read(tmp_path / "identification.json")["sysid"]["history"]
     assert list(map(len, history)) == [2, 1]  # The search after the release was estimated again continues the best.
-    assert not list(tmp_path.glob("identify_*"))
-
-
-def test_an_interrupted_landscape_goes_on_and_loses_no_identification(finished, tmp_path, monkeypatch, capsys):
-    """The searches are left out; the losses of the landscape count its points, and the second is a failure."""
-    shutil.copy(finished / "dataset.h5", tmp_path)
-    grid = [
-        "identify.starts=2",
-        "identify.landscape=true",
-        "identify.grid.youngs_modulus.points=5",
-        "identify.grid.poissons_ratio.points=2",
-    ]
-    wanted = settings(*SYNTHETIC, *grid)
-    (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
-    calls, moduli, interrupt_at = [], [], [6]
-
-    def starts(self, first, count, candidates, seed):
-        calls.append("starts")
-        return [first] * count
-
-    def descend(self, number, start, max_evaluations, tolerance, report):
-        calls.append("descent")
-        return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
-
-    def losses(self, points):
-        if len(moduli) in interrupt_at:
-            interrupt_at.clear()
-            raise KeyboardInterrupt
-        before = len(moduli)
-        moduli.extend(points[:, 0])
-        return np.array([np.inf if place == 1 else float(place) for place in range(before, len(moduli))])
-
-    monkeypatch.setattr(Identifier, "starts", starts)
-    monkeypatch.setattr(Identifier, "_descend", descend)
-    monkeypatch.setattr(Misfit, "uncertainty", lambda *_: calls.append("uncertainty"))
-    monkeypatch.setattr(Misfit, "losses_or_infinite", losses)
-    monkeypatch.setattr(identify, "_AT_ONCE", 2)
-    with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
-        run_stages([stage], tmp_path)
-    once = ["starts", "descent", "descent", "starts", "descent", "uncertainty"] * 2  # of the last search alone
-    assert calls == once
-    assert "identify: landscape: 6/10 points" in capsys.readouterr().err
-    run_stages([stage], tmp_path)
-    assert calls == once
-    err = capsys.readouterr().err
-    assert "identify: 6/60 evaluations at most" in err
-    assert "identify: landscape: 10/10 points" in err
-    results = read(tmp_path / "identification.json")
-    assert results["landscape"]["loss"] == [[0, None], [2, 3], [4, 5], [6, 7], [8, 9]]
-    np.testing.assert_allclose(moduli, np.repeat(np.linspace(0.0, 1.0, 5), 2))
-    assert results["sysid_elastic"]["loss"] == 1.0
     assert not list(tmp_path.glob("identify_*"))
 
 

@@ -40,7 +40,7 @@ def sensitivity():
     shape = (1, MARKERS, 3)
     sizes = {"youngs_modulus": 1e-6, "density": 1e-4}
     slopes = {name: size * RANDOM.standard_normal(shape) for name, size in sizes.items()}
-    return Sensitivity(np.zeros(shape), np.zeros(1), slopes, RANDOM.standard_normal((*shape, 3 * MARKERS + 6)))
+    return Sensitivity(np.zeros(shape), slopes, RANDOM.standard_normal((*shape, 3 * MARKERS + 6)))
 
 
 LINEAR = {name: sensitivity() for name in NAMES}
@@ -74,7 +74,7 @@ def test_the_position_of_a_rigid_body_does_not_vary_with_its_orientation():
     labels = tuple(f"plate {corner}" for corner in CORNERS)
     dataset = SimpleNamespace(observed=np.zeros((2, 1, 4, 3)), labels=labels, session=EXPERIMENT.dataset.session)
     experiment = SimpleNamespace(dataset=dataset, identification=lambda model: identified)
-    linear = dict.fromkeys(NAMES, Sensitivity(corners[None], np.zeros(1), slopes, moved[None]))
+    linear = dict.fromkeys(NAMES, Sensitivity(corners[None], slopes, moved[None]))
     spread = parameter_spread(experiment, "sysid", NAMES, linear)
     np.testing.assert_allclose(spread, np.array([[[1e-8 / 3.0]], [[2e-8 / 3.0]]]))
 

@@ -21,7 +21,6 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
 from warp_resphys.pipeline import acquisition_stages
-from warp_resphys.report.notes import published_note, target_note
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.settings.stages import MotionStage, PlayedSettings
 from warp_resphys.stepping.inputs import Inputs
@@ -43,7 +42,7 @@ def test_keys_that_are_left_out_are_those_of_the_simulator():
     target = run.target
     assert target.material.constants["youngs_modulus"] == 264e3  # directly in the group, as beam_oscillation has them
     assert (target.mesh, target.integrator, target.time_step) == (run.mesh, "bdf2", 0.02)
-    assert target_note(run) == "E 264 kPa, ν 0.499"  # noqa: RUF001
+
     bare = settings("target=null", "target={integrator: midpoint}").target
     assert (bare.material, bare.integrator) == (run.simulation, "midpoint")
     fibres = settings("experiment=sopra_fibres", "~laboratory.fibres")
@@ -69,14 +68,6 @@ def test_a_law_of_the_material_is_a_model_as_any_other():
     assert (material.ogden, material.shear_viscosity, material.density) == ({-3: 5e3}, 20.0, 1070.0)
     with pytest.raises(InputError, match="simulation: fibres has fibre_tension_1: give each family"):
         check(composed(*COARSE, *out, law.replace("}", ",fibre_tension_1:1e3}")))
-
-
-def test_the_report_tells_how_the_target_differs():
-    run = settings(*OWN, "target.material.stiffness_damping=0.01")
-    words = "another mesh, muscle fibres, time steps of 0.005 s, the integrator bdf2 and other damping"
-    assert target_note(run) == f"E 264 kPa, ν 0.45, stable neo-Hookean; with {words}"  # noqa: RUF001
-    assert "this run's also has another model of the material, another mesh" in published_note(run)
-    assert "this run's" not in published_note(settings())
 
 
 @pytest.mark.parametrize(

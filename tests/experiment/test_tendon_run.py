@@ -23,7 +23,7 @@ TINY = [
     *("data.steps=12", "data.sequences=5", "data.train=2", "data.validation=1", "data.test=1"),
     *("data.horizons=[0.06,0.12]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:2}"),
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.03"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "identify.grid=null"),
+    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3"),
     *("network={position_modes:2,velocity_modes:0,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
     *("trainer.batch_size=16", *QUIET),
 ]
@@ -132,7 +132,7 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(tmp_path, monkeypat
     assert np.sqrt(np.mean(np.square(ratios))) < 3.0  # the largest of four depends on where the search stops
     page = Path("run/report.html").read_text()
     assert "Zero of the tensions [N]" in page
-    assert "Where the rest comes from" in page
+    assert "What could explain the remaining error" in page
     check_sensitivities(finished_experiment(Path("run")), later)
 
 

@@ -136,29 +136,13 @@ def test_a_parameter_outside_its_range_ends_on_the_bound():
     assert result.parameters["youngs_modulus"] == pytest.approx(3e5)
 
 
-def test_a_grid_has_its_minimum_at_the_truth_and_the_axes_asked_for():
-    replay, release = replay_of(simulator(), TRUTH, frames=20)
-    identifier = Identifier([(replay, release)], {**RANGES, "poissons_ratio": Bounds(0.4, 0.499)})
-    others = {**TRUTH, "poissons_ratio": 0.499}
-    losses = identifier.grid({"stiffness_damping": 3, "youngs_modulus": 7}, others)
-    assert losses.shape == (3, 7)
-    ticks = identifier.ticks("youngs_modulus", 7)
-    assert ticks[0] == 1e5
-    assert ticks[-1] == pytest.approx(1e6)
-    assert ticks[losses[0].argmin()] == pytest.approx(215e3, rel=0.2)
-    one_by_one = [
-        identifier.grid({"youngs_modulus": 1}, others | {"youngs_modulus": 1e5}),
-        identifier.grid({"youngs_modulus": 7}, others | {"stiffness_damping": 0.01}, chunk=2),
-    ]
-    np.testing.assert_allclose(one_by_one[1], losses[1], rtol=1e-5)
-
-
-def test_failed_points_of_a_grid_are_infinite_and_the_others_unchanged():
+def test_failed_points_are_infinite_and_the_others_unchanged():
     bounds = {"youngs_modulus": Bounds(1.0, 1e10, logarithmic=True)}
     replay, release = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=5)
-    whole = Identifier([(replay, release)], bounds).grid({"youngs_modulus": 6}, {})
+    points = np.linspace(0.0, 1.0, 6)[:, None]
+    whole = Misfit([(replay, release)], bounds).losses_or_infinite(points)
     few = Replay(simulator(solver=SolverSettings(max_iterations=10)), MARKERS, replay.trials)
-    losses = Identifier([(few, release)], bounds).grid({"youngs_modulus": 6}, {})
+    losses = Misfit([(few, release)], bounds).losses_or_infinite(points)
     good = np.isfinite(losses)
     assert np.isfinite(whole).all()
     assert 0 < good.sum() < 6

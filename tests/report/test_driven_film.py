@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from warp_resphys.report.camera import path_axes
 from warp_resphys.report.driven_film import DrivenBodies
 from warp_resphys.report.figures import TONES
+from warp_resphys.report.render import path_axes
 
 X, Y, Z = np.eye(3)
 

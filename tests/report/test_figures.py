@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from warp_resphys.energies.pressure import PRESSURE
-from warp_resphys.report import control_figures, figures, learning_figures, motion_figures
+from warp_resphys.report import figures, learning_figures, motion_figures
 from warp_resphys.report.data import Driven, FollowedPath
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES, use_logarithm
 from warp_resphys.report.motion_sections import input_sequences
@@ -94,16 +94,6 @@ class TestLearning:
         low, high = rate.get_xlim()
         assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
 
-    def test_a_landscape_marks_its_points(self):
-        modulus, ratio = np.array([1e5, 2e5, 3e5]), np.array([0.4, 0.45])
-        loss = np.array([[1.0, 2.0], [0.1, 0.2], [np.nan, 1.0]])
-        points = {"data sheet": (2.64e5, 0.499), "lowest of the grid": (2e5, 0.4)}
-        surface = learning_figures.landscape(modulus, ratio, loss, points, narrow=True).axes[0]
-        assert [tuple(np.ravel(line.get_data())) for line in surface.lines] == [(264.0, 0.499), (200.0, 0.4)]
-        assert len(surface.collections) == 2
-        curve = learning_figures.landscape(modulus, np.array([]), loss[:, 1], points, narrow=False).axes[0]
-        assert tuple(np.ravel(curve.lines[-1].get_data())) == (200.0, 0.2)
-
     def test_the_start_that_was_kept_is_bold(self):
         histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
         (axes,) = learning_figures.loss_histories(histories, narrow=False).axes
@@ -128,10 +118,6 @@ class TestMotion:
         flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild}, narrow=False)
         for axes in flat.axes:
             assert np.ptp(axes.get_xlim()) == np.ptp(axes.get_ylim()) < 70.0  # [mm], of a motion of 40
-        figure = motion_figures.tip_in_space(0.01 * np.arange(50), measured, {"resphys": wild}, narrow=True)
-        assert np.ptp(figure.axes[0].get_zlim()) < 40.0
-        drawn = np.concatenate([np.stack(line.get_data_3d(), axis=1) for line in figure.axes[0].lines])
-        assert np.nanmax(np.abs(drawn)) < 60.0
 
     def test_prediction_intervals_are_bands_around_their_model(self):
         shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}
@@ -193,7 +179,7 @@ def test_followed_paths_are_drawn_in_their_plane(narrow):
     paths = [
         FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path}) for name in ("line", "bow")
     ]
-    figure = control_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]], narrow=narrow)
+    figure = motion_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]], narrow=narrow)
     asked, driven = figure.axes[0].lines
     np.testing.assert_allclose(np.ptp(asked.get_xdata()), 20.0)  # [mm]
     np.testing.assert_allclose(np.ptp(driven.get_ydata()), 11.0)

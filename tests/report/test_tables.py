@@ -10,13 +10,20 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
-from warp_resphys.report.camera import axes_from_below, motion_axes
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
-from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell
-from warp_resphys.report.run_page import published_beside
-from warp_resphys.report.sections import against, horizon_table, quality_rows, residual_table, scale_table
+from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell, duration_text, error_parts, number_text
+from warp_resphys.report.render import axes_from_below, motion_axes
+from warp_resphys.report.run_page import largest_filtered, published_beside, range_texts
+from warp_resphys.report.sections import (
+    against,
+    horizon_table,
+    published_growth,
+    quality_rows,
+    residual_table,
+    scale_table,
+)
 from warp_resphys.settings.learning import RangeSettings
 
 DOWN = np.array([0.0, 0.0, -9.8])
@@ -256,3 +263,41 @@ class TestMedianFilter:
         for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
             with pytest.raises(InputError, match="both must be positive"):
                 median_filter(values, step, window)
+
+
+def test_trials_out_of_range_are_counted_where_they_belong():
+    none, some, late = {"first_s": {}}, {"first_s": {"b": 2.5, "a": 1.0}}, {"first_s": {"d": 0.25}}
+    metrics = {
+        "range": {"resphys": some, "simfree": none},
+        "scales_range": {
+            "1": {"resphys": some, "simfree": none},
+            "1.5": {"resphys": late, "simfree": none},
+            "1.25": {"resphys": none, "simfree": none},
+        },
+    }
+    free, force = (text.replace(NO_BREAK_SPACE, " ") for text in range_texts(metrics, ["a", "b", "c"]))
+    assert free.startswith("SimFree: none of 3 roll-outs")
+    assert "higher" not in free
+    assert "ResPhys: 2 of 3 roll-outs left the training range, the first after 1.00 s (a)." in force
+    assert "none of 3 (1.25 times), 1 of 3 (1.5 times), the first after 0.25 s (d)" in force
+    (alone,) = range_texts({"range": {"resphys": {"first_s": {"a": 0.5}}}}, ["a"])
+    assert alone.startswith("ResPhys: the roll-out left")
+
+
+def test_numbers_have_sensible_digits():
+    shown = [number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
+    assert shown == ["4.488", "0.00072", "0.000", "diverged"]
+    assert number_text(2.14e-9) == "2.1 \N{MULTIPLICATION SIGN} 10⁻⁹"
+    deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
+    assert error_parts(deviating) == ("0.00072", "± 0.00031")
+    assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
+    shown = [duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
+    assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
+
+
+def test_published_growth_and_filtered_errors():
+    horizons = PUBLISHED_WINDOWS_MM["sopra_extrapolation"]
+    assert 100.0 * published_growth(horizons, "5", "10")["resphys"] == pytest.approx(5.4, abs=0.05)
+    assert largest_filtered({}) == ""
+    filtered = largest_filtered({"median_filtered": {"resphys": 1.5, "sysid": None}})
+    assert "reaches 1.500 mm (ResPhys)" in filtered.replace(NO_BREAK_SPACE, " ")

@@ -1,38 +1,37 @@
-"""The lines of single trials on the page of a run."""
+"""The table of single trials, and of what could explain the errors that remain."""
+
+from types import SimpleNamespace
 
 from warp_resphys.report.page import NONE
-from warp_resphys.report.trials_section import trial_table, worse
+from warp_resphys.report.sections import rest_table, trials_section
 
 
-def row(name, **errors):
-    thirds = {model: [3.0 * error, error, 0.5 * error] for model, error in errors.items()}
-    return {"name": name, "errors_mm": errors, "amplitude_mm": 20.0, "thirds_mm": thirds}
-
-
-def test_what_is_worse_than_a_simpler_model_is_named():
-    assert worse({"simulation": 3.0, "sysid": 1.0, "resphys": 0.5, "interpolation": 0.7}, "interpolation") == []
-    said = worse({"simulation": 3.0, "sysid": 1.0, "law": 0.9, "resphys": 1.2, "interpolation": 0.7}, "interpolation")
-    assert said == ["ResPhys than Law (1.2 of 0.9)", "ResPhys than Interpolation (1.2 of 0.7)"]
-    assert worse({"simfree": 9.0}) == []
-
-
-def test_a_trial_has_its_best_model_its_coverage_and_where_its_error_sits():
-    rows = [row("a", rest=9.0, interpolation=0.2, simulation=3.0, sysid=0.5, resphys=0.3), row("b", sysid=1.0)]
-    rows.append({"name": "pose", "errors_mm": {"resphys": None}, "amplitude_mm": 1.0})
-    table = trial_table(
-        rows, "interpolation", {"sysid": {"by_trial": {"a": 0.5}}, "resphys": {"by_trial": {"a": 0.93}}}
-    )
-    assert table.columns == [
-        "Amplitude [mm]",
-        "Best [mm]",
-        "Worse than a simpler one [mm]",
-        "Thirds of the time [mm]",
-        "Coverage",
+def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
+    rows = [
+        {"name": name, "errors_mm": {"sysid": error}, "amplitude_mm": 20.0} for name, error in [("a", 1.0), ("b", 2.0)]
     ]
-    first, second, pose = ([cell.text for cell in line.cells] for line in table.rows)
-    assert first == ["20.000", "Interpolation", "ResPhys than Interpolation (0.3 of 0.2)", "0.9 / 0.3 / 0.15", "93 %"]
-    assert second[1:] == ["SysID", NONE, "3 / 1 / 0.5", NONE]
-    assert pose[1:] == [NONE, NONE, NONE, NONE]
-    short = trial_table(rows[2:], "", {})
-    assert len(short.columns) == 3
-    assert trial_table([], "", {}) is None
+    covered = {"models": {"sysid": {"by_trial": {"a": 0.93}}}}
+    metrics = {"per_trajectory": rows, "errors_mm": {"sysid": {"mean": 1.5}}, "intervals": covered}
+    data = SimpleNamespace(metrics=metrics, others=("b",), pages={}, driven=None)
+    (table,) = trials_section(data, None).blocks
+    assert [(row.head, row.cells[0].text, row.small) for row in table.rows] == [
+        ("a", "1.000", "amplitude 20 mm, coverage 93 %"),
+        ("b", "2.000", "amplitude 20 mm, other loads"),
+    ]
+    assert trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
+
+
+def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
+    def fit(name, error, **left):
+        return {"name": name, "as_is_mm": error, "left_mm": left, "values": {"scale": 0.05, "zero": 2.0}}
+
+    quantity = SimpleNamespace(shown=lambda value: f"{value:g} kPa")
+    fits = {"sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)], "simulation": [fit("a", 9.0)]}
+    (table,) = rest_table(fits, quantity)
+    assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
+    assert [[(cell.text, cell.small) for cell in row.cells] for row in table.rows] == [
+        [("2.000", ""), ("1.000", "+5.0 %"), ("0.500", "2 kPa")],
+        [("4.000", ""), ("1.000", "+5.0 %"), (NONE, "")],
+        [("3.000", ""), ("1.000", ""), ("2.250", "")],
+    ]
+    assert rest_table({}, None) == rest_table({"sysid": [fit("a", 2.0)]}, None) == []

@@ -28,7 +28,6 @@ identify:
   substeps: 2
   integrator: bdf2
   seconds: 0.1
-  grid: null
   parameters:
     pressure_factor: {lower: 0.5, upper: 1.5}
     pressure_delay: {lower: 0.0, upper: 0.05}

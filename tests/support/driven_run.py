@@ -220,8 +220,6 @@ def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
         write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
     identified_values = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
     history = [[{"loss": 0.3 * 0.6**k + 0.02, **identified_values} for k in range(9)]]
-    moduli, ratios = np.geomspace(100e3, 500e3, 9), np.linspace(0.3, 0.499, 5)
-    loss = 0.02 + np.log(moduli / 237e3)[:, None] ** 2 + 3.0 * (ratios - 0.42) ** 2
     if "sysid" in models:
         identified = {
             "parameters": identified_values,
@@ -230,8 +228,7 @@ def _write_rest(folder, settings, tracked, registered, rng, models, simulated):
             "at_bounds": [],
             "uncertainty": None,
         }
-        grid = {"youngs_modulus": moduli, "poissons_ratio": ratios, "loss": loss}
-        write_json(folder / "identification.json", {"sysid": identified, "landscape": grid})
+        write_json(folder / "identification.json", {"sysid": identified})
     kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.4}
     for model in {"simfree", "resphys"} & set(models):
         epochs = [

@@ -228,11 +228,7 @@ def _write_identification(folder: Path, models):
             },
         }
 
-    moduli, ratios = np.geomspace(100e3, 500e3, 15), np.linspace(0.4, 0.499, 9)
-    loss = 0.002 + np.log(moduli / 251e3)[:, None] ** 2 + 3.0 * (ratios - 0.49) ** 2
-    loss[0, 0] = np.inf
-    landscape = {"youngs_modulus": moduli, "poissons_ratio": ratios, "loss": loss}
-    found = {"landscape": landscape}
+    found = {}
     if "sysid" in models:
         found["sysid"] = result(starts | damping)
     if "sysid_elastic" in models:

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..report.bodies import BODIES, BODY_LIGHT, obstacle_layers, sharp_edges
-from ..report.camera import frame_of
 from ..report.obstacles import ObstacleSurface
-from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, view_axes
+from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, frame_of, view_axes
 
 _SIZE: Final = (480, 480)  # px
 _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # azimuth and elevation of the camera

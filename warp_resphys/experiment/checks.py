@@ -178,11 +178,9 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
     if not identify.parameters:
         raise InputError(f"identify.parameters is empty: give a range for at least one of {', '.join(identifiable)}.")
     elastic = [name for name in ELASTIC if name in identifiable]
-    grid = () if identify.grid is None else [name for name, axis in dict(identify.grid).items() if axis is not None]
     for group, names, choice in (
         ("parameters", identify.parameters, identifiable),
         ("elastic", identify.elastic or (), elastic),
-        ("grid", grid, elastic),
         ("first_guess", identify.first_guess, identifiable),
     ):
         for name in names:

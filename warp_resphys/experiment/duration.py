@@ -93,9 +93,7 @@ def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
             candidates = wanted.candidates if wanted.starts > 1 else 0
             searches = {"sysid": len(wanted.parameters), "sysid_elastic": len(wanted.elastic or {})}
             each = {m: evaluations * (1.0 + _VARIED * number) + candidates for m, number in searches.items() if number}
-            points = [axis.points for axis in dict(wanted.grid or {}).values() if axis is not None]
-            shown = math.prod(points) * steps_of(experiment, "sysid", names) if wanted.landscape and points else 0.0
-            return sum(number * steps_of(experiment, m, names) for m, number in each.items()) + shown, 0.0, 0.0
+            return sum(number * steps_of(experiment, m, names) for m, number in each.items()), 0.0, 0.0
         case ReconstructStage():
             return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
         case TrainStage(model=model, training=training):

@@ -184,8 +184,7 @@ def summary(
     content: dict[str, Any] = {
         "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
         "per_trajectory": [
-            {**row, "amplitude_mm": amplitudes[row["name"]], **_thirds(errors, number)}
-            for number, row in enumerate(summarise_trajectories(tuple(names), errors))
+            {**row, "amplitude_mm": amplitudes[row["name"]]} for row in summarise_trajectories(tuple(names), errors)
         ],
     }
     if dataset.bound is None:
@@ -229,14 +228,6 @@ def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
     seen = np.isfinite(observed).all(axis=(-2, -1))
     mean = float(np.degrees(angles(observed, simulated)[seen].mean())) if seen.any() else math.nan
     return mean if math.isfinite(mean) else None
-
-
-def _thirds(errors: Mapping[str, Sequence[FloatArray]], number: int) -> dict[str, dict[str, list[float]]]:
-    """Mean errors in the thirds of a trial's frames [mm], by model whose roll-out is defined; empty for a pose."""
-    own = {model: rows[number] for model, rows in errors.items() if np.isfinite(rows[number]).all()}
-    parts = {model: np.array_split(row, 3) for model, row in own.items() if len(row) >= 3}
-    means = {model: [float(part.mean()) for part in series] for model, series in parts.items()}
-    return {"thirds_mm": means} if means else {}
 
 
 def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -> list[FloatArray]:

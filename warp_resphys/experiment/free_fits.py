@@ -1,4 +1,4 @@
-"""What would remain of the errors of test trials if their inputs or their marker places were free.
+"""What could explain the errors that remain in test trials: gain and zero of the inputs, or marker places.
 
 Every free quantity is fitted to the trial itself, linearised about the identified model, so that the fits tell where an
 error comes from and are no predictions: where a scale of the inputs takes most of an error away, the simulator lacks
@@ -26,9 +26,9 @@ def free_fits(
 ) -> list[dict[str, Any]]:
     """Returns what would remain of the errors of trials if something were free, by trial.
 
-    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change), their ``zero`` (in their unit) and
-    ``delay`` [s], common to all of a trial's inputs; the ``places`` of the trial's markers and the frame of its
-    recording, and those that all tested trials of a ``session`` share. What the trial does not determine is left out.
+    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change) and their ``zero`` (in their unit),
+    common to all of a trial's inputs; and the ``places`` of the markers and the frame of the recordings, which all
+    tested trials of a session share. What the trials do not determine is left out.
 
     Args:
         experiment: the experiment.
@@ -61,18 +61,7 @@ def _columns(linear: Sensitivity, words: Mapping[str, str]) -> dict[str, FloatAr
     for quantity, word in (("scale", "factor"), ("zero", "zero")):
         if own := [linear.by_parameter[name] for name, other in words.items() if other == word]:
             columns[quantity] = np.sum(own, axis=0)[..., None]
-    if words and len(linear.points) > 1:
-        columns["delay"] = -_rate(linear.points, linear.times)[..., None]
     return columns | ({} if linear.by_placement is None else {"places": linear.by_placement})
-
-
-def _rate(points: FloatArray, times: FloatArray) -> FloatArray:
-    """(T, M, 3) velocities [m/s] of points at times (T,), which repeat the last one after the end."""
-    count = int(np.count_nonzero(np.diff(times) > 0.0)) + 1
-    rate = np.zeros_like(points)
-    if count > 1:
-        rate[:count] = np.gradient(points[:count], times[:count], axis=0)
-    return rate
 
 
 def _fitted(
@@ -85,10 +74,10 @@ def _fitted(
     """Entry of a trial, see `free_fits`, from its errors (T, M, 3) [m] and the places that its session shares."""
     left, values = dict[str, float](), dict[str, float]()
     for quantity, slopes in columns.items():
-        if (own := _least([error], [slopes])) is not None:
+        if quantity != "places" and (own := _least([error], [slopes])) is not None:
             left[quantity] = _mean(error + slopes @ own, labels)
-            values |= {quantity: float(own[0])} if len(own) == 1 else {}
-    left |= {} if shared is None else {"session": _mean(error + columns["places"] @ shared, labels)}
+            values[quantity] = float(own[0])
+    left |= {} if shared is None else {"places": _mean(error + columns["places"] @ shared, labels)}
     return {"name": name, "as_is_mm": _mean(error, labels), "left_mm": left, "values": values}
 
 

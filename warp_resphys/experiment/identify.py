@@ -30,20 +30,18 @@ from .trials import evenly
 log = logging.getLogger(__name__)
 
 ELASTIC = ("youngs_modulus", "poissons_ratio")
-_LANDSCAPE = "landscape"
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
-_AT_ONCE = 4  # points of the landscape per batch
 
 Replays = Sequence[tuple[Replay, Start]]
 
 
 def identify(context: StageContext) -> None:
-    """Writes identification.json: all configured parameters, optionally E and nu alone, and the loss landscape.
+    """Writes identification.json: all configured parameters, and optionally E and nu alone.
 
     E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
     the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
     training trials. Releases are estimated again with the identified parameters, which are then refined. An interrupted
-    run keeps its finished starts, searches and points.
+    run keeps its finished starts and searches.
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
@@ -54,10 +52,8 @@ def identify(context: StageContext) -> None:
     kinds = {model: MODELS[model][0] for model in ranges}
     released = any(experiment.begins(name) == "released" for name in names)
     evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
-    kept = {
-        part: Checkpoint(context, part)
-        for part in (*ranges, *(again for model in ranges for again in again_of(model)), _LANDSCAPE)
-    }
+    parts = (*ranges, *(again for model in ranges for again in again_of(model)))
+    kept = {part: Checkpoint(context, part) for part in parts}
     done = sum(part.evaluations for part in kept.values())
     identified, replays = {}, {}
     with Progress(context.name, evaluations, "evaluations at most", done) as progress:
@@ -86,16 +82,6 @@ def identify(context: StageContext) -> None:
                 expected = nuisances["accuracy"].of_new_session(like, len(sessions)).tolist()
                 found = {**found, "placement": {**found["placement"], "new_session": expected}}
             identified[model] = _separated(found, searches[model]) | {"history": history, "first_guess": guess}
-    if wanted.landscape and wanted.grid is not None:
-        seconds = _seconds(settings, replays["sysid"]) if wanted.seconds is not None else None
-        grid = {name: axis for name, axis in dict(wanted.grid).items() if axis is not None}
-        axes = {name: Bounds(axis.lower, axis.upper, axis.logarithmic) for name, axis in grid.items()}
-        others = {name: bounds for name, bounds in ranges["sysid"].items() if name not in axes}
-        nuisances = _nuisances(experiment) | _placement(experiment)
-        identifier = Identifier(replays["sysid"], {**axes, **others}, seconds, **nuisances)
-        counts, found = {name: axis.points for name, axis in grid.items()}, identified["sysid"]
-        at = {**found["parameters"], **found.get("own", {})}
-        identified[_LANDSCAPE] = _landscape(identifier, counts, at, kept[_LANDSCAPE])
     write_json(context.run_dir / IDENTIFICATION, identified)
     for model in ranges:  # First frames are compared with the identified simulator, as later stages read it.
         values, deviations = _of_first_frames(experiment, model, searches[model], names)
@@ -293,19 +279,3 @@ def search_parameters(
     starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
     kept.keep(found=asdict(search.run(starts, most, report, finished, keep, wanted.tolerance, is_last)))
     return dict(kept.content["found"])
-
-
-def _landscape(
-    identifier: Identifier, counts: Mapping[str, int], identified: Mapping[str, float], kept: Checkpoint
-) -> dict[str, Any]:
-    """Losses on a grid over the ranges of parameters, the others at their identified values."""
-    finished = kept.content.get("losses", [])
-    with Progress("identify: landscape", math.prod(counts.values()), "points", len(finished)) as progress:
-
-        def report(losses: list[float]) -> None:
-            kept.keep(losses=losses)
-            progress.advance(len(losses) - progress.done)
-
-        losses = identifier.grid(counts, identified, _AT_ONCE, finished, report)
-    ticks = {name: identifier.ticks(name, count).tolist() for name, count in counts.items()}
-    return {**ticks, "loss": losses.tolist()}

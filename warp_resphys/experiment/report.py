@@ -34,7 +34,6 @@ from ..report.data import (
     TrialResults,
     models_in_figures,
 )
-from ..report.notes import error_notes, kept_note, material_note, network_note, published_note, target_note
 from ..report.obstacles import ObstacleSurface
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
@@ -86,8 +85,6 @@ def make_report(context: StageContext) -> None:
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
-    on_steps = run.in_the_loop is None or run.in_the_loop.start == "steps"
-    learned = "resphys" in metrics["errors_mm"] and on_steps
     assert run.tip is not None
     no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
@@ -101,18 +98,13 @@ def make_report(context: StageContext) -> None:
         film=film,
         driven=driven,
         recordings=read_recordings(folder, run, *_at_rest(mesh, trials, film)),
-        notes=error_notes(metrics.get("sideways_mm", {}), truth, metrics.get("mesh_check", {})),
         identification=identification,
         law=law,
         **(read_stretches(folder, mesh, trials, film) if law else {}),
         start=data_sheet(run, identification),
         truth={**truth.get("material", {}), **true_contact(run)},
         training=_histories(folder),
-        network_note=network_note(run, on_law=bool(law.get("accepted"))) if learned else "",
-        kept_note=kept_note(metrics["networks"]),
         followed=read_followed(folder, run),
-        simulator=material_note(run.simulation),
-        target=target_note(run),
     )
     run_page.write_report(folder / REPORT, data)
 
@@ -127,13 +119,11 @@ def make_folds_report(context: StageContext) -> None:
 
     folder, run = context.run_dir, context.settings.config
     metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
-    sideways = {trial: mm for fold in metrics["folds"].values() for trial, mm in fold.get("sideways_mm", {}).items()}
     body = build_body(run, run.payload_at)
     data = RunReport(
         **_common_parts(run, metrics, body),
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         recordings=read_recordings(folder, run, body.mesh, {}),
-        notes=error_notes(sideways, {}, {}),
     )
     run_page.write_report(folder / REPORT, data)
 
@@ -145,7 +135,6 @@ def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> d
         "settings": run,
         "mesh": body.mesh,
         "fixed": body.fixed_vertices,
-        "published_note": published_note(run),
     }
 
 
@@ -199,10 +188,10 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
 
 
 def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str, float]:
-    """Configured values of the identified parameters, and of the axes of the loss landscape."""
+    """Configured values of the identified parameters."""
     names = {name for model in identification.values() for name in model.get("parameters", {})}
     simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
-    return configured_parameters(simulator, (*names, "youngs_modulus", "poissons_ratio"))
+    return configured_parameters(simulator, sorted(names))
 
 
 def true_contact(run: RunSettings) -> dict[str, float]:

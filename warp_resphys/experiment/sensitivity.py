@@ -32,14 +32,12 @@ class Sensitivity:
 
     Attributes:
         points: (T, M, 3) [m].
-        times: (T,) of the frames [s].
         by_parameter: (T, M, 3) by parameter; a value of the trial's own moves in place of the common one.
         by_placement: (T, M, 3, 3 M + 6) by the offsets of the markers on the body, and the shift and the rotation
             vector of the recording's frame; None where markers are seen in part.
     """
 
     points: FloatArray
-    times: FloatArray
     by_parameter: Mapping[str, FloatArray]
     by_placement: FloatArray | None
 
@@ -113,11 +111,10 @@ def _of_batch(
         markers, rotations = DisplacedMarkers.split(points)
         points = placement.apply(markers + (rotations @ placement.offsets[..., None])[..., 0])
         slopes = by_placement(placement, points[0], rotations[0]).double().cpu().numpy()
-    shown, times = points.double().cpu().numpy(), own.trials.times.double().cpu().numpy()
+    shown = points.double().cpu().numpy()
     return {
         name: Sensitivity(
             points=shown[0, trial],
-            times=times[trial],
             by_parameter={p: (shown[row, trial] - shown[0, trial]) / moved[p] for p, row in rows.items()},
             by_placement=slopes[trial],
         )

@@ -7,7 +7,6 @@ derivatives along the motions (`Replay.varied`).
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -57,47 +56,6 @@ class ParameterSearch:
     def bounds(self) -> dict[str, Bounds]:
         """Range of each parameter."""
         return self._misfit.bounds
-
-    def grid(
-        self,
-        axes: Mapping[str, int],
-        others: Mapping[str, float],
-        chunk: int = 12,
-        finished: Sequence[float] = (),
-        report: Callable[[list[float]], None] | None = None,
-    ) -> FloatArray:
-        """Losses on a grid over some of the parameters, with the others fixed.
-
-        Args:
-            axes: number of points of each parameter of the grid, over its whole range.
-            others: values of the remaining parameters; if values of all are given, the priors are weighted there.
-            chunk: sets of parameters that are simulated at once.
-            finished: losses that an interrupted call with the same arguments reported; they are not computed again.
-            report: called with the losses so far, in the order of the grid's points, after every chunk.
-
-        Returns:
-            Losses with one axis for each of `axes`, in their order; infinite where a simulation failed.
-        """
-        misfit = self._misfit
-        if not misfit.prior_weight and others.keys() >= self.bounds.keys():
-            misfit.update_prior_weight(misfit.to_unit(others))
-        fixed = misfit.to_unit({**others, **{name: self.bounds[name].lower for name in axes}})
-        ticks = [
-            np.linspace(0.0, 1.0, axes[name]) if name in axes else [unit]
-            for name, unit in zip(self.bounds, fixed, strict=True)
-        ]
-        points = np.array(list(product(*ticks)))
-        losses = list(finished)
-        while len(losses) < len(points):
-            losses += misfit.losses_or_infinite(points[len(losses) : len(losses) + chunk]).tolist()
-            if report is not None:
-                report(losses)
-        order = [name for name in self.bounds if name in axes]
-        return np.array(losses).reshape([axes[name] for name in order]).transpose([order.index(name) for name in axes])
-
-    def ticks(self, name: str, count: int) -> FloatArray:
-        """The values of a parameter on `grid`."""
-        return self.bounds[name].from_unit(torch.linspace(0.0, 1.0, count, dtype=torch.float64)).numpy()
 
     def starts(self, first: Mapping[str, float], count: int, candidates: int, seed: int) -> list[dict[str, float]]:
         """The first guess, and the best of random candidates in the ranges.

@@ -53,14 +53,25 @@ def paired_gain(before: Sequence[float], after: Sequence[float]) -> Gain:
         after: error of each trial with this model, in the same unit.
     """
     pairs = np.array([before, after], dtype=np.float64)
-    rows = np.random.default_rng(0).integers(pairs.shape[1], size=(_DRAWS, pairs.shape[1]))
-    drawn = pairs[:, rows].mean(axis=2)
-    count, means = pairs.shape[1], pairs.mean(axis=1)
-    tail = 0.5
-    if count > 1:
-        tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, _TAIL)))
+    drawn, tail = _resampled(pairs)
     lower, upper = np.quantile(1.0 - drawn[1] / drawn[0], [tail, 1.0 - tail])
-    return Gain(float(1.0 - means[1] / means[0]), float(lower), float(upper), count)
+    means = pairs.mean(axis=1)
+    return Gain(float(1.0 - means[1] / means[0]), float(lower), float(upper), pairs.shape[1])
+
+
+def mean_interval(errors: Sequence[float]) -> tuple[float, float]:
+    """Returns the 90 % interval of a model's mean error over resampled trials, see `paired_gain`."""
+    drawn, tail = _resampled(np.array([errors], dtype=np.float64))
+    lower, upper = np.quantile(drawn[0], [tail, 1.0 - tail])
+    return float(lower), float(upper)
+
+
+def _resampled(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Means (P, draws) of resampled columns of (P, R), and the probability outside of an interval at either end."""
+    count = values.shape[1]
+    rows = np.random.default_rng(0).integers(count, size=(_DRAWS, count))
+    tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, _TAIL))) if count > 1 else 0.5
+    return values[:, rows].mean(axis=2), tail
 
 
 # J. Gao, M. Y. Michelis, A. Spielberg, R. K. Katzschmann, "Sim-to-Real of Soft Robots with Learned Residual

@@ -84,7 +84,7 @@ def write_ablation_report(
         ],
         title=settings.title,
         kicker=experiment_kicker(settings.name),
-        verdict=verdict(rows, uncorrected),
+        verdict=[verdict(rows, uncorrected)],
         metrics=metrics,
         settings=settings.plain(),
     )

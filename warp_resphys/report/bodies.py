@@ -8,10 +8,25 @@ import numpy as np
 
 from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
-from .camera import axes_from_below, frame_of, height_of, motion_axes, picture_size
 from .data import MODELS, mean_distance
 from .obstacles import OBSTACLE, OBSTACLE_LIGHT, ObstacleSurface
-from .render import INK, MEASURED, OUTLINE, FloatArray, IntArray, Layer, RenderScene, View, pace, view_axes
+from .render import (
+    INK,
+    MEASURED,
+    OUTLINE,
+    FloatArray,
+    IntArray,
+    Layer,
+    RenderScene,
+    View,
+    axes_from_below,
+    frame_of,
+    height_of,
+    motion_axes,
+    pace,
+    picture_size,
+    view_axes,
+)
 
 _LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
 MARGIN: Final = 0.02  # Around the bodies; this and the next lengths are over the longer side of the view.

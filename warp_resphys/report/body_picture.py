@@ -16,7 +16,6 @@ from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
 from .bodies import face_edges, obstacle_layers, sharp_edges
-from .camera import frame_of, picture_size
 from .figures import CHAMBER_COLOURS, in_style
 from .obstacles import ObstacleSurface
 from .render import (
@@ -32,6 +31,8 @@ from .render import (
     View,
     chain,
     draw,
+    frame_of,
+    picture_size,
     view_axes,
 )
 

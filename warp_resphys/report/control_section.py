@@ -21,7 +21,7 @@ _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # By prefix of a controller: n
 
 def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the section; None where nothing is controlled, or no simulation plays the robot."""
-    from . import control_figures
+    from . import motion_figures
 
     metrics, control = data.metrics.get("control") or {}, data.settings.control
     if not metrics or control is None:
@@ -39,7 +39,7 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
         )
         plane = np.array([control.right, control.up], dtype=np.float64)
         blocks.append(
-            canvas.figure("control", partial(control_figures.followed_paths, drawn, named, plane), alt, caption)
+            canvas.figure("control", partial(motion_figures.followed_paths, drawn, named, plane), alt, caption)
         )
     blocks += [Text("How it was planned", heading=True), Items(_facts(metrics), "planned")]
     return Part("Control", blocks)

@@ -1,8 +1,10 @@
 """Data of the page of a run."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
@@ -36,12 +38,9 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
-PLAIN_NAMES: Final = {  # By model without physics: its name in sentences.
-    "rest": "a body that does not move",
-    "interpolation": "interpolation between the training trials",
-    "regression": "kernel regression over the training trials",
-    "linear": "a linear model without physics",
-}
+INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
+
+Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
 _OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 
@@ -162,12 +161,6 @@ class RunReport:
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
     truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
     training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
-    published_note: str = ""  # How the published errors differ from those of this run.
-    notes: Sequence[str] = ()  # Sentences on the errors.
-    network_note: str = ""  # Network of ResPhys and its training.
-    kept_note: str = ""  # Weights that were kept.
-    simulator: str = ""  # Corrected simulator in words, such as "E 215 kPa".
-    target: str = ""  # Target simulator in words.
     followed: Sequence[FollowedPath] = ()  # Driven paths of the group `control`.
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
@@ -210,6 +203,53 @@ class RunReport:
 def other_trials(settings: RunSettings) -> tuple[str, ...]:
     """Return the names of the test trials outside of the training loads; empty for most experiments."""
     return tuple(settings.data.others) if isinstance(settings.data, ReleaseFromLoad) else ()
+
+
+def folds_in(metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the metrics of each fold, or those of a split alone."""
+    return list(metrics.get("folds", {}).values()) or [metrics]
+
+
+def trial_errors(metrics: Mapping[str, Any], others: Collection[str] = (), outside: bool = False) -> Errors:
+    """Returns the errors on each held-out trial [mm], by model that all folds have; None where a roll-out diverged.
+
+    Args:
+        metrics: of a split or of folds.
+        others: names of the test trials outside of the training loads.
+        outside: whether the errors are those on these trials, or on all that are not among them.
+    """
+    every = [row for fold in folds_in(metrics) for row in fold.get("per_trajectory", ())]
+    rows = [row for row in every if (row["name"] in others) is outside]
+    models = [model for model in (rows[0]["errors_mm"] if rows else ()) if all(model in r["errors_mm"] for r in every)]
+    return {model: [row["errors_mm"][model] for row in rows] for model in models}
+
+
+def errors_by_load(metrics: Mapping[str, Any], others: Collection[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Returns summaries of the errors by kind of load and model, without deviations; empty if there are no two kinds.
+
+    Args:
+        metrics: of a split.
+        others: names of the test trials outside of the training loads.
+    """
+    groups = {kind: trial_errors(metrics, others, kind == OUTSIDE) for kind in (INSIDE, OUTSIDE)}
+    if not all(groups.values()):
+        return {}
+    return {kind: {model: _summary(own) for model, own in errors.items()} for kind, errors in groups.items()}
+
+
+def _summary(values: Sequence[float | None]) -> dict[str, Any]:
+    finite = [value for value in values if value is not None]
+    lost = len(values) - len(finite)
+    return {"mean": None if lost else fmean(finite), "std": None, "trajectories": len(values), "diverged": lost}
+
+
+def untrained(metrics: Mapping[str, Any]) -> set[str]:
+    """Returns the models of which no fold kept an epoch of training, so that their learned force is zero."""
+    epochs: dict[str, int] = Counter()
+    for fold in folds_in(metrics):
+        for model, kept in fold.get("networks", {}).items():
+            epochs[model] += kept["epoch"]
+    return {model for model, count in epochs.items() if not count}
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:

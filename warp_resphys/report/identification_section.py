@@ -1,4 +1,4 @@
-"""The section on identification: parameters, how well the trials determine them, and the loss around them."""
+"""The section on identification: parameters, and how well the trials determine them."""
 
 import math
 import re
@@ -12,8 +12,7 @@ from ..data.rigid import root_mean_square
 from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
-from .data import MODELS, FloatArray, RunReport
-from .notes import material_words
+from .data import MODELS, RunReport
 from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 
 # Name, unit on the page, and its number in an SI unit.
@@ -78,7 +77,7 @@ _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the 
 
 
 def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the identified parameters, how well the data determine them, and the loss around them."""
+    """Return the identified parameters, and how well the data determine them."""
     identified = {name: data.identification[name] for name in MODELS if name in data.identification}
     if not identified:
         return None
@@ -94,7 +93,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     if uncertain:
         notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
     if data.truth:
-        model = material_words(data.truth.get("model", "corotated"))
+        model = data.truth.get("model", "corotated").replace("_", " ")
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(text) for text in uncertain]
@@ -106,7 +105,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas) -> list[Drawn]:
-    """The losses of the identifications over their evaluations, and over a grid."""
+    """The losses of the identifications over their evaluations."""
     from . import learning_figures
 
     drawn = []
@@ -120,37 +119,7 @@ def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas
                 "is the mean squared distance of the markers over the square of the motion’s amplitude.",  # noqa: RUF001
             )
         )
-    if grid := data.identification.get("landscape"):
-        loss, modulus = (np.array(grid[key], dtype=np.float64) for key in ("loss", "youngs_modulus"))
-        ratio = np.atleast_1d(np.array(grid.get("poissons_ratio", []), dtype=np.float64))
-        points = _landscape_points(data, loss, modulus, ratio)
-        marked = "; ".join(f"{name} at {1e-3 * e:.4g} kPa" for name, (e, _) in points.items())
-        drawn.append(
-            canvas.figure(
-                "landscape",
-                partial(learning_figures.landscape, modulus, ratio, loss, points),
-                f"Loss over Young's modulus{' and Poisson’s ratio' if loss.ndim > 1 else ''}: {marked}.",  # noqa: RUF001
-                "The loss on a grid around the parameters identified by SysID, with the others fixed. It is empty "
-                "where no simulation succeeded.",
-            )
-        )
     return drawn
-
-
-def _landscape_points(
-    data: RunReport, loss: FloatArray, modulus: FloatArray, ratio: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """Modulus [Pa] and ratio of the points marked in the landscape, by name."""
-    points: dict[str, tuple[float, float]] = {}
-    if np.isfinite(loss).any():
-        row, *column = np.unravel_index(int(np.nanargmin(loss)), loss.shape)
-        points["lowest of the grid"] = (float(modulus[row]), float(ratio[column[0]]) if column else 0.0)
-    identified = data.identification.get("sysid", {}).get("parameters", {})
-    identified = {"poissons_ratio": data.start.get("poissons_ratio", 0.0), **identified}
-    for name, values in {"data sheet": data.start, "identified": identified, "true": data.truth}.items():
-        if {"youngs_modulus", "poissons_ratio"} <= values.keys():
-            points[name] = (values["youngs_modulus"], values["poissons_ratio"])
-    return points
 
 
 def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:

@@ -1,5 +1,6 @@
 """The section on the identified law: its terms, its moduli at small strains, the classes that were tried, its use."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -10,13 +11,34 @@ import numpy as np
 from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
-from .conclusions import law_text
-from .data import RunReport
+from .data import MODELS, RunReport
 from .identification_section import Wording, digits, parameter_wording
-from .notes import in_a_row, small_strain_of
-from .page import NONE, Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, significant
-from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_strain, uniaxial_stress
-from .verdict import unbroken
+from .page import (
+    NONE,
+    Block,
+    Canvas,
+    Cell,
+    Drawn,
+    PageTable,
+    Part,
+    Row,
+    Text,
+    in_a_row,
+    number_text,
+    significant,
+    unbroken,
+)
+from .uniaxial import (
+    ACROSS,
+    ALONG,
+    SmallStrain,
+    families,
+    ogden_terms,
+    small_strain,
+    small_strain_of,
+    uniaxial_stress,
+)
+from .verdict import model_name
 
 _NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
 _BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
@@ -54,6 +76,7 @@ _GROUPS: Final[Mapping[str, str]] = {
     "branches": "relaxation",
     "fibres": "fibres",
 }
+_MATERIALS: Final = ("sysid", "law")  # Models whose material can be put on another body, the better one last.
 _OPEN: Final = 0.5  # Deviation from which on a constant is not determined, over its value.
 # The same for constants that may well be zero, in an SI unit.
 _OPEN_BY_UNIT: Final[Mapping[str, float]] = {"rad": 0.25, "": 0.05}
@@ -68,12 +91,32 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     law = {**law, "constants": constants}
     blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
-    notes += [f"The target is simulated, with the material {data.target}."] if data.target else []
-    blocks += [Text(" ".join(notes if law.get("deviation") else notes[1:]), note=True)]
+    blocks += [Text(" ".join(notes), note=True)] if law.get("deviation") else []
     said = (open_text(law), not_needed_text(law, settings), outside_text(data))
     blocks += [Text(unbroken(text)) for text in said if text]
     blocks += [_moduli_table(data, constants), *_curve(data, constants, canvas)]
     return Part("Law of the material", [*blocks, *_classes(law)])
+
+
+def law_text(law: Mapping[str, Any]) -> str:
+    """Return a sentence on whether the identified law is used, and why.
+
+    Args:
+        law: From metrics.json, with `accepted`, `validation` and the model `against` which it was tested.
+    """
+    checked, base = law["validation"], model_name(law.get("against", "simulation"))
+    where = f"{checked.get('split', 'validation')} trials ({', '.join(checked['trials'])})"
+    head = f"The identified law is {'used' if law['accepted'] else 'not used'}"
+    tail = ""
+    if law.get("file"):
+        head = f"The law of {law['file']} is used as it is"
+        there = law.get("accepted_there", True)
+        tail = "" if there else " The run that identified it did not use it: it was not clearly closer there."
+    law_error, base_error = (_share(checked[key]) for key in ("law", "below"))
+    return (
+        f"{head}: its root mean square error on the {where} is {law_error} of the motion's amplitude, that of {base} "
+        f"{base_error}.{tail}"
+    )
 
 
 def wording(name: str) -> tuple[Wording, str]:
@@ -204,9 +247,9 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
 
 def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
     """Draws the stress in slow tension and compression."""
-    from . import law_figure
+    from . import learning_figures
 
-    stretches = law_figure.drawn_stretches(data.stretches)
+    stretches = learning_figures.drawn_stretches(data.stretches)
     fibres = families(constants)
     directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
     curves = {label: (stretches, uniaxial_stress(constants, stretches, d)) for label, d in directions.items()}
@@ -220,7 +263,7 @@ def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> l
     return [
         canvas.figure(
             "law",
-            partial(law_figure.stress_over_stretch, curves, modulus, data.stretches),
+            partial(learning_figures.stress_over_stretch, curves, modulus, data.stretches),
             unbroken(f"Nominal stress of the law against stretch. {ends}."),
             "Nominal stress of the law in slow uniaxial tension and compression; dashed, the straight line with its "
             f"Young's modulus at small strains.{shaded}{without}",
@@ -260,3 +303,55 @@ def _is_coefficient(name: str) -> bool:
 
 def _share(value: float | None) -> str:
     return "failed" if value is None else significant(100.0 * value) + " %"
+
+
+def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
+    shapes: Mapping[str, Any] = data.metrics.get("shapes", {})
+    if not shapes:
+        return None
+    note = (
+        "Mean distance of the vertices from a target of the same shape, whose motion begins in the same state; below "
+        "it, the share of the uncorrected simulation's error that is removed. A learned force belongs to its mesh, and "
+        "cannot be put on another one."
+    )
+    beyond = [f"{n} ({100.0 * r['outside']:.0f} %)" for n, r in shapes.items() if r.get("outside", 0.0) > _BEYOND]
+    outside = "Outside of the stretches that the law was learned at, with the share of cells and times: "
+    texts = [outside + f"{in_a_row(beyond)}."] if beyond else []
+    return Part(
+        "Other bodies of the same material", [shapes_table(shapes, note), *(Text(unbroken(text)) for text in texts)]
+    )
+
+
+def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
+    """Return the errors by body and model."""
+    models = _models(shapes)
+    rows = []
+    for name, result in shapes.items():
+        shares = _removed(result)
+        cells = [
+            Cell(number_text(result["errors_mm"][model]), f"removes {share_text(shares[model])}")
+            if model in shares
+            else Cell(number_text(result["errors_mm"].get(model)) if model in result["errors_mm"] else NONE)
+            for model in models
+        ]
+        small = f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"
+        rows.append(Row(name, cells, small=small))
+    return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
+
+
+def _models(shapes: Mapping[str, Any]) -> list[str]:
+    return [model for model in MODELS if any(model in result["errors_mm"] for result in shapes.values())]
+
+
+def _removed(result: Mapping[str, Any]) -> dict[str, float]:
+    """Share of the uncorrected simulation's error that the others remove, where they did not diverge."""
+    errors = result["errors_mm"]
+    base = errors["simulation"]
+    return {m: 1.0 - errors[m] / base for m in _MATERIALS if base and errors.get(m) is not None}
+
+
+def share_text(share: float) -> str:
+    """Return a share as a percentage, with digits for what is left of it."""
+    digits = max(0, -math.floor(math.log10(1.0 - share)) - 1) if 0.9 < share < 1.0 else 0
+    return f"{100.0 * share:.{digits}f} %".replace("-", "\N{MINUS SIGN}")

@@ -1,4 +1,4 @@
-"""Figures of learning: losses of a training and of an identification, and the loss around identified parameters."""
+"""Figures of learning: losses of a training and of an identification, and the stress of an identified law."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -7,12 +7,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from .figures import LABELS, TONES, FloatArray, in_style, new_figure, positive, use_logarithm
 
-_LEVELS: Final = 14  # Of a landscape.
 _KILO: Final = 1e-3
+_POINTS: Final = 81
+_LEAST: Final = 0.02  # Least range of strains that is drawn, on either side of rest.
+_SHADE: Final = 0.45  # Opacity.
+_MARGIN: Final = 0.15  # Of the drawn range, over the range of the strains.
 
 
 @in_style()
@@ -83,72 +86,6 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     return figure
 
 
-@in_style()
-def landscape(
-    modulus: FloatArray,
-    ratio: FloatArray,
-    loss: FloatArray,
-    points: Mapping[str, tuple[float, float]],
-    *,
-    narrow: bool,
-) -> Figure:
-    """Draw the loss over Young's modulus and Poisson's ratio; as a curve where the grid has one ratio.
-
-    Args:
-        modulus: (A,) [Pa].
-        ratio: (B,); one value, or none, for a curve.
-        loss: (A, B) or (A,), NaN where the simulation failed.
-        points: Modulus and ratio to be marked, by name.
-        narrow: Whether the figure is for a narrow page.
-    """
-    values = positive(np.asarray(loss, dtype=np.float64))
-    figure = new_figure(3.6, 3.7, narrow=narrow)
-    axes = figure.subplots()
-    if values.ndim == 2 and values.shape[1] > 1 and np.isfinite(values).any():
-        _contours(figure, axes, _KILO * modulus, ratio, values)
-        places = {name: (_KILO * e, nu) for name, (e, nu) in points.items()}
-    else:
-        curve = values.reshape(len(modulus), -1)[:, 0]
-        axes.plot(_KILO * modulus, curve, color=TONES["sysid"].light)
-        use_logarithm(axes)
-        axes.set_ylabel("loss")
-        finite, e = np.isfinite(curve), np.array([e for e, _ in points.values()])
-        heights = np.interp(e, modulus[finite], curve[finite]) if finite.any() else []
-        places = {name: (_KILO * e, float(h)) for (name, (e, _)), h in zip(points.items(), heights, strict=False)}
-    for (name, place), marker in zip(places.items(), "oDs^", strict=False):
-        tone = TONES["simulation"].light if marker == "D" else "white"
-        edge: dict[str, Any] = {"markeredgecolor": "black", "markeredgewidth": 0.9, "zorder": 5, "clip_on": False}
-        axes.plot(*place, marker, color=tone, markersize=7.0, linestyle="none", label=name, **edge)
-    if modulus.max() > 3.0 * modulus.min():
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("Young's modulus [kPa]")
-    if places:
-        handles, names = axes.get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside upper left", ncols=1 if narrow else 3, columnspacing=1.6)
-    return figure
-
-
-def _contours(figure: Figure, axes: Axes, modulus: FloatArray, ratio: FloatArray, loss: FloatArray) -> None:
-    """Filled levels, evenly spaced in the logarithm of the loss, with lines between them."""
-    level = np.log10(loss)
-    low, high = float(np.nanmin(level)), float(np.nanmax(level))
-    levels = np.linspace(low - 1e-9, (high if high > low else low + 1.0) + 1e-9, _LEVELS)
-    masked = np.ma.masked_invalid(level.T)
-    filled = axes.contourf(modulus, ratio, masked, levels=levels, cmap="viridis")
-    axes.contour(modulus, ratio, masked, levels=levels, colors="white", linewidths=0.5, alpha=0.55)
-    axes.set_ylabel("Poisson's ratio")
-    axes.grid(visible=False)
-    bar = figure.colorbar(filled, ax=axes, pad=0.02, aspect=28)
-    bar.outline.set_visible(False)
-    whole = [tick for tick in (-6, -5, -4, -3, -2, -1, 0, 1, 2, 3) if low <= tick <= high]
-    ticks = whole if len(whole) > 1 else np.linspace(low, high, 4).tolist()
-    bar.set_ticks(ticks, labels=[f"{10.0**tick:.2g}" for tick in ticks])
-    bar.set_label("loss")
-
-
 def _count(axis: Axis, most: int) -> None:
     """Label an axis at whole numbers only, even if there is just one."""
     axis.set_major_locator(MaxNLocator(most, integer=True, min_n_ticks=1))
@@ -169,3 +106,52 @@ def _rollout_curve(axes: Axes, epochs: FloatArray, errors: FloatArray) -> None:
         best = int(np.nanargmin(errors))
         axes.plot(epochs[best], errors[best], "o", color=TONES["simulation"].light, markersize=5)
         axes.set_title(f"lowest: {errors[best]:.2g} mm, epoch {epochs[best]:.0f}", loc="right")
+
+
+def drawn_stretches(ranges: Mapping[str, tuple[float, float]]) -> FloatArray:
+    """Return the stretches (S,) of the curves: those of the trials and a margin, or 0.8 to 1.3 without any."""
+    low = min((low for low, _ in ranges.values()), default=0.8)
+    high = max((high for _, high in ranges.values()), default=1.3)
+    low, high = min(low, 1.0 - _LEAST), max(high, 1.0 + _LEAST)
+    margin = _MARGIN * (high - low)
+    return np.unique(np.append(np.linspace(max(low - margin, 0.2), high + margin, _POINTS), 1.0))
+
+
+@in_style()
+def stress_over_stretch(
+    curves: Mapping[str, tuple[FloatArray, FloatArray]],
+    modulus: float,
+    ranges: Mapping[str, tuple[float, float]],
+    *,
+    narrow: bool,
+) -> Figure:
+    """Draw stress against stretch, the line of Young's modulus dashed, and the stretches of trials as shades.
+
+    Args:
+        curves: Stretches (S,) and nominal stress (S,) [Pa], by label.
+        modulus: Young's modulus at rest, of the first curve [Pa].
+        ranges: Least and largest stretch in trials, by name.
+        narrow: Whether the figure is for a narrow page.
+    """
+    figure = new_figure(3.3, 3.7, narrow=narrow)
+    axes = figure.subplots()
+    law, ink = TONES["law"].light, TONES["ink"].light
+    stretches = next(iter(curves.values()))[0]
+    highest = max(float(np.nanmax(stress)) for _, stress in curves.values())
+    lowest = min(float(np.nanmin(stress)) for _, stress in curves.values())
+    for (name, (low, high)), tone in zip(ranges.items(), ("rule", "target"), strict=False):
+        axes.axvspan(low, high, color=TONES[tone].light, alpha=_SHADE, linewidth=0.0, label=f"stretches in {name}")
+    looks: list[dict[str, Any]] = [{}, {"linestyle": (0, (4, 1.5))}, {"linestyle": (0, (1, 1.2))}]
+    for (label, (x, stress)), look in zip(curves.items(), looks, strict=False):
+        axes.plot(x, _KILO * stress, color=law, linewidth=1.9, label=label, **look)
+    straight = modulus * (stretches - 1.0)
+    dashed: dict[str, Any] = {"color": ink, "linewidth": 1.0, "linestyle": (0, (6, 3))}
+    axes.plot(stretches, _KILO * straight, **dashed, label=f"E at small strains, {_KILO * modulus:.3g} kPa")
+    axes.axhline(0.0, color=TONES["muted"].light, linewidth=0.6)
+    span = highest - lowest
+    axes.set(xlim=(stretches[0], stretches[-1]), ylim=(_KILO * (lowest - 0.1 * span), _KILO * (highest + 0.1 * span)))
+    axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")
+    handles, labels = axes.get_legend_handles_labels()
+    columns = 1 if narrow else 2
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
+    return figure

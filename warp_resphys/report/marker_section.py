@@ -20,13 +20,18 @@ from .data import (
     shown_markers,
     tip_markers,
 )
-from .page import Canvas, Drawn, Part
+from .page import Canvas, Drawn, Part, mm_text
 
 # Models whose coordinates are drawn, as more would overlap.
 _DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
+_CALIBRATED: Final = {  # Source of prediction intervals.
+    "validation": "the errors in the validation trials",
+    "training": "the errors in the training trials, which tend to be too small",
+    "left_out": "the errors in the training trials, with the parameters identified without each of them",
+    "folds": "the errors of the other folds",
+}
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
 _PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
-_SPACE_SECONDS: Final = 2.5  # Of a path in space, where longer ones overlap.
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -45,8 +50,7 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
     markers = _driven_markers(data, trials, places["worst"], data.driven, canvas)
     if trials.own_frame or len(trials.axes) < 3:  # The position of the tip in space is not known.
         return Part("Marker by marker", [markers])
-    planes = [_plane(data, trials, row, at, which[at], canvas) for at, row in places.items()]
-    return Part("The tip", [*planes[:1], _space(data, trials, places["worst"], canvas), markers, *planes[1:]])
+    return Part("The tip", [markers, _plane(data, trials, places["worst"], which["worst"], canvas)])
 
 
 def _coordinates(data: RunReport, trials: TrialResults, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
@@ -61,7 +65,7 @@ def _coordinates(data: RunReport, trials: TrialResults, row: int, place: str, wh
         f"paths_{place}",
         _paths(trials, row, kept, models, trials.bound, bands),
         f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines.",
-        f"Trial {name}{which}: coordinates of the markers relative to where they were held.{_band_note(bands)}"
+        f"Trial {name}{which}: coordinates of the markers relative to where they were held.{_band_note(data, bands)}"
         + (f" The {hidden} markers that move least are not drawn." if hidden else ""),
     )
 
@@ -76,7 +80,7 @@ def _driven_markers(data: RunReport, trials: TrialResults, row: int, driven: Dri
         "markers",
         _paths(trials, row, kept, models, _start(trials, row), bands, own),
         f"Coordinates of markers over time in the trial {name}, and below them the {words} of the {per}s.",
-        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.{_band_note(bands)}",
+        f"The trial {name}: displacement of markers from rest, and the {words} that drive it.{_band_note(data, bands)}",
     )
 
 
@@ -110,8 +114,17 @@ def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int])
     return {}
 
 
-def _band_note(bands: Mapping[str, FloatArray]) -> str:
-    return " The band should contain nine of ten measured coordinates." if bands else ""
+def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:
+    """What the prediction intervals of the drawn band should contain, and what they contain in all test trials."""
+    if not bands:
+        return ""
+    intervals = data.metrics["intervals"]
+    (own,) = (intervals["models"][model] for model in bands)
+    return (
+        f" The band should contain {100.0 * intervals['level']:.0f} % of the measured coordinates, and contains "
+        f"{100.0 * own['coverage']:.0f} % of them; it is ± {mm_text(own['half_width_mm'])} wide on average, from "
+        f"{_CALIBRATED[intervals['calibrated_on']]}."
+    )
 
 
 def _start(trials: TrialResults, row: int) -> FloatArray:
@@ -120,45 +133,29 @@ def _start(trials: TrialResults, row: int) -> FloatArray:
     return np.where(np.isfinite(first), first, trials.bound)
 
 
-def _tip_paths(data: RunReport, trials: TrialResults, row: int, seconds: float) -> tuple[Any, ...]:
-    """Times (T,) [s], and displacements (T, 3) of the mean of the markers at the tip [m]: measured, and by model."""
+def _tip_paths(data: RunReport, trials: TrialResults, row: int) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Displacements (T, 3) of the mean of the markers at the tip [m]: measured, and by model."""
     shown = shown_markers(trials.target[row])
     tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
     tip = tip if len(tip) else shown
     rest = _start(trials, row)[tip].mean(axis=0)
-    near = trials.times[row] <= seconds + 1e-9
+    near = trials.times[row] <= _PLANE_SECONDS + 1e-9
     models = {m: trials.positions[m] for m in MODELS if m in trials.positions}
     seen, *paths = (q[row][near][:, tip].mean(axis=1) - rest for q in (trials.target, *models.values()))
-    return trials.times[row][near], seen, dict(zip(models, paths, strict=True))
+    return seen, dict(zip(models, paths, strict=True))
 
 
-def _plane(data: RunReport, trials: TrialResults, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
+def _plane(data: RunReport, trials: TrialResults, row: int, which: str, canvas: Canvas) -> Drawn:
     """Draws the path of the tip in the plane across gravity."""
     from . import motion_figures
 
     name = trials.names[row]
-    _, seen, paths = _tip_paths(data, trials, row, _PLANE_SECONDS)
+    seen, paths = _tip_paths(data, trials, row)
     return canvas.figure(
-        f"plane_{place}",
+        "plane",
         partial(motion_figures.tip_planes, seen, paths),
         f"Path of the tip in the plane of x and y in the trial {name}: measured in grey, the models over it.",
         f"Path of the tip across gravity over the first {min(_PLANE_SECONDS, trials.times[row, -1]):g} s of the trial "
         f"{name}{which}: displacement of the mean of the markers at the tip, measured in grey. Paths are cut at the "
         "frame.",
-    )
-
-
-def _space(data: RunReport, trials: TrialResults, row: int, canvas: Canvas) -> Drawn:
-    """Draws the path of the tip in space."""
-    from . import motion_figures
-
-    name = trials.names[row]
-    times, seen, paths = _tip_paths(data, trials, row, _SPACE_SECONDS)
-    last = [m for m in ("sysid", "law", "resphys") if m in paths] or list(paths)[-1:]
-    return canvas.figure(
-        "space",
-        partial(motion_figures.tip_in_space, times, seen, {m: paths[m] for m in last}),
-        f"Path of the tip in space in the trial {name}: measured in grey, the models as lines beside it.",
-        f"The first {min(_SPACE_SECONDS, trials.times[row, -1]):g} s of the trial {name} in space, with points every "
-        "0.5 s connected to the measured ones.",
     )

@@ -12,16 +12,16 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d import Axes3D
 
 from ..stepping.quantity import Quantity
-from .data import Driven, FloatArray
+from .data import Driven, FloatArray, FollowedPath
 from .figures import (
     CHAMBER_COLOURS,
     LABELS,
     LARGEST_SHOWN,
     NARROW,
     ROUND_STEPS,
+    STYLE,
     TONES,
     WIDE,
     in_style,
@@ -40,8 +40,9 @@ _LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest
 _ABOVE: Final = 0.35  # Margin around the measured path, over its longest side.
 _LEAST: Final = 0.25  # Shortest side of a view, over the longest.
 _LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
-_ROUND: Final = 0.5  # Time between the points along a path in space [s].
 _BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
+_LINES: Final[Mapping[str, Any]] = {"open": (0, (4, 2)), "receding": "-"}  # By beginning of a controller's name.
+_COLUMNS: Final = {False: 5, True: 2}  # Of followed paths on a wide page, on a narrow one.
 
 
 @in_style()
@@ -234,49 +235,6 @@ def _shown(path: FloatArray) -> FloatArray:
 
 
 @in_style()
-def tip_in_space(times: FloatArray, target: FloatArray, models: Mapping[str, FloatArray], *, narrow: bool) -> Figure:
-    """Draw the path of the tip in space, with a panel for each model and points connected to the measured ones.
-
-    Args:
-        times: (T,) [s].
-        target: (T, 3) displacement from rest [m], NaN where it was not seen.
-        models: (T, 3) [m] by model; outside the box around the measured path they are not drawn.
-        narrow: Whether the figure is for a narrow page; the panels are then stacked.
-    """
-    every = max(1, round(_ROUND / float(times[1] - times[0]))) if len(times) > 1 else 1
-    centre, half = _range(target)
-    shape = (len(models), 1) if narrow else (1, len(models))
-    figure = new_figure(3.3, 0.4 + 3.2 * len(models), narrow=narrow)
-    panels = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": "3d"})
-    seen = _MILLI * target
-    for (model, path), axes in zip(models.items(), panels.flat, strict=True):
-        assert isinstance(axes, Axes3D)
-        simulated = _shown(path)
-        simulated = np.where((np.abs(simulated - centre) <= half).all(axis=1, keepdims=True), simulated, np.nan)
-        axes.plot(*seen.T, color=TONES["target"].light, linewidth=2.4, label="Measured")
-        axes.plot(*simulated.T, color=TONES[model].light, linewidth=1.2, label=LABELS[model])
-        for at in range(0, len(times), every):
-            pair = np.stack([seen[at], simulated[at]])
-            axes.plot(*pair.T, color=TONES["ink"].light, linewidth=0.7)
-            axes.plot(*pair[:1].T, "o", color=TONES["muted"].light, markersize=3.0)
-            axes.plot(*pair[1:].T, "o", color=TONES[model].light, markersize=3.0)
-        xlim, ylim, zlim = np.stack([centre - half, centre + half], axis=1)
-        axes.set(xlim=xlim, ylim=ylim, zlim=zlim, xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
-        axes.view_init(elev=28.0, azim=-58.0)
-        axes.set_box_aspect(tuple(half), zoom=0.84)
-        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-            axis.set_major_locator(MaxNLocator(4, steps=ROUND_STEPS))
-            axis.set_tick_params(labelsize=7.5)
-            axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
-            axis.label.set_color(TONES["muted"].light)
-            axis._axinfo["grid"]["color"] = TONES["rule"].light
-        axes.set_title(LABELS[model], y=0.92)
-    handles, labels = panels.flat[0].get_legend_handles_labels()
-    figure.legend(handles[:1], labels[:1], loc="outside upper left")
-    return figure
-
-
-@in_style()
 def input_sequences(time_step: float, driven: Driven, *, narrow: bool) -> Figure:
     """Draw inputs over time, with a panel for each trial; the time step is in [s]."""
     height = 0.9 + 1.35 * len(driven.values)
@@ -364,4 +322,48 @@ def motion_instants(frames: Pixels, titles: Sequence[str], *, narrow: bool) -> F
             axes.imshow(picture)
             axes.set_axis_off()
         row[0].set_title(title)
+    return figure
+
+
+@in_style()
+def followed_paths(
+    paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray, *, narrow: bool
+) -> Figure:
+    """Draw paths and the paths of the controlled point, side by side in their plane.
+
+    Args:
+        paths: Paths and points.
+        controllers: Names in words of the controllers that are drawn.
+        plane: (2, 3) directions of the width and of the height.
+        narrow: Whether the figure is for a narrow page.
+    """
+    columns = min(_COLUMNS[narrow], len(paths))
+    rows = -(-len(paths) // columns)
+    width = NARROW if narrow else WIDE
+    figure = Figure(figsize=(width, width / columns * rows + 0.35), layout="constrained")
+    every = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    first = plane[0] / np.linalg.norm(plane[0])
+    second = plane[1] - (plane[1] @ first) * first
+    across = 1e3 * np.stack([first, second / np.linalg.norm(second)])
+    middle = np.mean([followed.path.mean(axis=0) for followed in paths], axis=0)
+    lines: dict[str, Any] = {}
+    for axes, followed in zip(every, paths, strict=False):
+        x, y = ((followed.path - middle) @ across.T).T
+        (lines["path"],) = axes.plot(x, y, color=TONES["target"].light, linewidth=3.2)
+        for controller, name in controllers.items():
+            beginning, model = controller.split("_", 1)
+            x, y = ((followed.points[controller] - middle) @ across.T).T
+            tone = TONES[model].light
+            (lines[name],) = axes.plot(x, y, color=tone, linestyle=_LINES[beginning], linewidth=1.1)
+        axes.set_aspect("equal")
+        axes.set_title(followed.name)
+        axes.grid(False)
+    for axes in every[len(paths) :]:
+        axes.set_visible(False)
+    for axes in every:
+        axes.tick_params(labelsize=STYLE["xtick.labelsize"] - 1.5)
+    every[0].set_ylabel("mm")
+    figure.legend(
+        list(lines.values()), list(lines), loc="outside upper left", ncols=1 if narrow else 4, columnspacing=1.6
+    )
     return figure

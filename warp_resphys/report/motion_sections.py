@@ -12,7 +12,6 @@ from markupsafe import Markup
 
 from ..learning.baselines import BASELINES
 from .bodies import ComparedMotion, distance_scene, largest_distances
-from .camera import hangs
 from .data import (
     MODELS,
     Driven,
@@ -25,9 +24,8 @@ from .data import (
     shown_models,
 )
 from .obstacles import ObstacleSurface
-from .page import Block, Canvas, Drawn, Part, Text, data_address, drawn_file, largest_text
-from .render import Pixels, Renderer, draw, write_film
-from .verdict import left_text, unbroken
+from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text, unbroken
+from .render import Pixels, Renderer, draw, hangs, write_film
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the interactive view.
@@ -124,9 +122,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]][0]}."
-    left = left_text(data.metrics, name)
-    blocks: list[Block] = [] if left is None else [Text(left, "left_here")]
-    blocks += [] if data.sees_markers else _vertex_figures(data, trials, canvas)
+    blocks: list[Block] = [] if data.sees_markers else _vertex_figures(data, trials, canvas)
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"

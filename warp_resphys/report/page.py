@@ -4,6 +4,7 @@ import base64
 import hashlib
 import logging
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -211,8 +212,7 @@ def write_page(
     *,
     title: str,
     kicker: str,
-    verdict: str,
-    conclusions: Sequence[str] = (),
+    verdict: Sequence[str],
     metrics: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
     timed: PageTable | None = None,
@@ -225,7 +225,6 @@ def write_page(
         title: Its heading.
         kicker: Line above the heading.
         verdict: Sentences below the heading.
-        conclusions: Further sentences below the verdict.
         metrics: Of a run: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
         settings: Of the same run, as nested data.
         timed: Times of the simulations of that run.
@@ -237,7 +236,6 @@ def write_page(
         title=title,
         kicker=kicker,
         verdict=verdict,
-        conclusions=conclusions,
         parts=parts,
         script=Script.of(parts),
         kind_of=lambda block: type(block).__name__,
@@ -350,3 +348,20 @@ def percent_text(ratio: float, decimals: int = 0) -> str:
         return f"{1.0 + ratio:,.0f} times"
     text = f"{100.0 * ratio:+.{decimals}f}"
     return f"{text.replace('-', MINUS) if float(text) else '0'} %"
+
+
+def ratio_text(ratio: float) -> str:
+    """Return a ratio of errors as "0.23", "1.4", "320" or "1/320"."""
+    if ratio < 0.1:
+        return f"1/{float(f'{1.0 / ratio:.2g}'):,.0f}" if ratio else "0"
+    return f"{float(f'{ratio:.2g}'):,.0f}" if ratio >= 10.0 else f"{ratio:.2g}"
+
+
+def unbroken(text: str) -> str:
+    """Return a text with no-break spaces between numbers and their units or symbols."""
+    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
+
+
+def in_a_row(words: Sequence[str]) -> str:
+    """Return words as a list in a sentence: "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -183,7 +183,7 @@ def write_pictures_report(
         ],
         title=run.title,
         kicker=experiment_kicker(run.name),
-        verdict=picture_verdict(results),
+        verdict=[picture_verdict(results)],
         metrics=metrics,
         settings=run.plain(),
     )

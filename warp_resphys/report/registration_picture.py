@@ -16,7 +16,6 @@ from scipy.optimize import isotonic_regression
 from ..io.atomic import atomic_path
 from ..mesh.mesh import Mesh, boundary_triangles
 from .bodies import face_edges, sharp_edges, stems
-from .camera import frame_of, picture_size
 from .data import Recordings
 from .render import (
     BODY,
@@ -31,6 +30,8 @@ from .render import (
     RenderScene,
     View,
     draw,
+    frame_of,
+    picture_size,
     view_axes,
 )
 

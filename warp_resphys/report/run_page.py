@@ -11,14 +11,12 @@ import numpy as np
 from markupsafe import Markup
 
 from ..io.errors import number_of
-from .conclusions import OUTSIDE, conclusions, epochs_kept, errors_by_load, trial_errors, untrained
 from .control_section import control_section
-from .data import MODELS, RunReport, TrialResults
+from .data import MODELS, OUTSIDE, RunReport, TrialResults, errors_by_load, folds_in, trial_errors, untrained
 from .identification_section import identification_section
-from .law_section import law_section
+from .law_section import law_section, shapes_section
 from .marker_section import paths_section
 from .motion_sections import body_section, motion_section, start_drawing
-from .notes import differences, in_a_row
 from .page import (
     NONE,
     Canvas,
@@ -36,21 +34,21 @@ from .page import (
     mm_text,
     number_text,
     published_parts,
+    ratio_text,
+    unbroken,
     write_page,
 )
-from .recommendation import recommended
 from .sections import (
-    against,
     horizons_section,
     model_table,
+    numbers,
     quality_section,
     registration_section,
     scales_section,
     training_section,
+    trials_section,
 )
-from .shapes_section import shapes_section
-from .trials_section import trials_section
-from .verdict import left_text, unbroken, verdict, when_text
+from .verdict import LEAST_TRIALS, known_errors, recommended, standings, verdict
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,12 +59,17 @@ _TIMED: Final = {
     "resphys": "Simulation with the learned force",
     "inference": "of which the network",
 }
-_WITHOUT_RECORDINGS: Final = (
-    "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with {}."
+_WITHOUT_RECORDINGS: Final = Markup(
+    "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with noise on the "
+    "markers, by the body that the settings below have as <code>laboratory</code>."
 )
-_FOLDS: Final = (
-    "Each trial links to the page of the fold in which it is the test: its motion, identification and training."
-)
+_PUBLISHED_FOR: Final = {  # By what is observed: how the published errors differ from those of this run.
+    "vertices": "Published errors are measured against the reconstructed trajectories, ours against the target; the "
+    "published simulator doubles the beam's mass and locks, as physics=published does.",
+    "beam": "The published errors are for other recordings, with ten markers and a weight that is cut off at the "
+    "release, and are measured against trajectories reconstructed from them.",
+    "arm": "The published errors are for the published simulator, of 494 vertices, on the authors' recordings.",
+}
 _MOST_LABELS: Final = 6  # Markers that are named one by one.
 _FILTER: Final = 1.0  # Window of the median filter [s], as published.
 _LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
@@ -96,8 +99,7 @@ def write_report(path: Path, data: RunReport) -> None:
         [part for section in SECTIONS if (part := made[section]) is not None],
         title=data.settings.title,
         kicker=experiment_kicker(data.experiment),
-        verdict=verdict(data),
-        conclusions=conclusions(data.metrics, data.settings),
+        verdict=verdict(data.metrics, data.settings),
         metrics=data.metrics,
         settings=data.settings.plain(),
         timed=PageTable("Model", ["Wall time"], timed) if timed else None,
@@ -107,19 +109,9 @@ def write_report(path: Path, data: RunReport) -> None:
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
     """Return the errors of the models and the published ones."""
-    blocks: list[Any] = [Text(text, "left")] if (text := left_text(data.metrics)) else []
-    if laboratory := data.settings.targets.get("laboratory"):
-        same = laboratory.material == data.settings.simulation
-        words = [*([] if same else ["another material"]), *differences(data.settings, laboratory)]
-        said = Markup(_WITHOUT_RECORDINGS).format(in_a_row([*words, "noise on the markers"]))
-        blocks.append(Text(said, "synthetic"))
+    synthetic = "laboratory" in data.settings.targets
+    blocks: list[Any] = [Text(_WITHOUT_RECORDINGS, "synthetic")] if synthetic else []
     blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
-    if data.network_note:
-        blocks.append(Text(data.network_note, "network", note=True))
-    if data.pages:
-        rows = {**data.metrics["folds"], "Mean": data.metrics}
-        means = _numbers({t: {m: e["mean"] for m, e in fold["errors_mm"].items()} for t, fold in rows.items()})
-        blocks.append(model_table("Test trial [mm]", means, data.metrics["errors_mm"], _FOLDS, data.pages))
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs outside the training range", heading=True))
         blocks.append(Items(ranges, "ranges"))
@@ -128,13 +120,14 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
 
 def _errors_table(data: RunReport) -> PageTable:
     errors, models = data.metrics["errors_mm"], data.models
-    idle = untrained(epochs_kept(data.metrics))
-    chosen = recommended(trial_errors(data.metrics), idle)
+    idle, by_trial = untrained(data.metrics), trial_errors(data.metrics)
+    chosen, places = recommended(known_errors(by_trial, idle)), standings(known_errors(by_trial))
     published = published_beside(data.published, models)
-    base, shares = against(errors) if data.sees_markers else ("", {})
     by_load = errors_by_load(data.metrics, data.others)
-    columns = ["All test trials", *by_load] if by_load else ["This run"]
-    columns += [*([f"Against {MODELS[base][0]}"] if base else []), *(["Published"] if published else [])]
+    with_intervals = any(interval for interval, _ in places.values())
+    columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
+    reconstructed = data.metrics.get("errors_vs_reconstruction_mm", {})
+    columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
     rows: list[Row] = []
     for model, (name, meaning) in MODELS.items():
         if model not in errors and model not in published:
@@ -145,9 +138,14 @@ def _errors_table(data: RunReport) -> PageTable:
             meaning = "the learned force on the simulator with the identified law"
         elif model == "resphys" and "sysid" in errors:
             meaning = "the learned force on the identified simulator"
+        interval, ratio = places.get(model, (None, None))
         cells = [_pair(error_parts(errors[model])) if model in errors else Cell(NONE)]
+        ends = NONE if interval is None else " to ".join(map(number_text, interval))
+        cells += [Cell(ends)] if with_intervals else []
+        cells.append(Cell(NONE if ratio is None else ratio_text(ratio)))
         cells += [_pair(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
-        cells += [Cell(shares.get(model, NONE))] if base else []
+        if reconstructed:
+            cells.append(_pair(error_parts(reconstructed[model])) if model in reconstructed else Cell(NONE))
         cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
         rows.append(Row(name, cells, model == chosen, meaning))
     return PageTable(f"Error of the {_observed(data)} [mm]", columns, rows)
@@ -204,10 +202,40 @@ def _what_is_measured(data: RunReport) -> str:
         )
     reconstructed = data.metrics.get("reconstruction", {})
     learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]
-    published = [data.published_note] if data.published else []
+    learned += [_PUBLISHED_FOR[_kind(data)]] if data.published else []
     if data.others:
         learned.append(f"{OUTSIDE}: {', '.join(data.others)}. No training trial was held like that.")
-    return unbroken(" ".join([text, *data.notes, *learned, *published]))
+    many = len(next(iter(trial_errors(data.metrics).values()), ())) >= LEAST_TRIALS
+    text += " Interval: of the mean, over draws of the trials." if many else ""
+    return unbroken(" ".join([text, *_contributions(data.metrics), *learned]))
+
+
+def _kind(data: RunReport) -> str:
+    return "arm" if data.settings.chambers is not None else "beam" if data.sees_markers else "vertices"
+
+
+def _contributions(metrics: Mapping[str, Any]) -> list[str]:
+    """Sentences on how bodies were held, and on the contributions of noise and mesh to the errors, if known."""
+    notes = []
+    if sideways := {trial: mm for fold in folds_in(metrics) for trial, mm in fold.get("sideways_mm", {}).items()}:
+        distances = ", ".join(f"{mm_text(distance)} ({trial})" for trial, distance in sideways.items())
+        notes.append(
+            "The sideways displacement of the held body is estimated from the first frames of a trial: with the "
+            f"identified simulator, the markers by {distances}."
+        )
+    if "noise_mm" in metrics:
+        notes.append(f"The noise of the markers alone is {metrics['noise_mm']:.2f} mm.")
+    if check := metrics.get("mesh_check"):
+        cells, finer = check["cells"]
+        where = f"On a mesh of {finer:,} instead of {cells:,} cells, with the same constants,"
+        if "failed" in check:
+            return [*notes, f"The error of the mesh is not known. {where} {check['failed']}"]
+        before, after = map(mm_text, check["errors_mm"])
+        model = MODELS[check["model"]][0]
+        notes.append(
+            f"{where} the markers of {model} move by {mm_text(check['moved_mm'])}; its error is {after}, not {before}."
+        )
+    return notes
 
 
 def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) -> str:
@@ -222,8 +250,18 @@ def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) 
     return f"{text}; replayed in the simulator, its forces {effect} on the validation trials."
 
 
-def _numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[str, Cell]]:
-    return {name: {m: Cell(number_text(value)) for m, value in row.items()} for name, row in rows.items()}
+def when_text(first: Mapping[str, float]) -> str:
+    """Return when the first of some trials left the training range, in words; empty without any.
+
+    Args:
+        first: Times [s] by trial.
+    """
+    if not first:
+        return ""
+    if not any(first.values()):
+        return f", from the start ({', '.join(first)})"
+    earliest = min(first, key=lambda trial: first[trial])
+    return f", the first after {first[earliest]:.2f} s ({earliest})"
 
 
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
@@ -270,19 +308,15 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
-    rows = {row["name"]: row["errors_mm"] for row in metrics["per_trajectory"]}
-    if len(rows) > 1:
-        small = dict.fromkeys(data.others, OUTSIDE.lower())
-        blocks.append(model_table("Each trial [mm]", _numbers(rows), metrics["errors_mm"], small=small))
     if by_model := metrics.get("per_marker"):
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
-        blocks.append(model_table("Each marker [mm]", _numbers(by_label), metrics["errors_mm"]))
+        blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
     if turned := metrics.get("orientations_deg"):
         bodies = next(iter(turned.values()))
         by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
-        blocks.append(model_table("Orientation of each rigid body [degrees]", _numbers(by_body), metrics["errors_mm"]))
-    return Part("Error over time" if trials.moves else "Each trial", blocks) if blocks else None
+        blocks.append(model_table("Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]))
+    return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
 
 
 def _panels(data: RunReport, trials: TrialResults) -> dict[str, list[int]]:
@@ -321,20 +355,6 @@ def largest_filtered(metrics: Mapping[str, Any]) -> str:
     return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
 
 
-def reconstruction_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the distances of the roll-outs from the reconstructed trajectories, from which the network learns."""
-    errors = data.metrics.get("errors_vs_reconstruction_mm", {})
-    if not errors:
-        return None
-    rows = [Row(MODELS[model][0], [_pair(error_parts(errors[model]))]) for model in MODELS if model in errors]
-    text = (
-        "The network learns from reconstructed trajectories. Their distance from the target is in the first table; "
-        "this is the distance of the roll-outs from them."
-    )
-    table = PageTable("Error against the reconstruction [mm]", ["This run"], rows)
-    return Part("Against the reconstruction", [Text(text), table])
-
-
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     results_section,
     horizons_section,
@@ -345,7 +365,6 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     control_section,
     paths_section,
     body_section,
-    reconstruction_section,
     identification_section,
     law_section,
     shapes_section,

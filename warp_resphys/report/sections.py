@@ -1,13 +1,15 @@
 """Sections of the page of a run: errors by horizon and by input, its recordings, and how its networks were trained."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Final
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM
-from .data import MODELS, RunReport, models_in_figures
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
+from ..stepping.quantity import Quantity
+from .data import MODELS, OUTSIDE, RunReport, folds_in, models_in_figures
 from .page import (
     NONE,
     Canvas,
@@ -20,12 +22,14 @@ from .page import (
     Text,
     drawn_file,
     error_parts,
+    number_text,
     percent_text,
     published_parts,
 )
-from .verdict import published_growth
 
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
+_CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the one before.
+_REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
 _TRAINED: Final = (
     "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the lowest."
 )
@@ -69,6 +73,71 @@ def model_table(
     return PageTable(head, [MODELS[model][0] for model in models], body, note)
 
 
+def numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[str, Cell]]:
+    """Return the cells of numbers by row and model."""
+    return {name: {m: Cell(number_text(value)) for m, value in row.items()} for name, row in rows.items()}
+
+
+def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the errors on each held-out trial, and what could explain the errors that remain."""
+    folds = folds_in(data.metrics)
+    trials = {row["name"]: row for fold in folds for row in fold.get("per_trajectory", ())}
+    covered = data.metrics.get("intervals", {}).get("models", {})
+    by_trial: Mapping[str, float] = next(
+        (covered[m]["by_trial"] for m in reversed(_CHAIN) if "by_trial" in covered.get(m, {})), {}
+    )
+    small = {}
+    for name, row in trials.items():
+        words = [f"amplitude {row['amplitude_mm']:.3g} mm"] if "amplitude_mm" in row else []
+        words += [f"coverage {100.0 * by_trial[name]:.0f} %"] if name in by_trial else []
+        small[name] = ", ".join([*words, *([OUTSIDE.lower()] if name in data.others else [])])
+    rows = numbers({name: row["errors_mm"] for name, row in trials.items()})
+    note = "Amplitude: root mean square displacement of the observed points."
+    note += " Coverage: share of the coordinates within the 90 % prediction intervals." if by_trial else ""
+    note += " Each trial links to the page of the fold in which it is the test." if data.pages else ""
+    tables = [model_table("Test trial [mm]", rows, data.metrics["errors_mm"], note, data.pages, small)] if rows else []
+    fits = [fold["free_fits"] for fold in folds if "free_fits" in fold]
+    merged = {model: [row for own in fits for row in own.get(model, ())] for model in _CHAIN}
+    tables += rest_table(merged, None if data.driven is None else data.driven.quantity)
+    return Part("Trial by trial", tables) if tables else None
+
+
+def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quantity | None) -> list[PageTable]:
+    """Return a table of what could explain the errors that remain; empty without fits.
+
+    Args:
+        fits: Of metrics.json, by model; the model with the smallest error is shown.
+        quantity: Of the inputs that drive the trials.
+    """
+    means = {model: fmean(row["as_is_mm"] for row in rows) for model, rows in fits.items() if rows}
+    model = min(means, key=lambda name: means[name], default="")
+    shown = [key for key in _REFITTED if any(key in row["left_mm"] for row in fits.get(model, ()))]
+    if not shown:
+        return []
+
+    def left(row: Mapping[str, Any], key: str) -> Cell:
+        if key not in row["left_mm"]:
+            return Cell(NONE)
+        value = row["values"].get(key)
+        words = "" if value is None else f"{100.0 * value:+.1f} %" if key == "scale" else ""
+        words = quantity.shown(value) if key == "zero" and value is not None and quantity is not None else words
+        return Cell(number_text(row["left_mm"][key]), words)
+
+    body = [Row(r["name"], [Cell(number_text(r["as_is_mm"])), *(left(r, key) for key in shown)]) for r in fits[model]]
+    averages = [fmean(row["left_mm"].get(key, row["as_is_mm"]) for row in fits[model]) for key in shown]
+    body.append(Row("Mean", [Cell(number_text(mean)) for mean in (means[model], *averages)]))
+    note = (
+        f"Mean error of {MODELS[model][0]} [mm], and what it would be with the inputs or the marker positions refitted "
+        "to the test trials, linearised about the identified simulator; below it, the refitted value. An improvement "
+        "by gain or offset suggests an error of the actuator or its log, one by marker positions a placement error."
+    )
+    return [
+        PageTable(
+            "What could explain the remaining error", ["As it is", *(_REFITTED[key] for key in shown)], body, note
+        )
+    ]
+
+
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the errors by length of the roll-out."""
     table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.experiment, {}))
@@ -96,6 +165,12 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
     note = "Growth of the mean error is from the shortest to the longest part of the same roll-outs."
     note += " Small: published." if published else ""
     return model_table("Mean error [mm]", rows, metrics.get("errors_mm", {}), note) if rows else None
+
+
+def published_growth(published: Mapping[str, Mapping[str, PublishedError]], first: str, last: str) -> dict[str, float]:
+    """Return the relative growth of published errors from one length of the roll-outs [s] to another, by model."""
+    before, after = published.get(first, {}), published.get(last, {})
+    return {model: after[model].mean / before[model].mean - 1.0 for model in before if model in after}
 
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -237,5 +312,4 @@ def training_section(data: RunReport, canvas: Canvas) -> Part | None:
             alt = f"Losses and validation roll-out error of the training of {name}, {len(records)} epochs."
             draw = partial(learning_figures.training_curves, records)
             blocks += [Text(name, heading=True), canvas.figure(f"training_{model}", draw, alt, _TRAINED)]
-    kept = [Text(data.kept_note, "kept")] if data.kept_note else []
-    return Part("Training", [*blocks, *kept]) if blocks else None
+    return Part("Training", blocks) if blocks else None

@@ -12,7 +12,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import scipy.optimize
+import torch
 from numpy.typing import NDArray
+
+from ..energies.catalogue import make_material
+from ..settings.body import MaterialSettings
 
 FloatArray = NDArray[np.float64]
 ALONG: Final = (1.0, 0.0, 0.0)  # Direction of fibres, in axes of which the first is that of the load.
@@ -42,6 +46,18 @@ def small_strain(constants: Mapping[str, float]) -> SmallStrain:
     mu = 2.0 * (value("c10", 0.0) + value("c01", 0.0)) + sum(ogden.values())
     lame = 2.0 * (value("dilation", 0.0) + value("bulk_1", 0.0))
     return SmallStrain(mu, lame + sum(2.0 * (1.0 + 2.0 / n) * own for n, own in ogden.items() if n < 0))
+
+
+def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
+    """Return the moduli of a material at small strains; None for one with regions."""
+    if material.regions:
+        return None
+    own = make_material(material.model, **material.constants)
+    if material.model == "law":
+        return small_strain({name: float(torch.as_tensor(value)) for name, value in own.constants.items()})
+    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in own.constants.items()}
+    mu, lame = np.asarray(own.law.LAME).T @ [float(modulus) for modulus in own.moduli(tensors)]
+    return SmallStrain(float(mu), float(lame))
 
 
 def ogden_terms(constants: Mapping[str, float]) -> dict[int, float]:

@@ -17,12 +17,11 @@ from matplotlib.colors import to_hex
 
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from .bodies import ComparedMotion, face_edges, sharp_edges, without_diverged
-from .camera import frame_of, motion_axes, upwards
 from .data import MODELS, FloatArray, mean_distance
 from .figures import TONES
 from .obstacles import OBSTACLE
 from .page import ViewInSpace
-from .render import COLOUR_MAP, MEASURED, OUTLINE
+from .render import COLOUR_MAP, MEASURED, OUTLINE, frame_of, motion_axes, upwards
 
 _TOLERANCE: Final = 2e-4  # Largest error of a drawn vertex, over the body's size,
 _MOST_MODES: Final = 96  # unless it takes more modes than these.

@@ -73,19 +73,6 @@ class RangeSettings(SpanSettings):
         return self
 
 
-class GridSettings(SpanSettings):
-    """Points of a loss landscape along a parameter."""
-
-    points: Natural = setting(description="number of points")
-
-
-class GridTable(Settings):
-    """The loss landscape of the report."""
-
-    youngs_modulus: GridSettings = setting(description="points along Young's modulus", unit="Pa")
-    poissons_ratio: GridSettings | None = setting(None, "points along Poisson's ratio")
-
-
 class PlacementSettings(Settings):
     """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
 
@@ -127,8 +114,6 @@ class IdentifySettings(IdentifiedSettings):
     candidates: Count = setting(4, "random candidates")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its gradient per start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
-    landscape: bool = setting(False, "whether the report shows the loss on the grid, which takes a while")
-    grid: GridTable | None = setting(None, "grid of the loss landscape")
 
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:

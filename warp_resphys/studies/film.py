@@ -17,12 +17,11 @@ from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
 from ..learning.baselines import BASELINES
 from ..report.bodies import ComparedMotion
-from ..report.camera import hangs
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times, shown_models
 from ..report.driven_film import DrivenBodies
 from ..report.obstacles import ObstacleSurface
-from ..report.render import DrawingError, RenderScene, write_film
+from ..report.render import DrawingError, RenderScene, hangs, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 from .tables import show

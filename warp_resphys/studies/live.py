@@ -13,8 +13,8 @@ from ..energies.contact import MOTION, SHIFT, Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import boundary_triangles, surface_vertices
-from ..report.camera import upwards
 from ..report.obstacles import ObstacleSurface
+from ..report.render import upwards
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot

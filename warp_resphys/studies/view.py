@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from ..io.errors import InputError, ResphysError
 from ..io.settings import Count, Positive, Settings, Word, setting
 from ..report.bodies import sharp_edges
-from ..report.camera import upwards
 from ..report.figures import TONES
 from ..report.obstacles import OBSTACLE, ObstacleSurface
-from ..report.render import MEASURED
+from ..report.render import MEASURED, upwards
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
 from ..robot.robot import Robot

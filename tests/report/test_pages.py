@@ -252,7 +252,7 @@ class TestBeams:
         assert page.text.count("1 of 2 diverged") == 1
         for said in ("No recordings are configured", "A line ends where the first roll-out has diverged."):
             assert said in page.text
-        for absent in ("SysID", "SimFree", "Published", "Identification", "Training", "Against"):
+        for absent in ("SysID", "SimFree", "Published", "Identification", "Training", "Against the reconstruction"):
             assert absent not in page.text
         assert figures_in(tmp_path) == {"error_over_time", "paths_worst", "paths_best"}
 

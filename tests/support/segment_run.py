@@ -17,7 +17,7 @@ markers:
   bind_to: {z: -0.1}
 parallel: {processes: 1, batch: 2}
 identify:
-  {trials: 1, seconds: 0.05, max_evaluations: 3, grid: {youngs_modulus: {points: 2}, poissons_ratio: {points: 1}}}
+  {trials: 1, seconds: 0.05, max_evaluations: 3}
 network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
 trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
 laboratory:

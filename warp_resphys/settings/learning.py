@@ -32,25 +32,12 @@ class PriorSettings(Settings):
     deviation: Positive = setting(description="standard deviation, in the parameter's unit")
 
 
-class SpanSettings(Settings):
-    """A range of values of a parameter."""
+class RangeSettings(Settings):
+    """The search range of a parameter."""
 
     lower: float = setting(description="lower bound, in the parameter's unit")
     upper: float = setting(description="upper bound, in the parameter's unit")
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
-
-    @model_validator(mode="after")
-    def _rises(self) -> Self:
-        if not self.lower < self.upper:
-            raise ValueError(f"lower is {self.lower:g}: it must be below upper, {self.upper:g}.")
-        if self.logarithmic and not self.lower > 0.0:
-            raise ValueError(f"lower is {self.lower:g}: it must be positive, as the scale is logarithmic.")
-        return self
-
-
-class RangeSettings(SpanSettings):
-    """The search range of a parameter."""
-
     prior: PriorSettings | None = setting(None, "prior knowledge")
     per: Literal["all", "session", "trial", "material", "lens"] = setting(
         "all",
@@ -58,13 +45,13 @@ class RangeSettings(SpanSettings):
     )
 
     @model_validator(mode="after")
-    def _is_held(self) -> Self:
+    def _rises(self) -> Self:
+        if not self.lower < self.upper:
+            raise ValueError(f"lower is {self.lower:g}: it must be below upper, {self.upper:g}.")
+        if self.logarithmic and not self.lower > 0.0:
+            raise ValueError(f"lower is {self.lower:g}: it must be positive, as the scale is logarithmic.")
         if self.per in ("session", "trial") and self.prior is None:
             raise ValueError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
-        return self
-
-    @model_validator(mode="after")
-    def _has_the_prior(self) -> Self:
         if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
             raise ValueError(
                 f"prior.mean is {self.prior.mean:g}, outside of the range from {self.lower:g} to {self.upper:g}: widen "

@@ -17,9 +17,8 @@ from support.sentences import offending
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import reduced_twin as reduced_twin_module
 from warp_resphys.control import reduction, sampling
-from warp_resphys.control.controllers import LinearRecedingHorizon, OpenLoop, RecedingHorizon
 from warp_resphys.control.estimate import Estimator, Noise
-from warp_resphys.control.files import plans_file, read_baselines, read_plan, read_reduced, reduced_file
+from warp_resphys.control.files import plans_file, read_plan, read_reduced, reduced_file
 from warp_resphys.control.laboratory import Laboratory
 from warp_resphys.control.open_loop import Follower
 from warp_resphys.control.plan import Horizon, Limits, Planner
@@ -488,32 +487,6 @@ class TestDriving:
         assert "stopped." in err
         assert record.stat().st_mtime_ns == before
         assert driven == ["drive"]
-
-    def test_a_controller_resumes_from_its_memory(self, folder, robot, model):
-        task = Task(control_of(folder), robot.labels, robot.time_step, 3)
-        path = read_plan(folder / plans_file("resphys"), "circle_0.4s").path
-        rest = robot.observe(robot.begin())[0].numpy()
-        linear = read_baselines(folder / "baselines.safetensors")[0]
-        horizon = Horizon(8, 2)
-
-        def made():
-            return [
-                RecedingHorizon(model, task.tracked, task.limits, horizon, Noise(), path, rest),
-                LinearRecedingHorizon(linear, task.tracked, task.limits, horizon, path, rest),
-            ]
-
-        first, second = made(), made()
-        random = np.random.default_rng(0)
-        for number in range(6):
-            if number == 3:
-                for old, new in zip(first, second, strict=True):
-                    new.recall({key: value.copy() for key, value in old.remembered().items()})
-            seen = rest + 1e-3 * random.standard_normal(rest.shape)
-            commands = [controller.command(number, seen) for controller in first]
-            if number >= 3:
-                for controller, wanted in zip(second, commands, strict=True):
-                    np.testing.assert_allclose(controller.command(number, seen), wanted, atol=1e-9)
-        assert OpenLoop(path).remembered() == {}
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
-"""Trials that are computed in parts: an interrupted part goes on where it was, and parts are joined."""
+"""Trials that are computed in parts: finished parts are kept, and parts are joined."""
 
 import numpy as np
 import pytest
 import torch
 
 from warp_resphys.experiment.parts import (
-    ResumableRollout,
+    PartRollout,
     padded,
     read_parts,
     remove_parts,
@@ -15,24 +15,22 @@ from warp_resphys.experiment.parts import (
 )
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import Workers
-from warp_resphys.io.resumable import Field
 from warp_resphys.io.stages import StageContext
 from warp_resphys.settings.run import ParallelSettings
 from warp_resphys.stepping.state import State
 
 
-class Growing(ResumableRollout):
-    """Powers of a number of every trial, in its only coordinate; fails once at a frame."""
+class Growing(PartRollout):
+    """Powers of a number of every trial, in its only coordinate; interrupted at a frame of a part."""
 
     def __init__(self, part):
-        self.part, self.frames, self.like = part, part.frames, torch.zeros(1, dtype=torch.float64)
-        self.fields = {"power": Field((len(part.names),), "m", batch_axes=1)}
+        self.part, self.frames, self.units = part, part.frames, {"power": "m"}
 
     def begin(self):
         return State(torch.ones(len(self.part.names), 1, 1).double(), torch.zeros(len(self.part.names), 1, 1).double())
 
     def step(self, number):
-        if number == self.part.more.get("fails_at"):
+        if (self.part.names, number) == self.part.more.get("fails_at"):
             raise KeyboardInterrupt
         self.part.more["computed"].append((self.part.names, number))
         growth = torch.tensor([float(name) for name in self.part.names]).double()
@@ -41,22 +39,26 @@ class Growing(ResumableRollout):
     def frame_arrays(self, number):
         return {"power": self.state.q.flatten().numpy()}
 
+    def constants(self):
+        return {"number": (np.array([float(name) for name in self.part.names]), "m")}
+
 
 @pytest.mark.parametrize("settings", ["same", "other"])
-def test_an_interrupted_stage_goes_on(tmp_path, settings):
-    kept, names = {"computed": [], "fails_at": 4}, ["2", "3", "5"]
+def test_an_interrupted_stage_keeps_its_finished_parts(tmp_path, settings):
+    kept, names = {"computed": [], "fails_at": (("5",), 4)}, ["2", "3", "5"]
     parts = split_into_parts(StageContext("powers", tmp_path, "same", None), names, 6, more=kept, batch=2)
     assert [part.names for part in parts] == [("2", "3"), ("5",)]
     with pytest.raises(KeyboardInterrupt):
         work_on(parts, Growing, Workers(1))
+    assert [part.done for part in parts] == [True, False]
     del kept["fails_at"]
+    kept["computed"].clear()
     context = StageContext("powers", tmp_path, settings, None)
     parts = split_into_parts(context, names, 6, more=kept, batch=2)
     work_on(parts, Growing, Workers(1))
-    again = 0 if settings == "same" else 3
-    assert kept["computed"].count((("2", "3"), 2)) == 1 + (again > 0)
-    assert len(kept["computed"]) == 2 * 5 + again
+    assert len(kept["computed"]) == (5 if settings == "same" else 10)
     np.testing.assert_array_equal(read_parts(parts, "power"), [[n**k for k in range(6)] for n in (2, 3, 5)])
+    assert parts[0].read("number").tolist() == [2.0, 3.0]
     assert all(part.done for part in parts)
     remove_parts(context)
     assert not any(part.done for part in parts)

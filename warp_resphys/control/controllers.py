@@ -1,12 +1,7 @@
-"""Controllers: open loop (a plan is played), receding horizon (a new plan at every step), and Jacobian feedback.
-
-The memory of a controller is a set of arrays, so that an interrupted run can resume.
-"""
+"""Controllers: open loop (a plan is played), receding horizon (a new plan at every step), and Jacobian feedback."""
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -17,8 +12,6 @@ from .plan import Horizon, Limits, Plan, Planner, PredictionModel
 from .reduced import ReducedModel
 from .world import FloatArray
 
-Memory = dict[str, FloatArray]
-
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model
 _AVERAGED = 0.25  # window of the means of points and inputs, which averages vibrations out [s]
 _LEARNING = 0.05  # share of Broyden's correction taken per step
@@ -27,26 +20,11 @@ _DAMPING = 0.05  # of the inverse of the Jacobian, relative to its largest singu
 
 
 class Controller(ABC):
-    """Commands inputs (n,) at each step, from the markers observed after the previous step.
-
-    Attributes:
-        memory_keys: names of the attributes that the next step depends on; those that are None are not saved.
-    """
-
-    memory_keys: ClassVar[tuple[str, ...]] = ()
+    """Commands inputs (n,) at each step, from the markers observed after the previous step."""
 
     @abstractmethod
     def command(self, number: int, markers: FloatArray) -> FloatArray:
         """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
-
-    def remembered(self) -> Memory:
-        """Returns the arrays that the next step depends on."""
-        return {key: value for key in self.memory_keys if (value := getattr(self, key)) is not None}
-
-    def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        """Continues from the memory of another controller with the same settings, see `remembered`."""
-        for key in self.memory_keys:
-            setattr(self, key, memory.get(key))
 
 
 class OpenLoop(Controller):
@@ -62,8 +40,6 @@ class OpenLoop(Controller):
 
 class _Receding(Controller):
     """Makes a new plan at every step; the previous plan, moved on by one step, is its initial guess."""
-
-    memory_keys: ClassVar[tuple[str, ...]] = ("last_command", "knots")
 
     def __init__(
         self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
@@ -126,15 +102,6 @@ class RecedingHorizon(_Receding):
         estimate.predict(plan.inputs[0])
         return self._keep(plan)
 
-    @override
-    def remembered(self) -> Memory:
-        return super().remembered() | self._estimator.memory
-
-    @override
-    def recall(self, memory: Mapping[str, FloatArray]) -> None:
-        super().recall(memory)
-        self._estimator.memory = memory
-
 
 class LinearRecedingHorizon(_Receding):
     """Plans with a linear model, from the last markers; a disturbance observer removes its constant error.
@@ -143,8 +110,6 @@ class LinearRecedingHorizon(_Receding):
         model: fitted to the recordings.
         tracked, limits, horizon, path, rest: as for `RecedingHorizon`.
     """
-
-    memory_keys: ClassVar[tuple[str, ...]] = (*_Receding.memory_keys, "seen", "expected", "missed")
 
     def __init__(
         self,
@@ -189,8 +154,6 @@ class JacobianFeedback(Controller):
         path: (T, d) reference after each step [m].
         rest: (M, 3) markers at the beginning [m].
     """
-
-    memory_keys: ClassVar[tuple[str, ...]] = ("jacobian", "shares", "past", "last_seen")
 
     def __init__(
         self,

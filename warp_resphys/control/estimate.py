@@ -5,14 +5,13 @@ a random walk. Estimating b removes the steady-state error of a receding horizon
 has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..robot.twin.kalman import conditioned
 from .polynomials import Monomials
-from .reduced import ReducedModel, ReducedState
+from .reduced import ReducedModel
 from .world import FloatArray
 
 
@@ -64,16 +63,6 @@ class Estimator:
         transition = np.eye(3 * r)
         self.state, transition[: 2 * r] = self.model.transition(self.state, inputs, self.bias)
         self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
-
-    @property
-    def memory(self) -> dict[str, FloatArray]:
-        """Arrays that the next step depends on."""
-        return {**self.state.arrays(), "bias": self.bias, "covariance": self._covariance}
-
-    @memory.setter
-    def memory(self, values: Mapping[str, FloatArray]) -> None:
-        self.state = ReducedState.from_arrays({key: values[key] for key in self.state.arrays()})
-        self.bias, self._covariance = values["bias"], values["covariance"]
 
     def correct(self, markers: FloatArray) -> None:
         """Updates the estimate with markers (M, 3) observed after the step [m]; NaN where one is not seen."""

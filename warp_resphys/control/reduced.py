@@ -90,7 +90,7 @@ class ReducedState:
         return self.from_arrays({k: np.where(chosen[:, None] if a.ndim > 1 else chosen, a, b) for k, a, b in pairs})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays of the state by name, for a checkpoint."""
+        """All arrays of the state by name."""
         own = {key: array for key, array in vars(self).items() if key != "memory"}
         return own | {f"memory.{key}": array for key, array in self.memory.items()}
 

@@ -5,17 +5,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
-from ..experiment.parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from ..experiment.parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import Field, resume_checkpoint
+from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..mesh.motion_files import input_columns, write_csv
 from ..robot.loading import load
@@ -181,7 +180,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     motions = {}
     for part in parts:
         (name,) = part.names
-        points, inputs, took = (read_parts([part], key).swapaxes(0, 1) for key in ("points", "inputs", "seconds"))
+        points, inputs, took = (part.read(key) for key in ("points", "inputs", "seconds"))
         path = read_plan(context.run_dir / plans_file(control.models[-1]), name).path
         motions[name] = DrivenMotion(path, points[:, 1:], inputs[:, 1:], took[:, 1:])
     write_driven(context.run_dir / DRIVEN, controllers, robot.time_step, motions)
@@ -222,7 +221,7 @@ def receding_controllers(
     return [*controllers, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest)]
 
 
-class _Drive(ResumableRollout):
+class _Drive(PartRollout):
     """Drives one motion with all controllers, each on a body of its own."""
 
     def __init__(self, part: TrialPart) -> None:
@@ -235,12 +234,8 @@ class _Drive(ResumableRollout):
         number = motions_of(control).index(self._name)
         self._laboratory = Laboratory(settings.played, self._folder, driven.name, len(names), number)
         self._controllers = self._made(robot)
-        self.like, self.frames, count = self._laboratory.state.q, part.frames, len(names)
-        self.fields = {
-            "points": Field((count, 3), "m"),
-            "inputs": Field((count, self._task.parts), driven.unit),
-            "seconds": Field((count,), "s"),
-        }
+        self.frames, count = part.frames, len(names)
+        self.units = {"points": "m", "inputs": driven.unit, "seconds": "s"}
         self._inputs, self._seconds = np.zeros((count, self._task.parts)), np.zeros(count)
 
     def _made(self, robot: Robot) -> list[Controller]:
@@ -270,25 +265,9 @@ class _Drive(ResumableRollout):
         return self._laboratory.state
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
         points = self._laboratory.markers().reshape(len(self._controllers), -1) @ self._task.tracked.T
         return {"points": points, "inputs": self._inputs, "seconds": self._seconds}
-
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        tensors = super().snapshot()
-        for row, controller in enumerate(self._controllers):
-            memory = controller.remembered()
-            tensors |= {f"{row}.{key}": torch.from_numpy(value.copy()) for key, value in memory.items()}
-        return tensors
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore({key: tensor for key, tensor in tensors.items() if not key.split(".")[0].isdecimal()})
-        self._laboratory.state = self.state
-        for row, controller in enumerate(self._controllers):
-            own = f"{row}."
-            controller.recall({key.removeprefix(own): x.numpy() for key, x in tensors.items() if key.startswith(own)})
 
 
 def _summary(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from typing_extensions import override
@@ -19,7 +19,6 @@ from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
-from ..io.resumable import Field
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
@@ -134,16 +133,15 @@ class _FromMarkers(Reconstructing):
         settings: AblationStage = part.context.settings
         self._count, draws = part.more, settings.drawn.draws
         simulator = build_simulator(settings, settings.simulation)
-        self.like = simulator.rest_positions
+        like = simulator.rest_positions
         self._motion = simulator.tensor(read_motion(part.context.run_dir)[0])
         self._vertices = draw_markers(simulator, self._count, draws, settings.seed)
-        self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=self.like.device), self.like.dtype)
+        self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=like.device), like.dtype)
         more = dict(settings.reconstruction) | {"modes": settings.drawn.modes}
         self.method = make_reconstructor(simulator, **more, observation=self._markers)
-        self.force = self.like.new_zeros(draws, *self.like.shape)
+        self.force = like.new_zeros(draws, *like.shape)
         self._padding = max(settings.drawn.counts) - self._count
-        self.fields = {name: Field((draws,), "m", batch_axes=1) for name in ("error", "misfit")}
-        self.frames = len(self._motion)
+        self.frames, self.units = len(self._motion), {"error": "m", "misfit": "m"}
 
     @override
     def begin(self) -> State:
@@ -155,7 +153,7 @@ class _FromMarkers(Reconstructing):
         return self.bring_to(self._markers(self._motion[number].expand_as(self.force)))
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
         away = self.state.q - self._motion[number]
         return {
             "error": away.norm(dim=-1).mean(-1).cpu().numpy(),
@@ -163,7 +161,7 @@ class _FromMarkers(Reconstructing):
         }
 
     @override
-    def constants(self) -> dict[str, tuple[ArrayLike, str]]:
+    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
         sets = np.pad(self._vertices, ((0, 0), (0, self._padding)), constant_values=-1)  # -1 where a set is smaller
         return {"markers": (sets, "1")}
 

@@ -64,7 +64,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
             create(file, f"{model}_observed", values, "m", time_axis=1)
             if model not in parts:
                 continue
-            bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
+            bodies = next(part.read("film")[0] for part in parts[model] if filmed in part.names)
             substeps = round(settings.time_step / experiment.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 
@@ -25,7 +25,6 @@ from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
-from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
@@ -36,7 +35,7 @@ from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
-from .parts import ResumableRollout, TrialPart, remove_parts, split_into_parts, work_on
+from .parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
 from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of
 from .target import substeps_of, target_settings
@@ -277,7 +276,7 @@ def _frame_count(settings: PlayedSettings, begins: str) -> int:
     return max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
 
 
-class _Played(ResumableRollout):
+class _Played(PartRollout):
     """Roll-out of bodies in the laboratory: released, driven by their inputs, or in a static pose.
 
     Saves the tracked markers in the frame of the body: at every step of released bodies, from time zero on, and at the
@@ -288,13 +287,13 @@ class _Played(ResumableRollout):
         settings: LaboratoryStage = part.context.settings
         setup, binding = make_setup(settings), settings.binding
         simulator = self._simulator = laboratory_simulator(settings, setup.gravity)
-        self._constants, self.like = simulator.prepare(), simulator.rest_positions
+        self._constants = simulator.prepare()
         by_name = {trial.name: trial for trial in settings.trials}
         self._trials = [by_name[name] for name in part.names]
         self._tip, released = settings.tip, self._trials[0].is_released
         self._substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
         markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed)
-        self._markers = markers.to(self.like)
+        self._markers = markers.to(simulator.rest_positions)
         payload = np.array([trial.payload for trial in self._trials])
         hung = payload_inputs(simulator.body, settings.payload_at, payload)
         self._payload = Inputs(
@@ -305,8 +304,7 @@ class _Played(ResumableRollout):
         if all(trial.is_driven for trial in self._trials) and quantity is not None:
             self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
             self._name = quantity.name
-        self.fields = {"markers": Field((len(self._trials), len(setup.tracked), 3), "m", batch_axes=1)}
-        self.frames = part.frames
+        self.frames, self.units = part.frames, {"markers": "m"}
         self._fixed: list[torch.Tensor] | None = None
         common = settings.data.base_motion
         times = simulator.time_step * np.arange((part.frames - 1) * self._substeps + 1)
@@ -353,5 +351,5 @@ class _Played(ResumableRollout):
         return state
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
         return {"markers": self._markers(self.state.q).cpu().numpy()}

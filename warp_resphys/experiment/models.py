@@ -2,20 +2,19 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
-from ..io.resumable import Field
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.predictors import LearnedPredictor, Range
@@ -25,7 +24,7 @@ from ..settings.stages import TestStage
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
-from .parts import ResumableRollout
+from .parts import PartRollout
 
 FloatArray = NDArray[np.float64]
 
@@ -81,7 +80,7 @@ def load(folder: Path, model: str, device: torch.device) -> Learned:
     return Learned(network, range_, str(description["force_frame"]))
 
 
-class ModelRollout(ResumableRollout):
+class ModelRollout(PartRollout):
     """Step-by-step roll-out of a model over trials that begin in the same way.
 
     Args:
@@ -106,7 +105,6 @@ class ModelRollout(ResumableRollout):
     ) -> None:
         self.experiment, self.model = experiment, model
         self.simulator = experiment.model_simulator(model) if simulator is None else simulator
-        self.like = self.simulator.rest_positions
         self.replay = experiment.replay(self.simulator, names, model)
         self.start = experiment.start(self.replay, model) if start is None else start
         parameters = experiment.parameters(model)
@@ -116,12 +114,7 @@ class ModelRollout(ResumableRollout):
         self._failed = False
         self._filmed = names.index(filmed) if filmed in names else None
         self.rollout, self.predictor = self._make(learned)
-        self.frames, held = self._steps() + 1, self.replay.trials.held
-        self.fields = {"points": Field(tuple(held.shape), "m", batch_axes=1)}
-        if learned is not None:
-            self.fields["left"] = Field((len(held),), "1", "int64", batch_axes=1)
-        if self._filmed is not None:
-            self.fields["film"] = Field((self.simulator.body.n_vertices, 3), "m", "float32")
+        self.frames, self.units = self._steps() + 1, {"points": "m", "left": "1", "film": "m"}
 
     def _make(self, learned: Learned | None) -> tuple[Rollout, LearnedPredictor | None]:
         predict = None
@@ -185,36 +178,20 @@ class ModelRollout(ResumableRollout):
         return torch.where(self._lost[:, None, None], torch.nan, self.replay.observe(self.state.q))
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
         """Observed points, steps at which trials left the training range (-1 before that), and filmed vertices."""
         points = self.points()
-        kept: dict[str, ArrayLike] = {"points": points.cpu().numpy()}
+        kept = {"points": points.cpu().numpy()}
         if self.predictor is not None:
             left = self.predictor.left_at
             kept["left"] = np.full(len(points), -1) if left is None else left.cpu().numpy()
         if self._filmed is not None:
-            body = self.state.q[self._filmed].cpu().numpy()
+            body = self.state.q[self._filmed, None].float().cpu().numpy()
             kept["film"] = np.full_like(body, np.nan) if self._lost[self._filmed] else body
         return kept
 
     @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        tensors = super().snapshot()
-        tensors |= {"lost": self.rollout.lost(self.state), "done": torch.tensor(self.rollout.done)}
-        predictor = self.predictor
-        own = {} if predictor is None else {"left": predictor.left_at, "hidden": predictor.hidden}
-        return tensors | {name: value for name, value in own.items() if value is not None}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore(tensors)
-        tensors = {name: tensor.to(self.like.device) for name, tensor in tensors.items()}
-        self.rollout.resume(tensors["lost"], int(tensors["done"]))
-        if self.predictor is not None:
-            self.predictor.left_at, self.predictor.hidden = tensors.get("left"), tensors.get("hidden")
-
-    @override
-    def constants(self) -> dict[str, tuple[ArrayLike, str]]:
+    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
         shift = torch.zeros_like(self.replay.trials.held) if self.start.shift is None else self.start.shift
         return {"delay": (self.start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
 

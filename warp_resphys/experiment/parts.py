@@ -1,7 +1,6 @@
-"""Rolls trials out frame by frame, in one process or several; an interrupted run resumes at its last saved frame.
+"""Rolls trials out in parts, in one process or several; an interrupted stage keeps its finished parts.
 
-A stage splits its trials into parts, with one file per part. A `ResumableRollout` computes the frames of a part, and
-`io.resumable.ResumableHDF5` saves them together with the state from which the next frame continues.
+A stage splits its trials into parts, with one file per part, and a `PartRollout` computes a part.
 """
 
 import shutil
@@ -14,35 +13,33 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..io.errors import InputError
 from ..io.fan_out import Advance, Workers, fan_out
-from ..io.files import read_array, read_hdf5
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.machine import available_cores
 from ..io.progress import Progress
-from ..io.resumable import Field, ResumableHDF5, is_final
+from ..io.resumable import is_final
 from ..io.stages import StageContext
 from ..settings.run import ParallelSettings
 from ..stepping.state import State
 from .build import simulation_device
 
 
-class ResumableRollout(ABC):
-    """Computes a batch of trials frame by frame.
+class PartRollout(ABC):
+    """Rolls a batch of trials out.
 
     Attributes:
         frames: number of frames.
-        fields: arrays of a frame that are written to the file.
-        like: a tensor with the data type and device of the trials.
+        units: units of the arrays of a frame, by name.
         state: state of the last frame.
         shown: named values displayed beside the progress bar.
     """
 
     frames: int
-    fields: Mapping[str, Field]
-    like: torch.Tensor
+    units: Mapping[str, str]
     state: State
     shown: Mapping[str, object] = {}
 
@@ -55,26 +52,25 @@ class ResumableRollout(ABC):
         """Returns the state of frame `number`, computed from the state of the previous frame."""
 
     @abstractmethod
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
-        """Returns the arrays of the current `state` to write to the file as frame `number`."""
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
+        """Returns arrays (R, ...) of the current `state`, frame `number`; a row need not be a trial."""
 
-    def constants(self) -> dict[str, tuple[ArrayLike, str]]:
-        """Returns arrays independent of the frame, with their units, to write to the file."""
+    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
+        """Returns arrays independent of the frame, with their units."""
         return {}
 
-    def frame(self, number: int) -> dict[str, ArrayLike]:
-        """Computes the next frame and returns its arrays for the file."""
-        with torch.no_grad():
+    @torch.no_grad()
+    def arrays(self, report: Callable[..., None]) -> dict[str, NDArray[Any]]:
+        """Computes all frames, and returns their arrays (R, T, ...); `report` is called after each."""
+        series = dict[str, NDArray[Any]]()
+        for number in range(self.frames):
             self.state = self.begin() if number == 0 else self.step(number)
-            return self.frame_arrays(number)
-
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        """Returns the tensors from which the next frame continues; they are not changed in place."""
-        return self.state.tensors()
-
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Restores a `snapshot`."""
-        self.state = State.from_tensors(tensors).map(lambda tensor: tensor.to(self.like))
+            for name, values in self.frame_arrays(number).items():
+                if number == 0:
+                    series[name] = np.empty((len(values), self.frames, *values.shape[1:]), values.dtype)
+                series[name][:, number] = values
+            report(**self.shown)
+        return series
 
 
 @dataclass(frozen=True)
@@ -95,24 +91,26 @@ class TrialPart:
     frames: int
     more: Any = None
 
-    def write(self, make: "Callable[[TrialPart], ResumableRollout]", advance: Advance) -> None:
-        """Computes the frames that are still missing and writes the file; `advance` counts the frames."""
-        count = len(self.names)
+    def write(self, make: "Callable[[TrialPart], PartRollout]", advance: Advance) -> None:
+        """Computes the frames and writes the file, unless it is done; `advance` counts the frames."""
+        count, rolled = len(self.names), 0
         if self.done:
             advance(count * self.frames)
             return
         rollout = make(self)
-        arguments = self.path, self.context.name, self.context.fingerprint, rollout.frames, rollout.fields
-        with ResumableHDF5(*arguments) as file:
-            if file.done:
-                rollout.restore(file.state)
-            advance(count * min(file.done, self.frames))
-            while file.done < file.frames:
-                arrays = rollout.frame(file.done)
-                file.append(rollout.snapshot(), **arrays)
-                advance(count if file.done <= self.frames else 0, **rollout.shown)
-            advance(count * max(self.frames - file.frames, 0))
-            file.finish(rollout.constants())
+
+        def report(**shown: object) -> None:
+            nonlocal rolled
+            rolled += 1
+            advance(count if rolled <= self.frames else 0, **shown)
+
+        series = rollout.arrays(report)
+        advance(count * max(self.frames - rolled, 0))
+        with atomic_hdf5(self.path, self.context.name, {"fingerprint": self.context.fingerprint}) as file:
+            for name, (values, unit) in rollout.constants().items():
+                create(file, name, values, unit)
+            for name, values in series.items():
+                create(file, name, values, rollout.units[name], time_axis=1)
 
     def read(self, name: str) -> NDArray[Any]:
         """Reads an array of the file.
@@ -178,7 +176,7 @@ def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> 
     return Workers(wanted, parallel.address)
 
 
-def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRollout], workers: Workers) -> None:
+def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], PartRollout], workers: Workers) -> None:
     """Computes the parts that are not done yet and writes their files.
 
     Args:
@@ -202,7 +200,7 @@ def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], ResumableRol
             fan_out(partial(_write, make), left, crew, progress.advance, first.path.parent, memory)
 
 
-def _write(make: Callable[[TrialPart], ResumableRollout], part: TrialPart, advance: Advance) -> None:
+def _write(make: Callable[[TrialPart], PartRollout], part: TrialPart, advance: Advance) -> None:
     part.write(make, lambda count=1, **shown: advance(count))
 
 

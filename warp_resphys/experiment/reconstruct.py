@@ -4,16 +4,16 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, write_json
-from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import Reconstructor, make_reconstructor, without_ringing
@@ -23,7 +23,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .experiment import Experiment
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
-from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from .parts import PartRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ def reconstructing_simulator(experiment: Experiment, model: str) -> Simulator:
     return without_ringing(experiment.model_simulator(model), experiment.observe)
 
 
-class Reconstructing(ResumableRollout):
+class Reconstructing(PartRollout):
     """Roll-out in which forces bring bodies to the observed points; each step starts from the force of the last one.
 
     Attributes:
@@ -106,15 +106,6 @@ class Reconstructing(ResumableRollout):
         self.force, self.shown = result.force, {"iterations": result.iterations}
         return result.state.detach()
 
-    @override
-    def snapshot(self) -> dict[str, torch.Tensor]:
-        return {**super().snapshot(), "force": self.force}
-
-    @override
-    def restore(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        super().restore(tensors)
-        self.force = tensors["force"].to(self.like)
-
 
 class _OfTrials(Reconstructing):
     """Reconstruction of trials that begin in the same way.
@@ -127,7 +118,7 @@ class _OfTrials(Reconstructing):
         experiment = Experiment(settings, part.context.run_dir)
         simulator = reconstructing_simulator(experiment, settings.model)
         replay = self._replay = experiment.replay(simulator, part.names, settings.model)
-        self._start, self.like = experiment.start(replay, settings.model), simulator.rest_positions
+        self._start = experiment.start(replay, settings.model)
         self._constants, self._inputs, self._resting = replay.prepare(experiment.parameters(settings.model))
         self._observed = experiment.targets(replay, self._start)
         if replay.is_static:  # One very long step leads to the static pose.
@@ -137,11 +128,8 @@ class _OfTrials(Reconstructing):
         method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
         self.method = method.with_constants(self._constants)
         self.force = torch.zeros_like(self._start.state.q)
-        dtype = "float64" if experiment.dataset.bound is None else "float32"
-        shape = (len(part.names), simulator.body.n_vertices, 3)
-        self.fields = {name: Field(shape, unit, dtype, 1) for name, unit in _UNITS.items()}
-        self.fields["error"] = Field((len(part.names),), "mm", dtype, 1)
-        self.frames = self._observed.shape[1]
+        self._dtype = "float64" if experiment.dataset.bound is None else "float32"
+        self.frames, self.units = self._observed.shape[1], {**_UNITS, "error": "mm"}
 
     @override
     def begin(self) -> State:
@@ -152,11 +140,12 @@ class _OfTrials(Reconstructing):
         return self.bring_to(self._observed[:, number], self._inputs.at(number - 1))
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
-        values = {"q": self.state.q, "v": self.state.v, "force": self.force}
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
+        kept = {"q": self.state.q, "v": self.state.v, "force": self.force}
         reached, seen = (x.cpu().numpy() for x in (self._replay.observe(self.state.q), self._observed[:, number]))
         error = np.array([frame_error(x, y) for x, y in zip(reached, seen, strict=True)])
-        return {**{name: value.cpu().numpy() for name, value in values.items()}, "error": error}
+        arrays = {**{name: values.cpu().numpy() for name, values in kept.items()}, "error": error}
+        return {name: values.astype(self._dtype) for name, values in arrays.items()}
 
 
 def replayed_errors(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..data.base_motion import check_steps, prescribed, rigid
@@ -15,7 +15,6 @@ from ..data.obstacle_motion import configured, contact_inputs, prescribed_all
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..io.fan_out import ALONE
-from ..io.resumable import Field
 from ..io.stages import StageContext
 from ..mesh.mesh import select_vertices
 from ..mesh.poses import twisted
@@ -35,7 +34,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import whole_mesh
 from .files import DATASET, GIVEN, Dataset
-from .parts import ResumableRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from .parts import PartRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .target import build_target
 
 log = logging.getLogger(__name__)
@@ -126,7 +125,7 @@ def contact_series(
     return {name: simulator.tensor(values) for name, values in inputs.items()}
 
 
-class _FreeMotion(ResumableRollout):
+class _FreeMotion(PartRollout):
     """Roll-out of released bodies, or of bodies with a moving base."""
 
     def __init__(self, part: TrialPart) -> None:
@@ -134,10 +133,8 @@ class _FreeMotion(ResumableRollout):
         self._data, self._target = settings.data, build_target(settings, settings.target)
         self._simulator = self._target.simulator
         self._trials = [trial for trial in settings.trials if trial.name in part.names]
-        self._constants, self.like = self._simulator.prepare(), self._simulator.rest_positions
-        shape = (len(self._trials), len(whole_mesh(settings).vertices), 3)
-        self.fields = {"observed": Field(shape, "m", batch_axes=1), "velocity": Field(shape, "m/s", batch_axes=1)}
-        self.frames = part.frames
+        self._constants = self._simulator.prepare()
+        self.frames, self.units = part.frames, {"observed": "m", "velocity": "m/s"}
         times = self._simulator.time_step * np.arange((part.frames - 1) * self._target.substeps + 1)
         self._moved = contact_series(self._simulator, settings.data.obstacle_motion, self._trials, times)
         self._fixed: list[torch.Tensor] | None = None
@@ -159,7 +156,7 @@ class _FreeMotion(ResumableRollout):
         return state
 
     @override
-    def frame_arrays(self, number: int) -> dict[str, ArrayLike]:
+    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
         seen = {"observed": self.state.q, "velocity": self.state.v}
         return {name: self._target.seen(values).cpu().numpy() for name, values in seen.items()}
 

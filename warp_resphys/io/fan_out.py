@@ -1,8 +1,8 @@
 """Runs independent tasks in worker processes of this machine, or of a Dask cluster, with joblib.
 
 Workers are single-threaded. Progress is reported through a small file for each task in a shared folder, so that joblib
-transfers only tasks and results. When a worker is lost, all tasks are submitted again: a task must resume from
-its own files, and return at once if it was finished.
+transfers only tasks and results. When a worker is lost, all tasks are submitted again: a task must return at
+once if its file is finished.
 """
 
 import json

@@ -109,7 +109,7 @@ def run_stages(
             except KeyboardInterrupt as error:
                 kept = f"finished and kept: {', '.join(seconds)}; " if seconds else ""
                 raise StageInterrupted(
-                    f"interrupted in stage '{stage.name}' ({kept}checkpoints of '{stage.name}' are kept); the same "
+                    f"interrupted in stage '{stage.name}' ({kept}what '{stage.name}' has saved is kept, too); the same "
                     "command resumes there"
                 ) from error
     return seconds

@@ -269,18 +269,19 @@ def _unreported(split, processes):
     return learning_stages(wanted, split, "..", "imported", processes)[:-1]
 
 
-def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp_path, monkeypatch):
+def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tmp_path, monkeypatch):
     """The searches are replaced: they return their starts."""
     shutil.copy(finished / "dataset.h5", tmp_path)
     wanted = settings(*SYNTHETIC, "identify.starts=2")
     (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
-    descents, at = [], 2
+    descents, at = [], 4
 
     def descend(self, number, start, max_evaluations, tolerance, report):
         descents.append((self._misfit.simulator.integrator, number))
         if len(descents) == at:
             raise KeyboardInterrupt
-        return {"parameters": dict(start), "loss": float(number + 1), "history": [{"loss": 1.0, **start}]}
+        unit, history = self._misfit.to_unit(start), [{"loss": 1.0, **start}]
+        return {"parameters": dict(start), "loss": number + 1.0, "unit": unit, "prior_weight": 0.0, "history": history}
 
     monkeypatch.setattr(Identifier, "_descend", descend)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
@@ -288,7 +289,7 @@ def test_an_interrupted_identification_goes_on_with_the_next_start(finished, tmp
     assert not (tmp_path / "identification.json").exists()
     run_stages([stage], tmp_path)
     own = [(name, number) for name in ("midpoint", "implicit_euler") for number in (0, 1, 0)]  # The release again.
-    assert descents == [*own[:2], *own[1:]]
+    assert descents == [*own[:4], *own[3:]]  # The first two searches are kept.
     history = read(tmp_path / "identification.json")["sysid"]["history"]
     assert list(map(len, history)) == [2, 1]  # The search after the release was estimated again continues the best.
     assert not list(tmp_path.glob("identify_*"))

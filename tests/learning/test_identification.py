@@ -1,6 +1,5 @@
 """Identification: parameters come back from sparse, noisy markers, with the deviation that was predicted."""
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 
@@ -174,22 +173,6 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     assert starts[0] == pytest.approx(FIRST)
     assert starts == identifier.starts(FIRST, 3, 8, seed=0) != identifier.starts(FIRST, 3, 8, seed=1)
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
-
-
-def test_finished_starts_are_skipped():
-    replay, release = replay_of(simulator(), TRUTH, frames=10)
-    kept, calls = [], []
-    starts = [FIRST, {"youngs_modulus": 150e3, "stiffness_damping": 0.01}]
-    whole = Identifier([(replay, release)], RANGES).run(
-        starts, 2, keep=lambda a: kept.append(json.loads(json.dumps(a)))
-    )
-    assert [len(attempts) for attempts in kept] == [1, 2]
-    again = Identifier([(replay, release)], RANGES).run(
-        starts, 2, report=lambda number, *_: calls.append(number), finished=kept[0]
-    )
-    assert set(calls) == {1}
-    assert again.parameters == whole.parameters
-    assert again.history == whole.history
 
 
 def test_only_the_first_seconds_count():

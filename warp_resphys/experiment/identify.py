@@ -41,7 +41,7 @@ def identify(context: StageContext) -> None:
     E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
     the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
     training trials. Releases are estimated again with the identified parameters, which are then refined. An interrupted
-    run keeps its finished starts and searches.
+    run keeps its finished searches.
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
@@ -226,8 +226,8 @@ class Checkpoint:
 
     @property
     def evaluations(self) -> int:
-        """Number of evaluations of the finished starts of a search."""
-        return sum(len(attempt["history"]) for attempt in self.content.get("attempts", ()))
+        """Number of evaluations of a finished search."""
+        return sum(map(len, self.content["found"]["history"])) if "found" in self.content else 0
 
 
 def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
@@ -248,14 +248,14 @@ def search_parameters(
     count: int,
     is_last: Callable[[float], bool] = lambda loss: True,
 ) -> dict[str, Any]:
-    """Returns the `Identification` of a search, as plain data; resumes an interrupted one.
+    """Returns the `Identification` of a search, as plain data, unless it was finished before.
 
     Args:
         wanted: its settings.
         seed: of the random candidates.
         search: the search.
         guess: first guess of each parameter.
-        kept: finished work.
+        kept: finished search.
         progress: advanced by every evaluation.
         count: number of starts.
         is_last: see `ParameterSearch.run`.
@@ -265,17 +265,12 @@ def search_parameters(
     """
     if "found" in kept.content:
         return dict(kept.content["found"])
-    if "starts" not in kept.content:
-        starts = search.starts(guess, count, wanted.candidates, seed)
-        kept.keep(starts=starts, attempts=[])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
         name, value = next(iter(values.items()))
         progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
 
-    def keep(attempts: list[Any]) -> None:
-        kept.keep(attempts=attempts)
-
-    starts, finished, most = kept.content["starts"], kept.content["attempts"], wanted.max_evaluations
-    kept.keep(found=asdict(search.run(starts, most, report, finished, keep, wanted.tolerance, is_last)))
+    starts = search.starts(guess, count, wanted.candidates, seed)
+    found = search.run(starts, wanted.max_evaluations, report, wanted.tolerance, is_last)
+    kept.keep(found=asdict(found))
     return dict(kept.content["found"])

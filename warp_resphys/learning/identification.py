@@ -82,8 +82,6 @@ class ParameterSearch:
         starts: Sequence[Mapping[str, float]],
         max_evaluations: int,
         report: Report | None = None,
-        finished: Sequence[Attempt] = (),
-        keep: Callable[[list[Attempt]], None] | None = None,
         tolerance: float = 1e-6,
         is_last: Callable[[float], bool] = lambda loss: True,
     ) -> Identification:
@@ -96,26 +94,18 @@ class ParameterSearch:
                 expects less is not evaluated.
             report: called after every evaluation with the start's number, the loss (infinite where the simulation
                 failed) and the parameters.
-            finished: results that an interrupted run with the same starts passed to `keep`; these starts are skipped.
-                Placement and uncertainty are those of the uninterrupted run to within the solver's tolerance.
-            keep: called after every start with the results of all so far, which can be written as JSON.
             is_last: whether no other search follows one with a loss; if not, placement and uncertainty are left out.
 
         Raises:
             ConvergenceError: the simulation fails at every start.
         """
-        attempts = list(finished)
-        for number in range(len(attempts), len(starts)):
-            attempts.append(self._descend(number, starts[number], max_evaluations, tolerance, report))
-            if keep is not None:
-                keep(attempts)
+        attempts = [self._descend(k, start, max_evaluations, tolerance, report) for k, start in enumerate(starts)]
         good = [attempt for attempt in attempts if attempt["loss"] is not None]
         if not good:
             reason = self._misfit.failure or "motions that are not finite"
             raise ConvergenceError(f"the simulation failed at every start of the identification: {reason}", None, None)
         best, misfit = min(good, key=lambda attempt: attempt["loss"]), self._misfit
-        unit = np.array(best.get("unit", misfit.to_unit(best["parameters"])))
-        misfit.prior_weight = best.get("prior_weight", 0.0)
+        unit, misfit.prior_weight = np.array(best["unit"]), best["prior_weight"]
         last = is_last(best["loss"])
         identified = Identification(
             parameters=best["parameters"],

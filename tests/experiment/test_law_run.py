@@ -12,8 +12,7 @@ from support.main_job import IN_RUN, run_without_report
 from warp_resphys import select_vertices
 from warp_resphys.experiment import identify_law
 from warp_resphys.experiment.experiment import LAW
-from warp_resphys.experiment.simulate import initial_state
-from warp_resphys.experiment.target import build_target
+from warp_resphys.experiment.simulate import build_target, initial_state
 from warp_resphys.experiment.trials import all_trials, split_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.learning.baselines import BASELINES
@@ -184,8 +183,8 @@ class TestALawThatDoesNotHelp:
             ["regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}", "simulation.regions={root:{},tip:{}}"],
             "^law: the simulator has materials by region, and one law is for one material: leave law out.$",
         ),
-        (["law.terms=[c20,c50]"], r"^law\.terms names c50: choose from c20, c30, "),
-        (["law.terms=[c10]"], r"^law\.terms names c10: choose from c20, c30, "),
+        (["law.terms=[c20,c50]"], r"^law\.terms is \['c20', 'c50'\]: it must be a list of c20, c30, "),
+        (["law.terms=[c10]"], r"^law\.terms is \['c10'\]: it must be a list of c20, c30, "),
         (
             [
                 "simulation={model:law,bulk_1:1e6,c10:1e4,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}"

@@ -14,7 +14,7 @@ from warp_resphys.environments.worlds import RobotWorld
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
-from warp_resphys.experiment.target import target_settings
+from warp_resphys.experiment.simulate import target_settings
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra

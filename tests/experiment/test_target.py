@@ -15,8 +15,7 @@ from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motio
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET, read_dataset
 from warp_resphys.experiment.laboratory import laboratory_simulator
-from warp_resphys.experiment.simulate import simulate
-from warp_resphys.experiment.target import vertices_in
+from warp_resphys.experiment.simulate import simulate, vertices_in
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext

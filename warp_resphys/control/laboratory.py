@@ -12,7 +12,7 @@ from ..data.rigid import RigidTransform, kabsch
 from ..experiment.build import bound_markers
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import laboratory_simulator, make_setup
-from ..experiment.target import substeps_of
+from ..experiment.simulate import substeps_of
 from ..io.files import read_json
 from ..mesh.mesh import boundary_triangles
 from ..report.obstacles import ObstacleSurface

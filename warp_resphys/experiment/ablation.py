@@ -30,8 +30,7 @@ from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import TrialPart, remove_parts, split_into_parts, work_on, workers_for
 from .reconstruct import Reconstructing
-from .simulate import held_state
-from .target import build_target
+from .simulate import build_target, held_state
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"

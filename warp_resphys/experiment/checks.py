@@ -4,7 +4,6 @@ The values of settings and their relations are checked when settings are made, s
 """
 
 import math
-import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import product
@@ -15,13 +14,14 @@ import torch
 
 from ..data.input_response import SLOPES
 from ..data.markers import MarkerMap
+from ..dynamics.plausibility import mean_of, small_strain_stiffness
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.law_files import read_law
-from ..energies.materials import ConvexMaterial
+from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
-from ..io.errors import InputError
+from ..io.errors import InputError, naming
 from ..io.memory import available_memory_gib
 from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
@@ -31,19 +31,20 @@ from ..settings.body import MaterialSettings
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
-from ..settings.trials import RecordedData
-from .actuators import check_drive, drive_of
-from .body_checks import check_size, check_target, naming
+from ..settings.trials import RecordedData, ReleaseFromLoad
+from .actuators import Drive, check_drive, drive_of
 from .build import build_body, build_material, build_simulator, finer
 from .experiment import LAW
 from .identify import ELASTIC
 from .recorded_checks import check_recorded
 from .shapes import check_shape
+from .simulate import substeps_of, target_settings, vertices_in
 from .trials import split_of, trials_of
 
-_TERMS = ("c20", "c30", "c01", "c02", "dilation", "bulk_2")  # elastic terms besides c10, bulk_1 and Ogden's
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
 _SHARE_OF_MEMORY = 0.8
+_LARGEST_STRAIN = 0.3  # rho g L / E above which a wrong unit is assumed
+_NOT_NEGATIVE = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
 
 def check_run(run: RunSettings) -> None:
@@ -66,7 +67,8 @@ def check_run(run: RunSettings) -> None:
     select_vertices(body.mesh, **run.tip.arguments())
     simulator = build_simulator(run, run.simulation, body)
     for material in simulator.materials.values():
-        check_size(body, material, run.gravity)
+        _check_size(body, material, run.gravity)
+    _check_target(run, body)
     if isinstance(run.data, RecordedData) and run.markers is not None:
         check_recorded(run, run.data, run.markers, body)
         _check_reconstruction(run, simulator)
@@ -98,11 +100,6 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
     """Checks the identification of a law, or that a law of another run can be used."""
     if run.simulation.regions:
         raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
-    for name in law.terms:
-        if name not in _TERMS and not re.fullmatch(r"ogden_m?[1-9]\d*", name):
-            raise InputError(
-                f"law.terms names {name}: choose from {', '.join(_TERMS)}, and ogden_3, ogden_m3 and so on."
-            )
     with naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
     if run.simulation.model == LAW and law.file is None:
@@ -119,7 +116,6 @@ def _check_law(run: RunSettings, law: LawSettings) -> None:
 def _check_simulated(run: RunSettings, simulator: Simulator) -> None:
     """Checks an experiment with simulated trials, in which all vertices are observed."""
     split_of(run)
-    check_target(run, simulator.body)
     for name, shape in run.shapes.items():
         with naming(f"shapes.{name}: "):
             check_shape(shape)
@@ -189,25 +185,10 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
                 raise InputError(f"identify.{group} names '{name}': {instead}.")
     for name, limits in identify.parameters.items():
         word = command_of(simulator, name)[1]
-        if word == "slew" and limits.lower < 0.0:
+        if word in _NOT_NEGATIVE and limits.lower < 0.0:
             raise InputError(
-                f"identify.parameters.{name}.lower is {limits.lower:g}: slew rates are positive, so it must be zero "
-                "or more, in s by the unit of the input."
-            )
-        if word in ("dead_band", "backlash") and limits.lower < 0.0:
-            raise InputError(
-                f"identify.parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is zero or more, in "
-                "the unit of the input."
-            )
-        if word in SLOPES and limits.lower < 0.0:
-            raise InputError(
-                f"identify.parameters.{name}.lower is {limits.lower:g}: a characteristic curve does not fall, so it "
-                "must be zero or more."
-            )
-        if word in ("delay", "rise") and limits.lower < 0.0:
-            raise InputError(
-                f"identify.parameters.{name}.lower is {limits.lower:g}: inputs cannot precede their command, so it "
-                "must be zero or more, in s; data.trials.NAME.onset is the time of a command."
+                f"identify.parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not negative: "
+                "set it to zero or more."
             )
 
 
@@ -253,7 +234,6 @@ def _check_parts(identify: IdentifySettings, simulator: Simulator) -> None:
 def _check_ablation(run: RunSettings, simulator: Simulator) -> None:
     """Checks the marker ablation."""
     assert run.ablation is not None
-    check_target(run, simulator.body)
     counts, surface = run.ablation.counts, len(surface_vertices(simulator.body.mesh))
     if max(counts) > surface:
         raise InputError(
@@ -261,3 +241,56 @@ def _check_ablation(run: RunSettings, simulator: Simulator) -> None:
             "fewer, or refine the mesh."
         )
     _check_reconstruction(run, simulator, run.ablation.modes)
+
+
+def _check_target(run: RunSettings, body: Body) -> None:
+    """Checks the simulation that plays the real body, which is observed at the vertices of the simulator's body."""
+    for key, target in run.targets.items():
+        build_material(target.material, f"{key}.material")
+        with naming(f"{key}: "):
+            simulator = build_simulator(target_settings(run, target), target.material, payload_at=run.payload_at)
+        for material in simulator.materials.values():
+            _check_size(simulator.body, material, run.gravity)
+        if run.recorded is not None:
+            _check_drive(drive_of(run, body), drive_of(target, simulator.body))
+            continue
+        substeps_of(run.time_step, target, key)
+        with naming(f"{key}.mesh: "):
+            vertices_in(simulator.body.mesh, body.mesh)
+        if isinstance(run.data, ReleaseFromLoad):
+            places = {f"data.others.{name}.at": held.at for name, held in run.data.others.items() if held.at}
+            for place, at in {"data.load": run.data.load, **places}.items():
+                with naming(f"{place}: "):
+                    select_vertices(simulator.body.mesh, **at.arguments())
+
+
+def _check_drive(drive: Drive | None, real: Drive | None) -> None:
+    """Refuses a laboratory whose input is not that of the simulator."""
+    simulated, played = (
+        "no input" if own is None else f"{own.quantity.name} of {len(own.parts)} {own.per}{'s'[: len(own.parts) - 1]}"
+        for own in (drive, real)
+    )
+    if simulated != played:
+        raise InputError(
+            f"laboratory: its body takes {played}, but that of the simulator takes {simulated}: give both the same "
+            "inputs, by chambers, tendons, muscles.commanded or energies."
+        )
+
+
+def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
+    """Refuses a body with very large strains under its own weight, which indicate a wrong unit.
+
+    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
+    """
+    length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
+    constants = material.constants
+    density, stiffness = mean_of(constants["density"]), small_strain_stiffness(material)
+    if stiffness <= 0.0:
+        raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
+    strain = density * float(np.linalg.norm(gravity)) * length / stiffness
+    if strain > _LARGEST_STRAIN:
+        raise InputError(
+            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
+            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
+            "Pa?"
+        )

@@ -44,7 +44,7 @@ from .files import (
     read_dataset,
     read_if_there,
 )
-from .target import target_settings
+from .simulate import target_settings
 
 COROTATED: Final = "corotated"
 LAW: Final = "law"

@@ -1,7 +1,7 @@
 """Stage: simulated laboratory, which records trials of a simulation that takes the place of the real body.
 
-The laboratory is for users without one. Its simulation is a target (`experiment.target`): mesh, time step, material and
-actuators may differ from those of the simulator to be corrected. Its body is slightly tilted, its markers deviate
+The laboratory is for users without one. Its simulation is a target (`experiment.simulate`): mesh, time step, material
+and actuators may differ from those of the simulator to be corrected. Its body is slightly tilted, its markers deviate
 slightly from their nominal places, and cameras see the markers in their own frame, with noise.
 """
 
@@ -37,8 +37,7 @@ from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
 from .reading import vertical
-from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of
-from .target import substeps_of, target_settings
+from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of, substeps_of, target_settings
 
 FloatArray = NDArray[np.float64]
 

@@ -9,18 +9,17 @@ from ..data.markers import follow_vertices
 from ..data.registration import axes_rotation
 from ..data.rigid_bodies import owners
 from ..fem.body import Body
-from ..io.errors import InputError, listed, number_of
+from ..io.errors import InputError, listed, naming, number_of
 from ..mesh.mesh import select_vertices
 from ..settings.run import RunSettings
 from ..settings.stages import PlayedSettings
 from ..settings.trials import MarkerSettings, RecordedData, Trial
 from .actuators import Drive, drive_of
-from .body_checks import check_target, naming
 from .build import build_material, marker_view_of, mounted_on
 from .files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from .laboratory import input_sequences
 from .reading import standing_enough
-from .target import substeps_of
+from .simulate import substeps_of
 from .trials import all_trials, folds_of, split_of, trials_of
 
 
@@ -53,7 +52,7 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     if run.published is not None:
         build_material(run.published.simulation, "published.simulation")
     if run.is_laboratory:
-        _check_laboratory(run, data, trials, body, drive)
+        _check_laboratory(run, data, trials, drive)
     for trial in trials:
         if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
             raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
@@ -183,9 +182,7 @@ def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None)
         raise InputError(f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it.")
 
 
-def _check_laboratory(
-    run: RunSettings, data: RecordedData, trials: Sequence[Trial], body: Body, drive: Drive | None
-) -> None:
+def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Trial], drive: Drive | None) -> None:
     laboratory, begins = run.laboratory, {trial.begins for trial in trials}
     assert laboratory is not None
     for trial in trials:
@@ -211,4 +208,3 @@ def _check_laboratory(
         if drive is not None:
             random = np.random.default_rng(0)
             input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
-    check_target(run, body)

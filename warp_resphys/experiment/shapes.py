@@ -30,8 +30,7 @@ from .build import build_body, build_simulator
 from .experiment import LAW, Experiment
 from .files import LAW_FILE, SHAPES
 from .identify import Checkpoint
-from .simulate import held_alone
-from .target import substeps_of, target_settings, vertices_in
+from .simulate import held_alone, substeps_of, target_settings, vertices_in
 
 Force = Callable[[State], torch.Tensor]
 

@@ -3,7 +3,8 @@
 import difflib
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 _LONGEST = 1000
@@ -79,3 +80,12 @@ def did_you_mean(wanted: str, known: Sequence[str], preferred: Sequence[str] = (
     offered = [name for name in dict.fromkeys(preferred) if name != wanted][:3]
     matches = offered or difflib.get_close_matches(wanted, [name for name in known if name != wanted], n=3, cutoff=0.6)
     return f", did you mean {' or '.join(repr(match) for match in matches)}?" if matches else ""
+
+
+@contextmanager
+def naming(group: str) -> Iterator[None]:
+    """Prefixes errors with the name of a group."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(f"{group}{error}") from error

@@ -14,7 +14,7 @@ from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
 from ..experiment.build import build_body
 from ..experiment.laboratory import make_setup
-from ..experiment.target import target_settings
+from ..experiment.simulate import target_settings
 from ..fem.body import Body
 from ..fem.rigid import Rigid
 from ..io.settings import NotNegative, Positive, Settings, parse, setting

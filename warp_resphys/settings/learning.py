@@ -23,6 +23,13 @@ from .body import Integrator
 from .trials import different, rising
 
 Size = Annotated[int, Field(ge=1, le=16_384)]
+Term = Annotated[
+    str,
+    Field(
+        pattern=r"^(c20|c30|c01|c02|dilation|bulk_2|ogden_m?[1-9]\d*)$",
+        json_schema_extra={"wanted": "c20, c30, c01, c02, dilation, bulk_2, or ogden_3, ogden_m3 and so on"},
+    ),
+]
 
 
 class PriorSettings(Settings):
@@ -121,7 +128,7 @@ class LawSettings(Settings):
     """
 
     file: Word | None = setting(None, "law of another run, or a silicone's name")
-    terms: Many[Word] = setting(
+    terms: Many[Term] = setting(
         ("c20", "c01", "dilation", "ogden_3", "ogden_6"), "elastic terms besides c10 and bulk_1"
     )
     branches: Count = setting(13, "relaxation times that are tried")

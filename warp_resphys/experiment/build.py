@@ -56,8 +56,6 @@ from .actuators import build_actuators
 
 FloatArray = NDArray[np.float64]
 
-_DTYPES = {"float64": torch.float64, "float32": torch.float32}
-
 
 def choose_device(name: str) -> torch.device:
     """Returns the named device; ``auto`` is CUDA if available.
@@ -369,5 +367,4 @@ def build_simulator(
         integrator=settings.integrator,
         solver=SolverSettings(**solver),
         device=simulation_device(settings.device),
-        dtype=_DTYPES[settings.dtype],
     )

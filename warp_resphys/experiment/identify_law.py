@@ -23,7 +23,7 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions
 from ..learning.bounds import Bounds
-from ..learning.identification import Identification, Identifier
+from ..learning.identification import Identifier
 from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
 from ..learning.replay import Replay
 from ..learning.weak_form import KnownMotion, WeakForm
@@ -59,13 +59,23 @@ def identify_law(context: StageContext) -> None:
 
 
 @dataclass(frozen=True)
+class _Found:
+    """Result of a search."""
+
+    parameters: dict[str, float]
+    loss: float
+    at_bounds: Sequence[str]  # parameters that ended on a bound
+    deviation: dict[str, float]  # standard deviations; empty if they are not known
+
+
+@dataclass(frozen=True)
 class _Refined:
     """A law that is refined through the simulator."""
 
     law: LawClass
     others: dict[str, float]  # identified parameters that are not those of the material
     names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
-    found: Identification
+    found: _Found
     score: Score  # on the validation trials
 
 
@@ -108,7 +118,7 @@ class _LawSearch:
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
         mass = {name: best.others.get(name, value) for name, value in self.trials.mass.items()}
         constants = mass | best.law.constants
-        below, deviation = self.trials.score_below(), _deviation(best.found)
+        below, deviation = self.trials.score_below(), best.found.deviation
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
@@ -145,7 +155,7 @@ class _LawSearch:
             "accepted_there": content.get("accepted_there", content.get("accepted", True)),
             "file": file,
             "parameters": others,
-            "deviation": content.get("deviation", {}) | _deviation(found),
+            "deviation": content.get("deviation", {}) | ({} if found is None else found.deviation),
             "at_bounds": [*content.get("at_bounds", ()), *(() if found is None else found.at_bounds)],
             "validation": self.trials.validation(score, self.trials.score_below()),
         }
@@ -260,7 +270,7 @@ class _LawSearch:
         bounds: Mapping[str, Bounds],
         guess: Mapping[str, float],
         others: Mapping[str, float] | None = None,
-    ) -> Identification:
+    ) -> _Found:
         """Returns the parameters that are closest to the training trials, from a guess and SysID's values.
 
         Args:
@@ -271,6 +281,8 @@ class _LawSearch:
             others: guess of the other ones, in place of SysID's values.
         """
         wanted, finished = self.settings.law, self.kept.content.get("searches", {})
+        if key in finished:
+            return _Found(**finished[key])
         whole, given = "whole" in key, key == "given"
         limits = (
             self.trials.seconds,
@@ -287,22 +299,17 @@ class _LawSearch:
                 name, value = next(iter(values.items()))
                 progress.advance(1, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
 
-            def keep(attempts: list[Any]) -> None:
-                self.kept.keep(searches={**finished, key: attempts})
-
             start = {name: {**self.trials.sysid, **(others or {}), **guess}[name] for name in bounds}
-            done = finished.get(key, ())
-            return identifier.run([start], wanted.max_evaluations, report, done, keep, wanted.tolerance)
+            best = identifier.run([start], wanted.max_evaluations, report, wanted.tolerance)
+        deviation = {} if best.uncertainty is None else best.uncertainty.deviation
+        found = _Found(best.parameters, best.loss, best.at_bounds, deviation)
+        self.kept.keep(searches={**finished, key: asdict(found)})
+        return found
 
 
 def _refined_groups(law: LawClass) -> set[str]:
     """Groups of terms of a law when it is refined, which adds viscosities."""
     return {*law.groups, "viscosity"}
-
-
-def _deviation(found: Identification | None) -> dict[str, float]:
-    """Standard deviations of identified parameters; none where they are not known."""
-    return {} if found is None or found.uncertainty is None else found.uncertainty.deviation
 
 
 def _family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:

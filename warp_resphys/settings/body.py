@@ -326,7 +326,6 @@ class SimulatorSettings(SteppedSettings):
     gravity: Vector = setting((0.0, 0.0, -9.80709), "acceleration of gravity", "m/s^2")
     solver: SolveSettings = SolveSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
-    dtype: Literal["float64", "float32"] = setting("float64", "precision of the simulation; experiments need float64")
 
 
 class SimulationSettings(SimulatorSettings):

@@ -242,8 +242,6 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _markers_and_data(self) -> Self:
-        if self.dtype != "float64":
-            raise ValueError("dtype is 'float32': experiments need float64; float32 is for roll-outs in Python.")
         if (self.markers is None) != (self.recorded is None):
             if self.markers is None:
                 raise ValueError("markers is null, but data.kind is recorded: name the markers, with their places.")

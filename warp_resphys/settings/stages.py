@@ -61,7 +61,6 @@ class PlayedSettings(Settings):
     time_step: float
     solver: SolveSettings
     device: str
-    dtype: str
     seed: int
     binding: BindingSettings
     data: ReadingSettings

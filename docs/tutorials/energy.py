@@ -171,9 +171,6 @@ length = np.linalg.norm(pulled[ends[0, 0]] - pulled[ends[0, 1]])
 print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length - 0.05):.3f} N")
 
 # %% [markdown]
-# Memory is declared in the same way, with a function of the start and the end of a step;
-# `warp_resphys.energies.friction` is an example of 40 lines.
-#
 # ## Use in an experiment
 #
 # [Your own physics](../extending.md) shows how a package of yours gives this energy a name in configurations, so that

@@ -1,5 +1,7 @@
 """The linearised step: its Hessian is the derivative of its residual, with a rigid part and a tendon."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,6 @@ import torch
 from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, select_vertices
 from warp_resphys.dynamics.energy_set import EnergySet
 from warp_resphys.dynamics.linearisation import Linearisation
-from warp_resphys.energies.friction import BristleFriction
 from warp_resphys.energies.placement import place_energies
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
@@ -69,22 +70,22 @@ def test_a_shifted_factor():
 
 def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     mesh = Mesh(BOX.vertices, BOX.cells, {"root": np.array([0]), "tip": np.array([1, 2])})
-    friction = BristleFriction([[0, 12]], 1.0, 1e-3)
-    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[friction])
+    tendon = replace(TENDON, friction=0.2)
+    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[tendon])
     materials = {"root": Corotated(1e5, density=1000.0), "tip": Corotated(2e5, density=500.0)}
     rest = torch.as_tensor(mesh.vertices)
     energies = EnergySet(place_energies(body, materials), body, rest, INTEGRATORS["bdf2"], 0.01)
     assert energies.constants["tip_youngs_modulus"] == 2e5
-    assert {"root_density", "tip_density", "friction_force"} <= set(energies.parameters)
+    assert {"root_density", "tip_density", "tendon_friction"} <= set(energies.parameters)
     given = {
         name: energies.parameters[name].shaped(torch.as_tensor(v).double()) for name, v in energies.constants.items()
     }
     values, mass = energies.prepare({**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()})
     volume = 0.02**3
     np.testing.assert_allclose(mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)])
-    assert "friction_force" in values
-    energies.check_memory({"bristle_deflection": rest.new_zeros(2, 1)}, 2, rest)
-    for wrong in ({"deflection": rest.new_zeros(2, 1)}, {"bristle_deflection": rest.new_zeros(2, 3)}):
+    assert "tendon_friction" in values
+    energies.check_memory({"tendon_segment_tension": rest.new_zeros(2, 1)}, 2, rest)
+    for wrong in ({"tension": rest.new_zeros(2, 1)}, {"tendon_segment_tension": rest.new_zeros(2, 3)}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             energies.check_memory(wrong, 2, rest)
     twice = 2 * place_energies(body, materials)

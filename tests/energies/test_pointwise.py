@@ -34,10 +34,10 @@ VALUES = {"muscle_stress": 2e4, "muscle_contraction": 0.5}  # where no fibre is 
 
 @wp.func
 def fibre(x: wp.vec3d, v: wp.vec3d) -> wp.float64:
-    """That of `Muscles` beyond the toe; the values are stress, contraction and stiffness."""
+    """That of `Muscles` beyond the toe; the values are stiffness, stress and contraction."""
     length = wp.length(x)
-    force = length - wp.float64(1.0) + v[1] - wp.float64(0.5e-3)
-    return v[0] * length + v[2] * (wp.float64(0.5) * force * force + wp.float64(0.025e-6))
+    force = length - wp.float64(1.0) + v[2] - wp.float64(0.5e-3)
+    return v[1] * length + v[0] * (wp.float64(0.5) * force * force + wp.float64(0.025e-6))
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,6 @@ class Fibre(PointwiseEnergy):
     parameters: ClassVar = (Quantity("muscle_stiffness", "Pa", 0.0),)
     density: ClassVar = fibre
     muscle_stiffness: float = 4e4
-
-    @property
-    def value_names(self):
-        return ("muscle_stress", "muscle_contraction", "muscle_stiffness")
 
     def points(self, mesh):
         return FIBRES.points(mesh)

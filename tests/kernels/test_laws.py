@@ -1,11 +1,10 @@
-"""Tension laws and bristle friction: slopes against differences, closed forms and the integral of the force."""
+"""Tension laws: slopes against differences, closed forms and the integral of the force."""
 
 import numpy as np
 import pytest
 import warp as wp
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 
-from warp_resphys.kernels.friction import bristle_energy
 from warp_resphys.kernels.laws import muscle, string, thread
 
 wp.set_module_options({"enable_backward": False})
@@ -59,26 +58,3 @@ def test_a_tension_law(name):
     np.testing.assert_allclose(slope[-2:], stiffness)
     work = energy[0] + [quad(lambda x: at(np.array([x]), values)[1, 0], lengths[0], end)[0] for end in lengths]
     np.testing.assert_allclose(energy, work, atol=1e-7 * stiffness)
-
-
-@wp.kernel
-def friction(slides: wp.array[wp.float64], v: wp.vec4d, out: wp.array[wp.float64]):
-    i = wp.tid()
-    out[i] = bristle_energy(wp.vec3d(wp.float64(0.6), wp.float64(0.0), wp.float64(0.8)) * (v[3] + slides[i]), v)
-
-
-@pytest.mark.parametrize("start", [0.0, 6e-4, -9e-4])
-def test_the_energy_of_bristles_is_the_work_against_them(start):
-    """In Dahl's model, dz/ds = 1 - |ds|/ds z / z_c over the slide s: F_c / z_c times the integral of z."""
-    force, length, slides = 2.0, 1e-3, np.array([0.0, 3e-4, 2e-3, -5e-4, -3e-3])
-    out = wp.zeros(len(slides), dtype=wp.float64, device="cpu")
-    inputs = [wp.array(slides, dtype=wp.float64, device="cpu"), wp.vec4d(force, length, start, 0.05), out]
-    wp.launch(friction, len(slides), inputs, device="cpu")
-    for slide, energy in zip(slides, out.numpy(), strict=True):
-        sign = np.sign(slide)
-
-        def slopes(_, y, sign=sign):
-            return [sign - y[0] / length, force / length * sign * y[0]]
-
-        end = solve_ivp(slopes, (0.0, abs(slide)), [start, 0.0], rtol=1e-10, atol=1e-14).y[1, -1] if slide else 0.0
-        assert energy == pytest.approx(end, rel=1e-7, abs=1e-12)

@@ -14,8 +14,8 @@ plastic strain E_p0 minimises the energy stored plus the work of friction,
 which is the radial return E_p = E - min(1, e / |A|) A (Simo and Hughes, Computational Inelasticity, 1998, chapter 3).
 It is exact where the strain changes in proportion, and depends on no time step. The function of A is convex with a
 continuous first derivative, so that a step has a potential, and friction takes energy in every implicit step. The
-second derivative jumps where a slider begins to slide: there, derivatives are those of one side. (Dahl's exponential,
-as in `energies.friction`, has no potential for tensors; several sliders approach it, or any other curve of loading.)
+second derivative jumps where a slider begins to slide: there, derivatives are those of one side. (Dahl's exponential
+has no potential for tensors; several sliders approach it, or any other curve of loading.)
 
 A cycle of amplitude a > e along one direction of strain takes 8 mu g e (a - e) per volume. |E| is 1.22 times the small
 elongation of an incompressible bar, and 0.71 times a small shear angle. Like a Prony branch, a slider acts on the whole

@@ -60,10 +60,8 @@ class ReadingTerm(PartTerm):
         launcher: launcher of the potential.
         sets: one set of points.
         kernels: ``local_step``, ``tangent`` and ``adjoint``, and the vector type ``values``.
-        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n values per part, or
-            (P,) for one value per point.
+        shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n values per part.
         count: number of parts.
-        per_point: names of the values with one value per point.
         arrays: names of arrays, of any shape, that every point reads completely.
         extra: arguments of the kernels after the values.
     """
@@ -75,13 +73,12 @@ class ReadingTerm(PartTerm):
         kernels: Any,
         shapes: Mapping[str, tuple[int, ...]],
         count: int,
-        per_point: Sequence[str] = (),
         arrays: Sequence[str] = (),
         extra: Sequence[Any] = (),
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
         self._kernels, self._extra = kernels, extra
-        self._per_point, self._arrays = frozenset(per_point), frozenset(arrays)
+        self._arrays = frozenset(arrays)
         part = self.part_of.cpu().numpy()
         self._columns = {name: self._columns_of(name, part) for name in self._shapes}
         self._column = launcher.upload(np.concatenate(list(self._columns.values())).astype(np.int32), int)
@@ -93,8 +90,7 @@ class ReadingTerm(PartTerm):
         if name in self._arrays:
             return np.tile(np.arange(int(np.prod(self._shapes[name])))[:, None], len(part))
         n = int(np.prod(self._shapes[name][1:]))
-        first = np.arange(len(part)) if name in self._per_point else part
-        return np.stack([first * n + k for k in range(n)])
+        return np.stack([part * n + k for k in range(n)])
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
@@ -116,10 +112,8 @@ class ReadingTerm(PartTerm):
             slopes, first = {}, 0
             for name, shape in self._shapes.items():
                 slope = out[..., first : first + len(self._columns[name])]
-                if name in self._arrays:
-                    slope = slope.sum(1)
-                elif name not in self._per_point:
-                    slope = torch.einsum("bpn,pc->bcn", slope, self._one_hot)
+                whole = name in self._arrays
+                slope = slope.sum(1) if whole else torch.einsum("bpn,pc->bcn", slope, self._one_hot)
                 slopes[name] = slope.reshape(own.batch, *shape).clone()
                 first += len(self._columns[name])
             return slopes

@@ -11,9 +11,9 @@ direction of the slide,
 
     f(s) = F + (f_0 - F) exp(-|s| / z_c),
 
-which derives from a convex potential of s, that of `energies.friction` with two bounds. Angles and bounds are those at
-the start of the step, under the commands of the step: a contraction that yields much within it makes friction too large
-in that step. The spring of a tendon lies before its first guide.
+which derives from a convex potential of s. Angles and bounds are those at the start of the step, under the commands of
+the step: a contraction that yields much within it makes friction too large in that step. The spring of a tendon lies
+before its first guide.
 
 In a static equilibrium, and at the start of a roll-out without memory, tendons have been pulled from slack: the tension
 falls at every guide by the factor exp(-mu theta).

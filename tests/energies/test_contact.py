@@ -19,7 +19,6 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
-    SymmetryPlane,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -607,9 +606,6 @@ def test_a_clamp_that_moves_through_an_obstacle_is_refused():
 
 def test_bodies_and_inputs_that_contact_refuses():
     floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
-    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
-    with pytest.raises(InputError, match="symmetry planes has no contact"):
-        Simulator(half)
     simulator = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
     with pytest.raises(InputError, match="without moves=True"):
         simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))

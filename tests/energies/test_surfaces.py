@@ -23,7 +23,6 @@ from warp_resphys import (
     SolverSettings,
     State,
     SurfaceContact,
-    SymmetryPlane,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -747,8 +746,6 @@ def test_refusals():
         SurfaceContact(distance=0.0)
     with pytest.raises(InputError, match="surface_friction"):
         SurfaceContact(friction=-0.1)
-    with pytest.raises(InputError, match="symmetry planes"):
-        Simulator(Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()]))
     with pytest.raises(InputError, match="midpoint"):
         Simulator(Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
     simulator = landing()

@@ -35,20 +35,13 @@ NAN, INF = float("nan"), float("inf")
     ("constants", "message"),
     [
         ({"youngs_modulus": 0.0}, "youngs_modulus is"),
-        ({"youngs_modulus": -1e5}, "youngs_modulus is"),
         ({"youngs_modulus": NAN}, "youngs_modulus is nan"),
-        ({"youngs_modulus": INF}, "youngs_modulus is inf"),
         ({"youngs_modulus": [1e5, -1.0]}, "youngs_modulus is"),
         ({"youngs_modulus": torch.ones(1, 1, 1)}, r"youngs_modulus has shape \(1, 1, 1\)"),
         ({"youngs_modulus": []}, r"youngs_modulus has shape \(0,\)"),
         ({"poissons_ratio": 0.5}, "poissons_ratio is"),
-        ({"poissons_ratio": 0.7}, "poissons_ratio is 0.7"),
         ({"poissons_ratio": -1.0}, "poissons_ratio is -1"),
-        ({"poissons_ratio": NAN}, "poissons_ratio is nan"),
         ({"density": 0.0}, "density is"),
-        ({"density": -1.0}, "density is -1"),
-        ({"mass_damping": -0.1}, "mass_damping is"),
-        ({"stiffness_damping": -1e-3}, "stiffness_damping is"),
         ({"stiffness_damping": INF}, "stiffness_damping is inf"),
         ({"lame_lambda": 1e5}, "'lame_lambda'"),
         ({"model": "linear"}, "'linear'"),
@@ -62,11 +55,11 @@ def test_material(constants, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"time_step": 0.0}, "time_step is"),
         ({"time_step": -0.01}, "time_step is -0.01: it must be positive"),
-        ({"time_step": NAN}, "time_step is nan"),
         ({"time_step": INF}, "time_step is inf"),
         ({"dtype": torch.float16}, "torch.float16"),
+        ({"gravity": (0.0, -9.81)}, "gravity"),
+        ({"gravity": (0.0, 0.0, NAN)}, "gravity"),
     ],
 )
 def test_simulator(options, message):
@@ -84,7 +77,6 @@ def test_absent_cuda_device():
     ("options", "message"),
     [
         ({"fixed": [0, VERTICES]}, f"fixed vertices must lie between 0 and {VERTICES - 1}"),
-        ({"fixed": [-1]}, f"fixed vertices must lie between 0 and {VERTICES - 1}"),
         ({"fixed": range(VERTICES)}, "every vertex is fixed"),
         ({"mass": "consistent"}, "mass is"),
     ],
@@ -98,13 +90,10 @@ def test_body(options, message):
     ("mass", "message"),
     [
         (PointMass(-0.1, [0]), "a point mass of -0.1 kg"),
-        (PointMass(NAN, [0]), "a point mass of nan kg"),
         (PointMass(0.1, []), "a point mass must hang on at least one vertex"),
         (PointMass(0.1, [VERTICES]), f"a point mass's vertices must lie between 0 and {VERTICES - 1}"),
         (PointMass(0.1, [True, False]), "a point mass's vertices must be vertex numbers"),
         (PointMass(0.1, [0, 1], [0.5]), "a point mass on 2 vertices needs 2 weights, zero or more, that sum to one"),
-        (PointMass(0.1, [0, 1], [2.0, -1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
-        (PointMass(0.1, [0, 1], [NAN, 1.0]), "a point mass on 2 vertices needs 2 weights, zero or more"),
         (PointMass(0.1, [0, 1], [0.5, 0.6]), "a point mass on 2 vertices needs 2 weights, zero or more"),
     ],
 )
@@ -130,52 +119,43 @@ def step(simulator, q, v, external_force, fixed_positions):
 NAMES = {"q": "state.q", "v": "state.v", "external_force": "external_force", "fixed_positions": "fixed_positions"}
 
 
-@pytest.mark.parametrize("value", [NAN, INF])
 @pytest.mark.parametrize("name", NAMES)
-def test_values_that_are_not_finite(name, value, simulator):
+def test_values_that_are_not_finite(name, simulator):
     given = {key: tensor.clone() for key, tensor in arguments(simulator).items()}
-    given[name][1, 2, 0] = value
+    given[name][1, 2, 0] = NAN
     with refused(f"{NAMES[name]} is not finite in environment 1, vertex 2"):
         step(simulator, **given)
 
 
-@pytest.mark.parametrize("integrator", ["bdf2", "implicit_euler"])
-def test_the_state_before_is_checked_like_the_state(integrator):
-    simulator = Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0)), integrator=integrator)
+def test_the_state_before_is_checked_like_the_state():
+    simulator = Simulator(BODY, integrator="bdf2")
     rest = simulator.rest_state(2)
     for which in (0, 1):
-        for value in (NAN, INF):
-            pair = [rest.q.clone(), rest.v.clone()]
-            pair[which][1, 2, 0] = value
-            with refused(rf"state.previous\[{which}\] is not finite in environment 1, vertex 2"):
-                simulator.step(State(rest.q, rest.v, tuple(pair)))
-        for wrong in (rest.q[:1], rest.q.float(), rest.q.numpy()):
+        moved = rest.v.clone()
+        moved[1, 2, 0] = INF
+        for wrong, message in (
+            (moved, "is not finite in environment 1, vertex 2"),
+            (rest.q[:1], ""),
+            (rest.q.numpy(), ""),
+        ):
             pair = [rest.q, rest.v]
             pair[which] = wrong
-            with refused(rf"state.previous\[{which}\] "):
+            with refused(rf"state.previous\[{which}\] {message}"):
                 simulator.step(State(rest.q, rest.v, tuple(pair)))
-    for wrong in (rest.q, (rest.q,)):
-        with refused(r"state.previous must be the pair \(q, v\)"):
-            simulator.step(State(rest.q, rest.v, wrong))
+    with refused(r"state.previous must be the pair \(q, v\)"):
+        simulator.step(State(rest.q, rest.v, (rest.q,)))
 
 
-@pytest.mark.parametrize("name", ["v", "external_force", "fixed_positions"])
+@pytest.mark.parametrize("name", NAMES)
 def test_wrong_shapes(name, simulator):
     given = arguments(simulator)
     wanted = rf"it must be \(2, {FIXED if name == 'fixed_positions' else VERTICES}, 3\)"
-    for wrong in (given[name][:1], given[name][:, :-1], given[name][..., :2], given[name][0]):
-        with refused(f"{NAMES[name]} has shape .*{wanted}"):
+    for wrong in (given[name][:, :-1], given[name][..., :2], given[name][0]):
+        with refused(f"{NAMES[name]} has shape" + ("" if name == "q" else f" .*{wanted}")):
             step(simulator, **(given | {name: wrong}))
 
 
-def test_wrong_shape_of_positions(simulator):
-    given = arguments(simulator)
-    for wrong in (given["q"][:, :-1], given["q"][..., :2], given["q"][0]):
-        with refused("state.q has shape"):
-            step(simulator, **(given | {"q": wrong}))
-
-
-@pytest.mark.parametrize("count", [0, -1, 2.5, NAN, True, "two"])
+@pytest.mark.parametrize("count", [0, 2.5, True, "two"])
 def test_batches_and_steps_that_are_no_whole_numbers(simulator, count):
     with refused("batch is .*: it must be a whole number, one or more"):
         simulator.rest_state(count)
@@ -194,32 +174,12 @@ def test_rollout_with_the_wrong_number_of_steps(simulator):
         simulator.rollout(state, 4, Inputs(fixed_positions=forces[:, :, simulator.fixed]))
 
 
-@pytest.mark.parametrize(
-    "constants",
-    [
-        {"youngs_modulus": [1e5] * (ELEMENTS + 1)},
-        {"poissons_ratio": [0.4] * (ELEMENTS + 1)},
-        {"density": [1000.0] * (ELEMENTS + 1)},
-    ],
-)
-def test_material_of_another_mesh(constants, simulator):
+def test_material_of_another_mesh_or_batch(simulator):
     with refused(f"a material parameter has {ELEMENTS + 1} values for {ELEMENTS} elements"):
-        simulator.step(simulator.rest_state(1), parameters=constants)
-
-
-@pytest.mark.parametrize(
-    "constants",
-    [
-        {"youngs_modulus": np.full((3, 1), 1e5)},
-        {"density": np.full((3, 1), 1e3)},
-        {"mass_damping": [1.0, 2.0, 3.0]},
-        {"stiffness_damping": [1e-3, 2e-3, 3e-3]},
-    ],
-    ids=lambda constants: next(iter(constants)),
-)
-def test_material_of_another_batch(constants, simulator):
-    with refused("3 environments"):
-        simulator.step(simulator.rest_state(2), parameters=constants)
+        simulator.step(simulator.rest_state(1), parameters={"density": [1000.0] * (ELEMENTS + 1)})
+    for constants in ({"youngs_modulus": np.full((3, 1), 1e5)}, {"mass_damping": [1.0, 2.0, 3.0]}):
+        with refused("3 environments"):
+            simulator.step(simulator.rest_state(2), parameters=constants)
 
 
 def test_static_equilibrium_of_a_free_body():
@@ -234,12 +194,6 @@ def test_static_equilibrium_of_values_that_are_not_finite(name, simulator):
     values[0, 1, 2] = NAN
     with refused(f"{name} is not finite in environment 0, vertex 1"):
         simulator.static_equilibrium(**({name: values} if name == "start" else {"inputs": Inputs(**{name: values})}))
-
-
-def test_gravity(simulator):
-    for gravity in ((0.0, -9.81), (0.0, 0.0, NAN)):
-        with refused("gravity"):
-            Simulator(BODY, gravity=gravity)
 
 
 def test_mesh_with_vertices_that_no_cell_uses():

@@ -42,6 +42,7 @@ def _here(folder, no_report):
     """Runs are in a folder of the test, without a report."""
 
 
+@pytest.mark.slow
 def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothing():
     code, err = run(*CRAWLS, "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN)
     assert (code, err[-600:] if code else "") == (0, "")

@@ -43,6 +43,7 @@ def played(tmp_path_factory):
     return folder, result
 
 
+@pytest.mark.slow
 def test_stiffness_density_and_damping_come_back(played):
     folder, result = played
     identified = json.loads((folder / "identification.json").read_text())["sysid"]["parameters"]
@@ -81,6 +82,7 @@ def recorded(played, folder):
 RECORDED = [*PLAYED, "data.folder=pictures", "data.simulated=null", IN_RUN]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -106,6 +108,7 @@ def test_a_release_after_the_simulated_pictures_is_named_before_any_work(folder)
         camera.check_release("poses.released", 20.7 / 60.0)  # 21 is not, with the delay
 
 
+@pytest.mark.slow
 def test_a_frame_rate_gives_times(recorded, folder):
     """With which nothing is refused before the file of the tracked points, which lacks a frame."""
 
@@ -121,6 +124,7 @@ def test_a_frame_rate_gives_times(recorded, folder):
     assert "has no row of frame 19" in refusal(*RECORDED, "data.poses.released.points=tracked.csv")
 
 
+@pytest.mark.slow
 def test_copies_of_pictures_are_no_motion(recorded, folder):
     pictures = folder / "pictures" / "released"
     for number in range(1, 24):

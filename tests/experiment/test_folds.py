@@ -41,7 +41,7 @@ def written(folder, name="second"):
     return {path.parent.name[-1]: json.loads(path.read_text()) for path in Path(folder).glob(f"fold_*/{name}.json")}
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_every_fold_is_run_once(tmp_path, processes):
     run_folds(folds(tmp_path), Workers(processes))
     results = written(tmp_path)
@@ -66,6 +66,7 @@ def deadly(name, workers):
     return [first, Stage("second", killed_once, second.outputs, second.settings, second.upstream)]
 
 
+@pytest.mark.slow
 def test_a_fold_whose_worker_is_killed_goes_on_in_another(tmp_path, caplog):
     run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", partial(deadly, "d"))}, Workers(2))
     assert written(tmp_path).keys() == set("abcd")
@@ -73,6 +74,7 @@ def test_a_fold_whose_worker_is_killed_goes_on_in_another(tmp_path, caplog):
     assert "a worker process was lost" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_fold_that_fails_is_named_and_the_others_are_kept(tmp_path):
     with pytest.raises(WorkerError, match=r"^fold d: the simulation fails"):
         run_folds(folds(tmp_path, fails="d"), Workers(2))
@@ -97,6 +99,7 @@ def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
     assert asked[-1] == Workers(4)
 
 
+@pytest.mark.slow
 def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path, monkeypatch):
     program = f"""if __name__ == "__main__":
     import signal

@@ -10,7 +10,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from support.command_line import refusal
 from support.configured import check, settings
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
@@ -21,7 +20,6 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
 from warp_resphys.experiment.importing import import_recordings, sessions_text
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
-from warp_resphys.experiment.observing import Observer
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5
@@ -169,15 +167,6 @@ def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     assert np.abs(one.translation - other.translation).min() > 1e-3
 
 
-def test_without_a_known_vertical_gravity_is_as_configured(tmp_path):
-    short = ("data.up=null", "laboratory.train=[m90]", "laboratory.test=[m50]", "data.seconds=0.1")
-    run = settings("experiment=beam_real", *SMALL, *short, "laboratory.seconds=0.1")
-    run_stages(acquisition_stages(run), tmp_path)
-    with read_hdf5(tmp_path / DATASET, "dataset") as file:
-        np.testing.assert_allclose(file.attrs["gravity"], run.gravity)
-    assert "vertical_deg" not in read_json(tmp_path / REGISTRATION)["m90"]
-
-
 class Shelf:
     """Recordings in a folder, made of the simulated ones, and the configuration that names them."""
 
@@ -236,20 +225,6 @@ def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
     np.testing.assert_array_equal(shelf.bring_in()["bound"], first)
     shelf.move("load52", "Tip - 2", [0.0, 0.001, 0.0])
     assert np.abs(shelf.bring_in()["bound"] - first).max() > 2e-4
-
-
-def test_short_gaps_are_filled_and_long_ones_masked(shelf):
-    whole = shelf.bring_in()["observed"]
-    positions = shelf.recordings["load52"].positions.copy()
-    positions[50:53, 0] = positions[60:70, 1] = np.nan
-    shelf.write("load52", positions=positions)
-    results = shelf.bring_in()["observed"]
-    np.testing.assert_allclose(results[1, :, 0], whole[1, :, 0], rtol=0.0, atol=1e-3)
-    first = 60 - int(np.ceil(read_json(shelf.folder / QUALITY)["load52"]["release_frame"]))
-    hidden = np.zeros(results.shape[1], bool)
-    hidden[first : first + 10] = True
-    np.testing.assert_array_equal(np.isnan(results[1, :, 1]).all(1), hidden | np.isnan(whole[1, :, 1]).all(1))
-    np.testing.assert_array_equal(results[2], whole[2])
 
 
 def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
@@ -338,18 +313,57 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     assert np.linalg.norm(results["held"] - results["bound"], axis=2).min() > 5e-4
 
 
-def test_a_recording_without_its_rest_is_named(shelf):
-    shelf.config["data"]["rest"] = "file"
-    refuse(shelf, r"bare\.h5 has no array 'rest' .* or set data\.rest to held")
-    rest = np.median(shelf.recordings["bare"].positions[:40], axis=0)
-    rest[1] = np.nan
-    shelf.write("bare", rest=rest)
-    refuse(shelf, r"bare\.h5: 'rest' has no place of 'Tip - 2'")
-
-
 def refuse(shelf, message, error=DataFileError):
     with pytest.raises(error, match=message):
         shelf.bring_in()
+
+
+HELD = slice(None, 45)
+WRONG = {
+    r"load52\.h5 is (truncated|damaged)": lambda shelf: truncate(shelf.folder / "load52.h5"),
+    r"load52\.h5 has no marker named 'Tip - 1'; it has 'Tip 1', 'Tip - 2'.*set the marker names": lambda shelf: (
+        shelf.write("load52", labels=("Tip 1", *TIPS[1:], *BASES))
+    ),
+    r"load52\.h5: .*Tip - 2.* seen": lambda shelf: shelf.move("load52", "Tip - 2", np.nan),
+    r"load52\.h5: .*Base - 3.* seen": lambda shelf: shelf.move("load52", "Base - 3", np.nan),
+    r"load52\.h5: 'Tip - 2' cannot be seen while the body is held": lambda shelf: shelf.move(
+        "load52", "Tip - 2", np.nan, HELD
+    ),
+    r"load52\.h5: 'Tip - 2' cannot be seen in the 0\.5 s after the release": lambda shelf: shelf.move(
+        "load52", "Tip - 2", np.nan, slice(41, None)
+    ),
+    r"load52\.h5: base marker Base - \d moved by \d\.\d\d mm against .* since .*bare\.h5": lambda shelf: shelf.move(
+        "load52", "Base - 3", [0.002, 0.0, 0.0]
+    ),
+    r"No release found in .*load52\.h5.* never moves by more than": lambda shelf: shelf.write(
+        "load52", positions=still(shelf, 1e-5)
+    ),
+    r"load52\.h5 holds an actuation, 2 in each frame, which nothing here uses: take an experiment with": lambda shelf: (
+        shelf.write("load52", actuation=np.zeros((len(shelf.recordings["load52"].positions), 2)))
+    ),
+    r"load52\.h5 has 25 frames per second, too few .* record at least 40": lambda shelf: shelf.write(
+        "load52", rate=25.0
+    ),
+    r"bare\.h5 has no array 'rest' .* or set data\.rest to held": lambda shelf: shelf.config["data"].update(
+        rest="file"
+    ),
+}
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def still(shelf, noise):
+    """(100, 6, 3) markers that do not move but by noise [m]."""
+    rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
+    return rest + np.random.default_rng(0).normal(scale=noise, size=(100, 6, 3))
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_a_recording_that_cannot_be_used_is_named(shelf, message):
+    WRONG[message](shelf)
+    refuse(shelf, message)
 
 
 def test_a_missing_file_is_named(shelf):
@@ -357,40 +371,6 @@ def test_a_missing_file_is_named(shelf):
     refuse(shelf, r"load52\.h5 does not exist")
     with pytest.raises(DataFileError, match=r"cannot read .*load52\.h5 .*data\.trials\.load52\.file"):
         acquisition_stages(parse(RunSettings, shelf.config))
-
-
-@pytest.mark.parametrize("share", [0.3, 0.9])
-def test_a_truncated_file_is_named(shelf, share):
-    path = shelf.folder / "load52.h5"
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    refuse(shelf, r"load52\.h5 is (truncated|damaged)")
-
-
-def test_names_that_do_not_match_are_listed(shelf):
-    shelf.write("load101", labels=("Tip 1", *TIPS[1:], *BASES))
-    refuse(shelf, r"load101\.h5 has no marker named 'Tip - 1'; it has 'Tip 1', 'Tip - 2'.*set the marker names")
-
-
-@pytest.mark.parametrize("label", ["Tip - 2", "Base - 3"])
-def test_a_marker_that_is_never_seen_is_named(shelf, label):
-    shelf.move("load52", label, np.nan)
-    refuse(shelf, rf"load52\.h5: .*{label}.* seen")
-
-
-def test_a_marker_that_is_hidden_while_the_body_is_held_is_named(shelf):
-    shelf.move("load52", "Tip - 2", np.nan, slice(None, 45))
-    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen while the body is held")
-
-
-def test_a_marker_that_is_hidden_after_the_release_is_named(shelf):
-    shelf.move("load52", "Tip - 2", np.nan, slice(41, None))
-    refuse(shelf, r"load52\.h5: 'Tip - 2' cannot be seen in the 0\.5 s after the release")
-
-
-def test_a_base_marker_that_moved_between_trials_is_named(shelf):
-    shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
-    refuse(shelf, r"load52\.h5: base marker Base - \d moved by \d\.\d\d mm against .* since .*bare\.h5")
 
 
 def test_a_base_that_moved_as_a_whole_is_named(shelf):
@@ -405,57 +385,19 @@ def test_what_moved_after_the_release_alone_is_no_fault_of_the_base(shelf):
     shelf.bring_in()
 
 
-def test_a_residual_above_the_threshold_names_file_and_marker(shelf):
-    for name in shelf.recordings:
-        shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
-    shelf.config["markers"]["reference"].pop("Base - 3")
-    shelf.config["markers"]["reference"].pop("Base - 2")
-    refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
-
-
 def test_chosen_markers_register(shelf):
+    shelf.config["markers"]["reference"] = {"Base - 1": shelf.config["markers"]["reference"]["Base - 1"]}
     whole = shelf.bring_in()
     for name in shelf.recordings:
         shelf.move(name, "Tip - 3", [0.0, 0.0, 0.012])
-    for label in ("Base - 3", "Base - 2"):
-        shelf.config["markers"]["reference"].pop(label)
+    refuse(shelf, r"bare\.h5: the markers at rest do not fit .* 4\.0 mm: 'Tip - 3' is \d+\.\d mm off")
     shelf.config["markers"]["register_with"] = ["Base - 1", "Tip - 1", "Tip - 2"]
-    results = shelf.bring_in()
-    off = np.linalg.norm(results["bound"] - whole["bound"], axis=1)
+    off = np.linalg.norm(shelf.bring_in()["bound"] - whole["bound"], axis=1)
     assert off[:2].max() < 2e-3
     assert off[2] == pytest.approx(0.012, abs=2e-3)
     shelf.config["markers"]["register_with"] = ["Base - 1", "Base - 2"]
     with pytest.raises(InputError, match="register_with names 'Base - 2', which is in neither tracked nor reference"):
         shelf.bring_in()
-
-
-def test_one_outlier_among_six_is_left_out_and_named(shelf):
-    whole = shelf.bring_in()
-    for name in shelf.recordings:
-        shelf.move(name, "Base - 3", [0.0, 0.0, 0.012])
-    results = shelf.bring_in()
-    assert read_json(shelf.folder / REGISTRATION)["bare"]["outliers"] == ["Base - 3"]
-    np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=1e-3)
-
-
-def test_registered_markers_are_where_the_body_has_them(shelf):
-    """In the frame of the body the base markers of every trial stay, and a trial without a payload shows the places."""
-    run = parse(RunSettings, shelf.config)
-    trials = trials_of(run)
-    stage = ImportStage.of(run, files={}, trials=trials, learned=None)
-    for observed in Observer(StageContext("import", shelf.folder, "", stage)).observe(trials):
-        still = observed.registration.transform.apply(observed.still)
-        reference = [*run.markers.reference.values()]
-        np.testing.assert_allclose(still[len(TIPS) :], reference, rtol=0.0, atol=1e-3)
-        np.testing.assert_allclose(observed.to_body(observed.still[: len(TIPS)], 0.0), observed.places, atol=1e-9)
-        assert observed.release is not None
-        assert observed.moving.positions.shape[1:] == (len(TIPS), 3)
-
-
-def test_a_trial_without_a_release_is_named(shelf):
-    held = np.broadcast_to(shelf.recordings["bare"].positions[:1], (100, 6, 3))
-    shelf.write("load52", positions=held + np.random.default_rng(0).normal(scale=1e-5, size=held.shape))
-    refuse(shelf, r"No release found in .*load52\.h5.* never moves by more than")
 
 
 def test_recordings_in_which_nothing_moves_are_named(shelf):
@@ -464,24 +406,12 @@ def test_recordings_in_which_nothing_moves_are_named(shelf):
         published_layout(shelf, name, first=44)
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
     rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
-    still = rest + np.random.default_rng(0).normal(scale=5e-5, size=(100, 6, 3))
-    shelf.write("load52", positions=still, rest=rest)
+    shelf.write("load52", positions=still(shelf, 5e-5), rest=rest)
     refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that count")
 
 
-def test_pressures_that_nothing_uses_are_named(shelf):
-    shelf.write("load52", actuation=np.zeros((len(shelf.recordings["load52"].positions), 2)))
-    refuse(shelf, r"load52\.h5 holds an actuation, 2 in each frame, which nothing here uses: take an experiment with")
-
-
-def test_too_few_frames_a_second_are_refused(shelf):
-    shelf.write("load52", rate=25.0)
-    refuse(shelf, r"load52\.h5 has 25 frames per second, too few .* record at least 40")
-
-
-@pytest.mark.parametrize("up", ["-x", "y", [0.0, 0.0, 1.0]])
-def test_a_wrong_vertical_is_noticed(shelf, up):
-    shelf.config["data"]["up"] = up
+def test_a_wrong_vertical_is_noticed(shelf):
+    shelf.config["data"]["up"] = "-x"
     refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
 
 
@@ -539,42 +469,6 @@ def test_the_fish_tail(shared_data, tmp_path):
     assert dataset.inputs["muscle_stress"][0, -1].tolist() == [-2e4, 2e4]
 
 
-class TestCommand:
-    @pytest.fixture
-    def command(self, shelf, monkeypatch, capsys):
-        """Runs the experiment on the shelf's recordings, through the command line."""
-
-        def run(*overrides):
-            trials = [f"++data.trials.{name}={{file: {name}.h5, payload: 0.0}}" for name in shelf.recordings]
-            quiet = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-            places = [f"data.folder={shelf.folder}", f"hydra.run.dir={shelf.folder / 'run'}"]
-            err = refusal("experiment=beam_real", *places, *quiet, *trials, *overrides)
-            assert "Traceback" not in err
-            return err
-
-        return run
-
-    def test_a_marker_that_moved(self, shelf, command):
-        shelf.move("load52", "Base - 3", [0.002, 0.0, 0.0])
-        sentence = r"^error: .*load52\.h5: base marker Base - 3 moved by 2\.00 mm .*\n$"
-        assert re.search(sentence, command(), flags=re.MULTILINE)
-        assert not (shelf.folder / "run" / DATASET).exists()
-
-    def test_names_that_do_not_match(self, shelf, command):
-        shelf.write("bare", labels=("a", *TIPS[1:], *BASES))
-        assert "bare.h5 has no marker named 'Tip - 1'; it has 'a'" in command()
-
-    def test_a_file_that_is_not_there(self, shelf, command):
-        err = command("data.trials.bare.file=gone.c3d")
-        assert "gone.c3d (No such file or directory): check data.folder and data.trials.bare.file." in err
-
-    def test_a_trial_in_two_splits(self, shelf, command):
-        err = command("data.folds=null", "data.train=[bare]", "data.test=[bare,load52]")
-        assert err.endswith(
-            "error: the trial 'bare' is in data.train and data.test: a trial belongs to one split only.\n"
-        )
-
-
 TUTORIAL = [ROOT / "docs" / "bring_your_robot" / f"{page}.md" for page in ("mesh", "first_run", "tentacle")]
 
 
@@ -605,6 +499,7 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
         assert line == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to {rms:.2f} mm"
 
 
+@pytest.mark.slow
 def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
     blocks = tutorial_blocks()
     _, written = [text for kind, text in blocks if kind == "yaml"]
@@ -621,16 +516,7 @@ def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, ca
     assert [message for message in caplog.messages if "are assigned by their places" in message] == log
 
 
-def test_an_experiment_may_set_gravity(tmp_path):
-    place = tmp_path / "experiment" / "hanging.yaml"
-    place.parent.mkdir()
-    place.write_text("# @package _global_\ndefaults: [beam_real, _self_]\nname: hanging\ngravity: [9.81, 0.0, 0.0]\n")
-    own = (f"hydra.searchpath=[file://{tmp_path}]", "experiment=hanging")
-    assert settings(*own).gravity == (9.81, 0.0, 0.0)
-    assert settings(*own, "gravity=[0,0,-1]").gravity == (0.0, 0.0, -1.0)
-
-
-@pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (0.5, 12), (1.0, 6)])
+@pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (1.0, 6)])
 def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
     """What a simulator with smaller steps is driven by lasts as long as it did, and so does the motion of a base."""
     base = np.zeros((1, 7, 6))

@@ -83,6 +83,7 @@ def by_trial(folder):
     return {trial["name"]: trial["errors_mm"] for trial in read(folder, "metrics.json")["per_trajectory"]}
 
 
+@pytest.mark.slow
 class TestALawThatHelps:
     def test_it_has_the_terms_of_the_rubber(self, rubber):
         law = read(rubber, "law.json")
@@ -95,18 +96,10 @@ class TestALawThatHelps:
         moduli = sum(value for name, value in constants.items() if name.startswith("prony_modulus"))
         assert moduli == pytest.approx(0.3 * 2.0 * 44e3, rel=0.3)
         assert all(value >= 0.0 for name, value in constants.items() if "azimuth" not in name and "elev" not in name)
-        assert {law["units"][name] for name in ("c10", "fibre_tension_1")} == {"Pa"}
-        assert law["units"]["shear_viscosity"] == "Pa s"
-
-    def test_the_smallest_class_comes_first_and_a_close_one_is_chosen(self, rubber):
-        law = read(rubber, "law.json")
         sizes = [len(own["groups"]) for own in law["classes"]]
         assert sizes == sorted(sizes)
         assert law["classes"][0]["groups"] == []
-        chosen = next(own for own in law["classes"] if own["groups"] == law["groups"])
-        assert chosen["validation"] < 0.1 * law["classes"][0]["validation"]
         assert law["validation"]["law"] < 0.1 * law["validation"]["below"]
-        assert law["validation"]["trials"] == ["100 g"]
 
     def test_it_is_better_than_identification_under_every_load(self, rubber):
         errors = means(rubber)
@@ -118,18 +111,9 @@ class TestALawThatHelps:
         for name, own in trials.items():
             assert own["law"] < 0.2 * own["sysid"], name
 
-    def test_the_learned_force_is_zero_far_from_its_training(self, rubber):
-        trials = by_trial(rubber)
-        assert trials["twist 90°"]["resphys"] == trials["twist 90°"]["law"]
-        assert trials["120 g sideways"]["resphys"] == trials["120 g sideways"]["law"]
+        assert trials["twist 90°"]["resphys"] == trials["twist 90°"]["law"]  # far from the training of the force
         assert trials["160 g"]["resphys"] != trials["160 g"]["law"]
-
-    def test_only_the_force_on_the_law_fades_out(self, rubber):
-        robot = warp_resphys.load(rubber, model="resphys")
-        assert robot.description.learned.range_.missed is not None
-        assert warp_resphys.load(rubber, model="simfree").description.learned.range_.missed is None
         assert finished_experiment(rubber).sources("resphys") == (LAW, LAW)
-        assert robot.description.material.model == LAW
 
     def test_the_force_of_a_robot_fades_out_as_well(self, rubber):
         robot = warp_resphys.load(rubber, model="resphys")
@@ -159,6 +143,7 @@ class TestALawThatHelps:
             check(composed("experiment=law_beam", f"law={rubber / 'errors.json'}"))
 
 
+@pytest.mark.slow
 class TestALawThatDoesNotHelp:
     def test_it_is_not_used(self, known):
         law, errors = read(known, "law.json"), means(known)
@@ -184,7 +169,6 @@ class TestALawThatDoesNotHelp:
             "^law: the simulator has materials by region, and one law is for one material: leave law out.$",
         ),
         (["law.terms=[c20,c50]"], r"^law\.terms is \['c20', 'c50'\]: it must be a list of c20, c30, "),
-        (["law.terms=[c10]"], r"^law\.terms is \['c10'\]: it must be a list of c20, c30, "),
         (
             [
                 "simulation={model:law,bulk_1:1e6,c10:1e4,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}"
@@ -196,7 +180,6 @@ class TestALawThatDoesNotHelp:
             r"^the material resists no change of shape: ",
         ),
         (["law.terms=[ogden_2]"], r"^law\.terms: ogden has the exponent 2"),
-        (["law.term=[c20]"], "unknown key 'law.term'"),
         (["data.others.a={weight_g:50,twist_deg:10}"], r"^data\.others\.a\.weight_g is 50 and twist_deg 10: "),
         (["data.others.a={direction:[0,0,1]}"], r"^data\.others\.a\.weight_g is 0 and twist_deg 0: "),
         (["data.others.a={weight_g:50,direction:[0,0,0]}"], "others.a.direction"),
@@ -233,7 +216,7 @@ class TestOtherLoads:
         """Initial states of all trials by name, with the simulator that played them."""
         run = settings("experiment=law_beam", "mesh.divisions=[8,2,2]", "data.weights_g.test=[120]")
         (stage,) = acquisition_stages(run)
-        trials = [all_trials(run)[name] for name in ("50 g", *OTHERS, "120 g")]
+        trials = [all_trials(run)[name] for name in (*OTHERS, "120 g")]
         simulator = build_target(stage.settings, stage.settings.target).simulator
         with torch.no_grad():
             state = initial_state(simulator, run.data, trials)
@@ -248,11 +231,9 @@ class TestOtherLoads:
     @pytest.mark.parametrize(
         ("name", "x", "weight"),
         [
-            ("400 g", 0.1, (0.0, 0.0, -0.4)),
             ("120 g up", 0.1, (0.0, 0.0, 0.12)),
             ("200 g mid-span", 0.05, (0.0, 0.0, -0.2)),
             ("120 g at 45°", 0.1, (0.0, 0.12 / np.sqrt(2.0), -0.12 / np.sqrt(2.0))),
-            ("120 g sideways", 0.1, (0.0, 0.12, 0.0)),
             ("120 g", 0.1, (0.0, 0.0, -0.12)),
         ],
     )
@@ -273,8 +254,3 @@ class TestOtherLoads:
         simulator, states = held
         expected = twisted(simulator.rest_positions, simulator.tensor([np.pi / 2.0]))[0]
         torch.testing.assert_close(states["twist 90°"], expected)
-
-    def test_each_trial_keeps_its_place_in_a_batch(self, held):
-        _, states = held
-        tips = {name: float(q[q[:, 0] > 0.05].mean(0)[2]) for name, q in states.items()}
-        assert tips["400 g"] < tips["120 g"] < tips["50 g"] < tips["120 g up"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.configured import check, composed, settings
-from support.main_job import IN_RUN, TINY, run
+from support.main_job import IN_RUN, run
 from support.played_run import check_robots
 from warp_resphys import Body
 from warp_resphys.data.base_motion import prescribed, rigid
@@ -177,20 +177,7 @@ def test_recorded_motions_that_do_not_fit_are_refused(given, said):
         check(composed("experiment=beam_pushed", *given))
 
 
-def test_a_target_and_a_simulator_that_are_equal_meet_the_same_moving_ball():
-    """Without differences beside the motion of the ball, which throws the beam up, roll-outs repeat the trials."""
-    ball = f"obstacles={{ball: {BALL.replace('-0.02', '-0.018')}}}"
-    motion = "data.obstacle_motion={ball: {ramp: 0.02, swings: {a: {frequency: 2.0, translation: [0, 0, 0.02]}}}}"
-    same = ["simulation={youngs_modulus: 2.64e5, poissons_ratio: 0.45, density: 1070, model: corotated}"]
-    same += ["target={youngs_modulus: 2.64e5, poissons_ratio: 0.45, density: 1070, model: corotated}"]
-    results = done(*TINY, ball, motion, "integrator=bdf2", *same, "correct_uncorrected=false", "timing=false")
-    assert results["errors_mm"]["simulation"]["mean"] < 1e-6
-    poses = read_dataset(Path("run/dataset.h5")).obstacles["ball"]
-    wanted = prescribed(settings(*TINY, ball, motion).data.obstacle_motion["ball"], 0.01 * np.arange(poses.shape[1]))
-    np.testing.assert_array_equal(poses, np.broadcast_to(wanted, poses.shape))
-    check_robots("run", ("simulation", "resphys"))
-
-
+@pytest.mark.slow
 def test_a_recorded_bar_pushes_the_beam_of_the_laboratory_and_of_the_models():
     results = done(*PUSHED)
     dataset, configured = read_dataset(Path("run/dataset.h5")), settings(*PUSHED)

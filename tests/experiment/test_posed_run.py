@@ -46,7 +46,6 @@ TINY = [
     ),  # weak poses do not show them
     *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
 ]
-QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
 
 
 def trials(poses):
@@ -119,14 +118,9 @@ def test_poses_are_imported_from_bags(poses, tmp_path, monkeypatch):
     dataset = read_dataset(Path("run/dataset.h5"))
     rows = [dataset.names.index(name) for name in POSES]
     np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=1e-5)
-    code, err = run("inspect", "weak", *QUIET)
-    assert code == 2
-    assert "/M1 (geometry_msgs/msg/PointStamped)" in err
-    code, err = run("inspect", "weak", "recording.bag={markers: {tip: /Tip, middle: /M2}}", *QUIET)
-    assert (code, err[-300:] if code else "") == (0, "")
-    assert json.loads(next(Path().rglob("quality.json")).read_text())["rate_hz"] == 200.0
 
 
+@pytest.mark.slow
 def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recorded = settings(*TINY, *TRIALS)
@@ -142,6 +136,7 @@ def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     check_robots("run")
 
 
+@pytest.mark.slow
 def test_poses_identify_where_tendons_end(tmp_path, monkeypatch):
     """Outwards at the end alone, which strong poses tell from Young's modulus; their priors shrink them a little."""
     monkeypatch.chdir(tmp_path)
@@ -177,6 +172,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
     check_robots("run")
 
 
+@pytest.mark.slow
 def test_a_law_is_identified_from_poses(poses, tmp_path):
     write(tmp_path / "recordings", poses)
     law = "law={terms:[c01],branches:0,families:0,max_evaluations:3}"
@@ -202,6 +198,7 @@ def test_parameters_of_sessions_need_sessions():
         )
 
 
+@pytest.mark.slow
 def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     """Between two sessions a marker moved by 4 mm; one tension is 7 % larger than its log says."""
     sessions = {"weak": "monday", "strong": "monday", "other": "friday", "second": "friday", "both": "friday"}
@@ -278,12 +275,8 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["data.axes=[x,z,y]"], "data.axes"),
         (["data.axes=[x,x,y]"], "data.axes is .*twice"),
-        (["mesh_check=1"], "mesh_check is 1: .* above 1"),
         (["data.axes=null"], "markers.reference names 1: static poses need 3 .*, or data.axes and one"),
-        (["data.table.columns=[1,2]"], "data.table.columns is"),
-        (["data.trials.weak.inputs=[a]"], "data.trials.weak.inputs is"),
         (
             ["identify.parameters.tendon_offset_1_first.upper=0.03"],
             "tendon_offset_1_first.upper: guide 1 .* outside of",
@@ -292,8 +285,6 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
             ["+identify.parameters.tendon_offset_1={lower: -1e-3, upper: 1e-3}"],
             "names tendon_offset_1 and its parts, tendon_offset_1_first, tendon_offset_1_second: choose one",
         ),
-        (["markers.labels=guessed"], "markers.labels is 'guessed': .* recorded, assigned"),
-        (["markers.reference={}", "~markers.reference.Base"], "markers.reference"),
     ],
 )
 def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, poses, monkeypatch):
@@ -303,6 +294,7 @@ def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path
         check(composed(*TINY, *TRIALS, *overrides))
 
 
+@pytest.mark.slow
 def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(poses, tmp_path):
     """Without validation poses, and with markers that may sit 3.4 mm elsewhere in the session of the test pose."""
     write(tmp_path / "recordings", poses)

@@ -37,40 +37,25 @@ WHOLE = {"lower": 0.0, "upper": 1.0}
     [
         ("data/up", "up", "data.up is 'up': it must be one of x, -x"),
         ("data/up", [0.0, 0.0, 0.0], "data.up is"),
-        ("data/base_motion", "video", "data.base_motion is 'video'"),
         ("data/base_motion", {"about": [0.0, 0.0, 0.0]}, "data.base_motion.file and swings: give one of them"),
         ("data/base_motion", {"swings": {}}, "data.base_motion.swings is empty"),
-        (
-            "data/base_motion",
-            {"swings": {"a": {"translation": [0, 0, 1]}}},
-            "data.base_motion.swings.a.frequency is mis",
-        ),
-        ("data/base_motion", {"swings": {"a": {"frequency": 80.0}}}, "data.base_motion.swings.a.frequency is 80"),
         ("data/payload_at", {"x": 0.07003}, "no vertex lies within"),
         ("data/payload_at", {"x": 0.0}, "data.payload_at selects fixed vertices only"),
-        ("data/payload_at", {"w": 0.0}, "unknown key 'data.payload_at.w'"),
         ("data/payload_at", None, "a trial has a payload, but data.payload_at is not set"),
         ("data/trials", {}, "recordings is not a folder: set data.folder"),
         ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.*a/b cannot name a trial"),
         ("data/trials", {"a": {"payload": 0.0}}, "data.trials.a.file is missing"),
-        ("data/trials", {"a": 3}, "data.trials.a is 3"),
-        ("data/trials", {"a": TRIALS["a"] | {"colour": 1}}, "unknown key 'data.trials.a.colour'"),
         ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
         ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs at least two trials"),
         ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
         ("data/seconds", None, "data.seconds is not set"),
         ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
-        ("markers/bind_to", {"x": 0.07003}, "no vertex lies within"),
-        ("markers/tracked", {}, "markers.tracked is empty"),
         ("markers/tracked/Tip - 1", [0.1, 0.0], "markers.tracked.Tip - 1 is"),
         ("markers/reference/Tip - 1", [0.1, 0.0, 0.0], "markers.tracked and markers.reference both have 'Tip - 1'"),
         ("markers", None, "markers is null, but data.kind is recorded"),
         ("published/simulation/colour", 1.0, "published.simulation: corotated has no constant 'colour'"),
-        ("published/simulation/density", [1e3], "published.simulation.density is"),
         ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
         ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
-        ("release/colour", 1, "unknown key 'release.colour'"),
-        ("identify/parameters", {}, "identify.parameters is empty"),
         ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
         ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),
         ("identify/parameters/density", {"lower": 2.0, "upper": 1.0}, "identify.parameters.density.lower is 2"),
@@ -91,26 +76,14 @@ def test_configuration_of_recordings_is_checked(key, value, offending):
         ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
         ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
         ("laboratory/test", [], "laboratory.test is empty: add at least one of laboratory.trials"),
-        ("laboratory/test", None, "laboratory.test is missing"),
         ("laboratory/test", ["m10", "m99"], "laboratory.test names the trial 'm99'"),
         ("laboratory/test", ["m10", "m20"], "the trial 'm20' is in laboratory.train and laboratory.test"),
         ("laboratory/test", ["m10", "m10"], "the trial 'm10' is twice in laboratory.test"),
-        ("laboratory/mesh/kind", "sphere", "laboratory.mesh.kind is 'sphere'"),
     ],
 )
 def test_configuration_of_a_simulated_laboratory_is_checked(key, value, offending):
     with pytest.raises(ResphysError, match=offending):
         check(changed(composed("experiment=beam_real"), key, value))
-
-
-GROUPS = ("physics", "solver", "reconstruction", "network", "trainer", "budget")
-OPTIONS = [(group, path.stem) for group in GROUPS for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
-
-
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_goes_with_recordings(group, option):
-    more = ["trainer=sequences"] if option == "recurrent" else []
-    check_run(settings("experiment=beam_real", f"{group}={option}", *more))
 
 
 def test_a_trial_without_a_payload_carries_none(tmp_path):
@@ -197,21 +170,17 @@ def test_the_quick_budget_wins_over_the_experiment_and_the_command_line_over_bot
     assert (full.in_the_loop.epochs, full.data.seconds) == (10, 1.4)
 
 
-@pytest.mark.parametrize("experiment", ["beam_real", "beam_real_repeated", "beam_synthetic"])
-@pytest.mark.parametrize(
-    ("group", "option"), [("network", "published"), ("network", "reduced"), ("trainer", "published")]
-)
-def test_a_network_or_trainer_on_the_command_line_is_taken_whole(experiment, group, option):
+@pytest.mark.parametrize(("group", "option"), [("network", "published"), ("trainer", "published")])
+def test_a_network_or_trainer_on_the_command_line_is_taken_whole(group, option):
     wanted = getattr(settings(f"{group}={option}"), group)
-    run = settings(f"experiment={experiment}", f"{group}={option}")
+    run = settings("experiment=beam_synthetic", f"{group}={option}")
     assert getattr(run, group) == getattr(run.simfree, group) == wanted
     other = "network" if group == "trainer" else "trainer"
-    assert getattr(run, other) == getattr(settings(f"experiment={experiment}"), other)
+    assert getattr(run, other) == getattr(settings("experiment=beam_synthetic"), other)
 
 
 @pytest.mark.parametrize(
-    ("experiment", "modes", "layers"),
-    [("beam_real", (2, 2, 2), 0), ("beam_real_repeated", (3, 3, 6), 0), ("beam_synthetic", (3, 3, 4), 2)],
+    ("experiment", "modes", "layers"), [("beam_real", (2, 2, 2), 0), ("beam_synthetic", (3, 3, 4), 2)]
 )
 def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes, layers):
     run, default = settings(f"experiment={experiment}"), settings()
@@ -231,7 +200,7 @@ def test_the_identification_of_e_and_nu_alone_can_be_left_out():
     assert list(run.identify.parameters) == ["youngs_modulus", "stiffness_damping"]
 
 
-@pytest.mark.parametrize("experiment", ["beam_oscillation", "beam_real", "sopra"])
+@pytest.mark.parametrize("experiment", ["beam_oscillation", "sopra"])
 def test_a_material_may_leave_out_its_model_and_its_constants(experiment):
     config = composed(f"experiment={experiment}")
     for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):

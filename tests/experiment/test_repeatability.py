@@ -73,6 +73,7 @@ def places(tmp_path_factory):
     return here, there
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", SMALL)
 def test_the_same_seed_gives_the_same_numbers(places, experiment):
     first, second = (measured(folder / experiment) for folder in places)

@@ -41,6 +41,7 @@ def results(folder):
     return json.loads((folder / "shapes.json").read_text())
 
 
+@pytest.mark.slow
 def test_an_exact_identification_is_exact_on_other_bodies(run):
     for name in ("thin", "twisted", "muscle"):
         found = results(run)[name]
@@ -50,6 +51,7 @@ def test_an_exact_identification_is_exact_on_other_bodies(run):
         assert "law" not in found["errors_mm"]
 
 
+@pytest.mark.slow
 def test_a_target_on_another_mesh_leaves_the_error_of_the_mesh(run):
     found = results(run)
     assert found["finer"]["vertices"] == found["thin"]["vertices"]
@@ -57,11 +59,13 @@ def test_a_target_on_another_mesh_leaves_the_error_of_the_mesh(run):
     assert found["finer"]["moved_mm"] == pytest.approx(found["thin"]["moved_mm"], rel=0.3)
 
 
+@pytest.mark.slow
 def test_the_metrics_have_the_errors(run):
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["shapes"] == results(run)
 
 
+@pytest.mark.slow
 def test_an_interrupted_stage_goes_on(run, monkeypatch):
     before, tried = results(run), []
     (run / "stages" / "shapes.json").unlink()

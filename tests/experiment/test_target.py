@@ -157,8 +157,6 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
     ("overrides", "message"),
     [
         (["target.time_step=0.004"], "time_step is 0.01 s and target.time_step 0.004 s: the first must be a multiple"),
-        (["target.time_step=0.02"], "target.time_step 0.02 s: the first must be a multiple of the second"),
-        (["laboratory.tme_step=0.005", "experiment=beam_real"], "unknown key 'laboratory.tme_step', did you mean"),
         (["target.tme_step=0.005"], r"target\.material: .*'tme_step'"),
         (
             ["target.fibres={angles:[8.0],stiffness:1e4}"],
@@ -169,7 +167,6 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
             ["target.mesh={kind:box_hexahedra,size:[0.08,0.03,0.03],divisions:[8,3,3]}", "data.load={x:0.08}"],
             r"target\.mesh: the simulator's vertex at \(0\.1, .*\) m lies outside of this mesh: both must be",
         ),
-        (["target.fixed={x:0.001}"], r"target: no vertex lies within"),
         (
             ["target.mesh={kind:box_hexahedra,size:[0.11,0.03,0.03],divisions:[8,3,3]}"],
             r"data\.load: no vertex lies within 1e-09 m of x = 0\.1 m: the mesh reaches .*",
@@ -178,7 +175,6 @@ def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
             ["target.regions={tip:{x:[0.05,0.1]}}", "target.rigid={tip:{}}", "target.integrator=midpoint"],
             r"target\.integrator is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2",
         ),
-        (["target.mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[9000,9000,9000]}"], "target.mesh.divisions"),
         (
             ["target.muscles={bundles:{a:{direction:[1,0,0]}},stiffness:0.0}"],
             r"target\.muscles\.stiffness is 0, but not",

@@ -257,7 +257,7 @@ def check_of_the_mesh():
     moved = 1e3 * float((shown[1] - shown[0]).norm(dim=1).mean())
     assert moved > 0.1
     assert checked["moved_mm"] == pytest.approx(moved, rel=0.05)
-    assert "Error of the mesh: on" in Path("run/report.html").read_text()
+    assert "cells, with the same constants, the markers of" in Path("run/report.html").read_text()
 
 
 def test_a_finer_mesh_has_so_many_times_as_many_cells():

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from support.command_line import outcome, refusal
+from support.configured import settings
 from support.main_job import IN_RUN
+from warp_resphys.experiment.pictures import picture_stages
+from warp_resphys.io.stages import run_stages
 from warp_resphys.pictures.reading import read_tracked
 from warp_resphys.settings.pictures import SimulatedCamera
 
@@ -63,10 +66,19 @@ def test_stiffness_density_and_damping_come_back(played):
     assert law["constants"]["stiffness_damping"] == identified["stiffness_damping"]
 
 
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Folder of the pictures of a simulated camera, and of tracked points."""
+    folder = tmp_path_factory.mktemp("camera")
+    played = settings(*PLAYED, "data.poses.released.points=tracked.csv")
+    run_stages(picture_stages(played, {})[:1], folder)
+    return folder / "recordings"
+
+
 @pytest.fixture
-def recorded(played, folder):
-    """The pictures of that run as a folder of their own, with a function that rewrites camera.json of the motion."""
-    shutil.copytree(played[0] / "recordings", folder / "pictures")
+def recorded(pictures, folder):
+    """A copy of these pictures, with a function that rewrites camera.json of the motion."""
+    shutil.copytree(pictures, folder / "pictures")
     path = folder / "pictures" / "released" / "camera.json"
     scene = json.loads(path.read_text())
 
@@ -82,7 +94,6 @@ def recorded(played, folder):
 RECORDED = [*PLAYED, "data.folder=pictures", "data.simulated=null", IN_RUN]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -108,7 +119,6 @@ def test_a_release_after_the_simulated_pictures_is_named_before_any_work(folder)
         camera.check_release("poses.released", 20.7 / 60.0)  # 21 is not, with the delay
 
 
-@pytest.mark.slow
 def test_a_frame_rate_gives_times(recorded, folder):
     """With which nothing is refused before the file of the tracked points, which lacks a frame."""
 
@@ -124,7 +134,6 @@ def test_a_frame_rate_gives_times(recorded, folder):
     assert "has no row of frame 19" in refusal(*RECORDED, "data.poses.released.points=tracked.csv")
 
 
-@pytest.mark.slow
 def test_copies_of_pictures_are_no_motion(recorded, folder):
     pictures = folder / "pictures" / "released"
     for number in range(1, 24):

@@ -116,19 +116,6 @@ def test_a_laboratory_binds_its_markers_as_they_are_configured():
     assert made[2].settings.binding.patch == 0.05
 
 
-def test_frames_end_with_what_counts(laboratory):
-    folder, run = laboratory
-    with read_hdf5(folder / DATASET, "dataset") as file:
-        times, markers = file["times"][()], file["observed"][()]
-    assert (np.diff(times, axis=1) >= 0.0).all()
-    assert (times[:, 0] >= 0.0).all()
-    assert (times[:, 0] < 1.0 / RATE).all()
-    assert times.max() <= run.data.seconds
-    assert times[:, -1].min() > run.data.seconds - 1.0 / RATE
-    ended = np.concatenate([np.zeros((len(times), 1), bool), np.diff(times, axis=1) == 0.0], axis=1)
-    np.testing.assert_array_equal(np.isnan(markers).all((2, 3)), ended)
-
-
 def test_gravity_and_release_are_recovered(laboratory):
     folder, run = laboratory
     truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
@@ -143,16 +130,6 @@ def test_gravity_and_release_are_recovered(laboratory):
     for name, at in truth["released_s"].items():
         assert quality[name]["release_frame"] == pytest.approx(RATE * at, abs=0.3)
         assert 40.0 < RATE * at < 41.0
-
-
-def test_the_recordings_are_in_a_frame_of_their_own(laboratory):
-    folder, run = laboratory
-    recording = read_recording(folder / "recordings/m0.h5")
-    assert recording.labels == (*TIPS, *BASES)
-    nominal = np.array([*run.markers.tracked.values(), *run.markers.reference.values()])
-    assert np.linalg.norm(recording.positions[0] - nominal, axis=1).min() > 0.05
-    sag = recording.positions[-1, :3].mean(0) - recording.positions[0, :3].mean(0)
-    assert -sag[0] > 0.99 * np.linalg.norm(sag) - 2e-3  # up is x
 
 
 def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
@@ -380,11 +357,6 @@ def test_a_base_that_moved_as_a_whole_is_named(shelf):
     shelf.bring_in()
 
 
-def test_what_moved_after_the_release_alone_is_no_fault_of_the_base(shelf):
-    shelf.move("load52", "Base - 3", [0.0, 0.0, 0.002], slice(45, None))
-    shelf.bring_in()
-
-
 def test_chosen_markers_register(shelf):
     shelf.config["markers"]["reference"] = {"Base - 1": shelf.config["markers"]["reference"]["Base - 1"]}
     whole = shelf.bring_in()
@@ -454,21 +426,6 @@ def test_the_three_beams(shared_data, tmp_path):
     assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
 
 
-def test_the_fish_tail(shared_data, tmp_path):
-    """A table without a header, with semicolons, in millimetres; a step that nobody has recorded."""
-    run = settings("experiment=fish_tail", f"data.folder={shared_data / 'fish_tail'}")
-    check_run(run)
-    run_stages(acquisition_stages(run), tmp_path)
-    dataset = read_dataset(tmp_path / DATASET)
-    (tip,) = dataset.observed.transpose(2, 0, 1, 3)
-    travel = np.linalg.norm(tip[0] - tip[0, 0], axis=1)
-    assert travel.max() == pytest.approx(0.0192, abs=2e-4)
-    assert (tip[0, -1] - tip[0, 0])[0] > 0.99 * 0.0184  # towards +x
-    np.testing.assert_allclose(tip[0, 0], [0.0, -0.0142, 0.0522], atol=2e-3)
-    assert dataset.inputs["muscle_stress"][0, :2].tolist() == [[0.0, 0.0], [-2e4, 2e4]]  # from 0.01 s on
-    assert dataset.inputs["muscle_stress"][0, -1].tolist() == [-2e4, 2e4]
-
-
 TUTORIAL = [ROOT / "docs" / "bring_your_robot" / f"{page}.md" for page in ("mesh", "first_run", "tentacle")]
 
 
@@ -497,23 +454,6 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     for line, (name, trial) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
         assert line == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to {rms:.2f} mm"
-
-
-@pytest.mark.slow
-def test_the_second_robot_of_the_tutorial(shared_data, tmp_path, monkeypatch, caplog):
-    blocks = tutorial_blocks()
-    _, written = [text for kind, text in blocks if kind == "yaml"]
-    _, log = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "poses").symlink_to(shared_data / "tentacle")
-    place = tmp_path / "configs" / "experiment" / "my_tentacle.yaml"
-    place.parent.mkdir(parents=True)
-    place.write_text(written)
-    run = settings(f"hydra.searchpath=[file://{tmp_path}/configs]", "experiment=my_tentacle")
-    check_run(run)
-    with caplog.at_level("INFO"):
-        run_stages(acquisition_stages(run), tmp_path)
-    assert [message for message in caplog.messages if "are assigned by their places" in message] == log
 
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (1.0, 6)])

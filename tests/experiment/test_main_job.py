@@ -22,9 +22,7 @@ from support.main_job import (
     STAGES,
     TINY,
     errors,
-    files,
     metrics,
-    ran,
     run,
     same_errors,
 )
@@ -193,22 +191,6 @@ class TestOtherRuns:
         same_errors(results[seeds.index(0)], errors(finished[0]))
         assert results[0] != results[1]
         same_errors(*(metrics(path.parent)["errors_mm"]["simulation"]["mean"] for path in folders))
-
-    def test_training_over_windows_helps_a_poor_network(self, folder):
-        poor = [*TINY, "trainer.epochs=3", "trainer.rollout_every=1", "trainer.linear_noise=null"]
-        assert run(*poor, IN_RUN)[0] == 0
-        first, alone = metrics(), files()
-        windows = ["+in_the_loop=windows", "in_the_loop.window=4", "in_the_loop.epochs=3"]
-        assert run(*poor, *windows, IN_RUN)[0] == 0
-        assert ran(alone) == ["train_resphys", "evaluate", "time", "report"]
-        results, start = metrics(), first["networks"]["resphys"]
-        history = json.loads(Path("run/training_resphys.json").read_text())["epochs"]
-        assert [record["epoch"] for record in history] == [start["epoch"] + k for k in range(4)]
-        assert history[0]["rollout_error_mm"] == pytest.approx(start["validation_rollout_error_mm"], rel=0.05)
-        assert history[3]["train_loss"] < history[0]["train_loss"]
-        kept = results["networks"]["resphys"]
-        assert kept["validation_rollout_error_mm"] < 0.9 * start["validation_rollout_error_mm"]
-        assert results["errors_mm"]["resphys"]["mean"] < 0.9 * first["errors_mm"]["resphys"]["mean"]
 
     def test_kept_weights_that_diverge_are_no_secret(self, folder, monkeypatch, caplog):
         monkeypatch.setattr(learn, "rollout_error", lambda *_: lambda _: float("inf"))

@@ -10,7 +10,6 @@ import torch
 from support.configured import check, composed, settings
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
-from warp_resphys.environments.worlds import RobotWorld
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
@@ -18,7 +17,6 @@ from warp_resphys.experiment.simulate import target_settings
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report.identification_section import parameter_wording
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
@@ -109,11 +107,6 @@ def test_a_run_with_control_is_refused():
         check(composed("experiment=tendon_rod_control", f"obstacles={floor}"))
 
 
-def test_the_midpoint_rule_is_refused_before_the_laboratory_runs():
-    with pytest.raises(InputError, match=r"identify\.integrator is midpoint"):
-        check(composed("experiment=beam_obstacle", "identify.integrator=midpoint"))
-
-
 def test_parameters_have_a_name_for_each_obstacle():
     run = settings(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
     simulator = build_simulator(run, run.simulation)
@@ -128,19 +121,6 @@ def test_the_truth_of_a_laboratory_is_by_parameter():
     truth = true_contact(settings("experiment=beam_obstacle"))
     assert truth["contact_friction"] == 0.5
     assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "words", "unit"),
-    [
-        ("contact_friction", "Friction of the obstacles", ""),
-        ("obstacle_z_bar", "Shift along z of the obstacle 'bar'", "mm"),
-        ("obstacle_turn_x_left_wall", "Turn about x of the obstacle 'left_wall'", "°"),
-        ("contact_stiffness_bar", "Stiffness of the obstacle 'bar'", "kPa"),
-    ],
-)
-def test_parameters_have_words_in_the_report(name, words, unit):
-    assert parameter_wording(name)[:2] == (words, unit)
 
 
 @pytest.fixture(scope="module")
@@ -186,28 +166,6 @@ def test_files_of_a_motion_have_the_obstacle_where_identification_put_it(robot, 
     plate = meshio.read(tmp_path / "beam_obstacles" / "beam_obstacles_2.vtu")
     assert plate.points[:, 2].max() == pytest.approx(-4e-3)
     assert len(plate.cells_dict["triangle"]) == 12
-
-
-@pytest.mark.slow
-def test_an_environment_steps_and_draws_with_obstacles():
-    """A rod hangs above a floor and beside a wall, to which a tendon pulls it unless it lies elsewhere."""
-    run = settings(
-        "experiment=tendon_rod",
-        "mesh.layers=4",
-        "mesh.nodes=8",
-        "obstacles={floor: {shape: half_space, position: [0, 0, -0.205]}, wall: {shape: half_space, "
-        "position: [0.02, 0, 0], axis: [-1, 0, 0]}}",
-    )
-    body = SimulatorSettings.of(run)
-    rod = Robot(Description("rod", "sysid", body, run.simulation, build_body(run).mesh))
-    furthest = []
-    for robot in (rod, rod.with_parameters(obstacle_x_wall=1.0)):
-        world = RobotWorld(robot, "tendon_tension", 1)
-        for _ in range(25):
-            assert not world.step(np.array([[1.5, 0.0, 0.0]])).any()
-        furthest.append(world.bodies()[1][..., 0].max())
-        assert world.obstacles().points.shape == (16, 3)
-    assert 0.019 < furthest[0] < 0.02 < furthest[1]
 
 
 def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):

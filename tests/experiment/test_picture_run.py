@@ -11,17 +11,17 @@ import shapely
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-import warp_resphys
 from support.command_line import outcome, refusal
 from support.configured import composed, settings
 from support.main_job import IN_RUN
 from support.tags import draw_tag
 from warp_resphys.energies.law_files import read_law
-from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.picture_laboratory import noisy_mask
+from warp_resphys.experiment.pictures import picture_stages
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.settings import parse
+from warp_resphys.io.stages import run_stages
 from warp_resphys.mesh.mesh import box_tetrahedra
 from warp_resphys.pictures.outlines import Outline
 from warp_resphys.report.pictures_page import PictureResult, picture_verdict
@@ -48,6 +48,7 @@ def played(tmp_path_factory):
     return folder, result
 
 
+@pytest.mark.slow
 def test_the_material_of_a_simulated_laboratory_comes_back(played):
     folder, result = played
     identified = json.loads((folder / "identification.json").read_text())["sysid"]
@@ -71,22 +72,24 @@ def test_the_material_of_a_simulated_laboratory_comes_back(played):
     assert (folder / "figures" / "outlines.png").stat().st_size > 1e4
 
 
-def test_a_finished_run_is_not_repeated(played):
-    folder, _ = played
-    before = (folder / "identification.json").stat().st_mtime_ns
-    assert outcome(*SIMULATED, f"hydra.run.dir={folder}").code == 0
-    assert (folder / "identification.json").stat().st_mtime_ns == before
-
-
+@pytest.mark.slow
 def test_other_commands_say_what_pictures_are(played):
     folder, _ = played
     assert "has pictures, from which no robot is made" in refusal("view", f"run={folder}")
 
 
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Folder of the pictures of a simulated camera."""
+    folder = tmp_path_factory.mktemp("camera")
+    run_stages(picture_stages(settings(*SIMULATED), {})[:1], folder)
+    return folder / "recordings"
+
+
 @pytest.fixture
-def recorded(played, folder):
+def recorded(pictures, folder):
     """A folder of pictures with two cameras of which the first is wrong, a copy, a mesh and clamps of their own."""
-    source = played[0] / "recordings" / "level"
+    source = pictures / "level"
     pose = folder / "pictures" / "beam"
     pose.mkdir(parents=True)
     shutil.copy(source / "00_mask.png", pose / "00.png")
@@ -119,6 +122,7 @@ RECORDED = [
 ]
 
 
+@pytest.mark.slow
 def test_pictures_of_a_folder(recorded):
     """Copies count once, the better of two cameras is chosen, masks are files or colours."""
     result = outcome(*RECORDED)
@@ -142,6 +146,7 @@ def test_pictures_of_a_folder(recorded):
     assert law["constants"]["density"] == 1100.0
 
 
+@pytest.mark.slow
 def test_a_tag_shows_the_camera(recorded):
     """A frame without world_to_camera; of the two cameras that the tag allows, the one that sees the body is chosen."""
     scene = json.loads((recorded / "pictures/beam/camera.json").read_text())
@@ -164,74 +169,26 @@ def test_a_tag_shows_the_camera(recorded):
     assert row["outline_mm"]["sysid"] < 0.5
 
 
-def test_tracked_points_of_a_moving_camera(recorded):
-    """Points alone, each frame before a camera of its own, whose places are known."""
-    scene = json.loads((recorded / "pictures/beam/camera.json").read_text())
-    right = np.array(scene["frames"][1]["world_to_camera"])
-    other = right.copy()
-    other[:3, :3] = right[:3, :3] @ Rotation.from_euler("y", 0.4).as_matrix()
-    other[:3, 3] += (0.0, 0.0, 0.1)
-    places = {"tip": (0.12, 0.015, 0.03), "middle": (0.06, 0.015, 0.03), "corner": (0.12, 0.03, 0.015)}
-    mesh = box_tetrahedra((0.12, 0.03, 0.03), (4, 1, 1), 2)
-    clamp = np.flatnonzero(mesh.vertices[:, 0] < 1e-9)
-    body = warp_resphys.Body(mesh, fixed=clamp)
-    material = warp_resphys.Corotated(120e3, 0.49, density=1100.0)
-    simulator = warp_resphys.Simulator(body, material, gravity=(0.0, -9.81, 0.0))
-    q = simulator.static_equilibrium().q
-    points = warp_resphys.bind_markers(mesh, [*places.values()], [*places])(q)[0].numpy()
-    matrix, lines = np.array([[450.0, 0.0, 320.0], [0.0, 450.0, 180.0], [0.0, 0.0, 1.0]]), ["frame"]
-    lines[0] += "".join(f",{name}.x,{name}.y" for name in places)
-    for number, camera in enumerate((right, other)):
-        rays = (points @ camera[:3, :3].T + camera[:3, 3]) @ matrix.T
-        lines.append(f"{number}," + ",".join(f"{value:.4f}" for value in (rays[:, :2] / rays[:, 2:]).ravel()))
-    (recorded / "pictures/beam/tracked.csv").write_text("\n".join(lines))
-    frames = [{"image": f"0{2 * n}.png", "world_to_camera": own.tolist()} for n, own in enumerate((right, other))]
-    (recorded / "pictures/beam/camera.json").write_text(json.dumps({**scene, "frames": frames}))
-    table = ",".join(f"{name}:{list(place)}" for name, place in places.items())
-    tracked = ["data.poses.beam.points=tracked.csv", "data.poses.beam.outline=false", f"data.points={{{table}}}"]
-    assert "set data.stands=false" in refusal(*RECORDED, *tracked)
-    result = outcome(*RECORDED, *tracked, "data.stands=false")
-    assert result.code == 0, result.err
-    assert "Distance of tracked points" in result.out
-    assert "diverged" not in result.out
-    (row,) = json.loads((recorded / "run" / "metrics.json").read_text())["poses"]
-    assert row["points_mm"]["sysid"] < 0.02
-    assert row["outline_mm"]["sysid"] is None
-    identified = json.loads((recorded / "run" / "identification.json").read_text())["sysid"]["parameters"]
-    assert identified["youngs_modulus@soft"] == pytest.approx(120e3, rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ("data.poses.beam.frames=[0,9]", "name 9, but"),
-        ("data.poses.beam.folder=nowhere", "nowhere/camera.json"),
-        ("data.poses.beam.mesh=nowhere.vtk", "nowhere.vtk"),
         ("data.poses.beam.material=hard", "materials lacks 'hard'"),
         (
             "identify.parameters.youngs_modulus={lower:1e4,upper:1e6,per:trial,prior:{mean:2e5,deviation:1e5}}",
             "take material",
         ),
         ("data.test=[beam]", "which is in data.train as well"),
-        ("data.train=[other]", "train names 'other'"),
         ("identify=null", "identify is null, but data.kind is pictures"),
         ("identify.parameters.gravity_tilt_1.per=session", "pictures have all, material, lens and trial"),
         ("identify.parameters.colour={lower:0,upper:1}", "identify.parameters names 'colour': choose from"),
         ("data.lens.file=calibration.yaml", "give one of them, a calibration or the matrix"),
-        ("data.folder=null", "folder is not set"),
-        ("data.poses.beam.outline=false", "data.poses.beam has no outline, no points, no scan and no depth image"),
         ("data.poses.beam.points=tracked.csv", "points is empty, and data.poses.beam has some: give their places"),
         ("data.simulated={place:[0,0,1],looks_at:[0,0,0]}", "data.folder is set: set data.simulated to null"),
     ],
 )
 def test_bad_input_gets_a_sentence(recorded, change, sentence):
     assert sentence in refusal(*RECORDED, change)
-
-
-def test_a_value_a_material_is_for_pictures():
-    run = settings("experiment=beam_synthetic", "identify.parameters.youngs_modulus.per=material")
-    with pytest.raises(InputError, match=r"which is for data\.kind pictures"):
-        check_run(run)
 
 
 def test_a_kept_back_material_is_refused():

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import warp_resphys
-from support.bags import write_points
 from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, run_without_report
 from support.played_run import check_robots
@@ -16,16 +15,13 @@ from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
-from warp_resphys.pipeline import acquire
 from warp_resphys.report.identification_section import own_table
-from warp_resphys.report.uniaxial import small_strain
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
 from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere
-ENDS = {"first": 1e-3, "second": 5e-4}  # m, outwards, by which they end elsewhere
 POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "second": (0.0, 1.5), "other": (0.0, 1.0), "both": (1.0, 1.0)}
 STRONG = {"weak": (1.5, 0.0), "strong": (4.0, 0.0), "second": (0.0, 3.0), "other": (0.0, 4.0), "both": (3.0, 3.0)}
 TINY = [
@@ -56,11 +52,11 @@ def trials(poses):
 TRIALS = trials(POSES)
 
 
-def moved(tendons, offsets=OFFSETS, direction=0):
-    """Tendons whose guides are where the recorded body has them: displaced along their first or second direction."""
+def moved(tendons):
+    """Tendons whose guides are where the recorded body has them: displaced along their first direction."""
     routes = {}
     for name, route in tendons.routes.items():
-        guides = np.array(route.guides) + offsets[name] * np.array(route.offsets[direction])
+        guides = np.array(route.guides) + OFFSETS[name] * np.array(route.offsets[0])
         routes[name] = {"guides": guides.tolist(), "pieces": route.pieces}
     return tendons.changed(routes=routes)
 
@@ -101,25 +97,6 @@ def write(folder, places_of_poses):
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
 
 
-def test_poses_are_imported_from_bags(poses, tmp_path, monkeypatch):
-    """A folder or a file for each pose, with a topic for each marker, under the names of the configuration."""
-    monkeypatch.chdir(tmp_path)
-    names = ["M1", "M2", "M3", "Tip", "Base"]
-    for name, places in zip(POSES, poses, strict=True):
-        turned = np.stack([places[:, 0], -places[:, 2], places[:, 1]], -1) + [0.3, 0.4, -0.1]
-        write_points(
-            Path(name), {f"/{label}": np.tile(at, (40, 1)) for label, at in zip(names, turned, strict=True)}, 200.0
-        )
-    Path("both.mcap").write_bytes((Path("both") / "both.mcap").read_bytes())
-    recorded = [TRIALS[0], TRIALS[1].replace("both.csv", "both.mcap").replace(".csv", "")]
-    markers = f"+data.bag={{markers: {{{','.join(f'{label}: /{label}' for label in names)}}}}}"
-    given = settings(*TINY, *recorded, "data.folder=.", "data.table=null", markers, "markers.labels=recorded")
-    acquire(given, Path("run"))
-    dataset = read_dataset(Path("run/dataset.h5"))
-    rows = [dataset.names.index(name) for name in POSES]
-    np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=1e-5)
-
-
 @pytest.mark.slow
 def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -134,20 +111,6 @@ def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
     errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
     assert errors["sysid"]["mean"] < 0.3
     check_robots("run")
-
-
-@pytest.mark.slow
-def test_poses_identify_where_tendons_end(tmp_path, monkeypatch):
-    """Outwards at the end alone, which strong poses tell from Young's modulus; their priors shrink them a little."""
-    monkeypatch.chdir(tmp_path)
-    given = [key for key in TINY if "tendon_offset_2" not in key]
-    recorded = settings(*given, *trials(STRONG))
-    write(Path("recordings"), poses_of(recorded, moved(recorded.tendons, ENDS, 1), STRONG))
-    known = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
-    run_without_report(tmp_path, *given, *trials(STRONG), *known, "mesh_check=null")
-    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
-    assert {name: identified[f"tendon_offset_2_{name}"] for name in ENDS} == pytest.approx(ENDS, abs=3e-4)
-    assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.05)
 
 
 def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):
@@ -170,32 +133,6 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch
     assert {"simfree", "resphys"} <= errors.keys()
     check_of_the_mesh()
     check_robots("run")
-
-
-@pytest.mark.slow
-def test_a_law_is_identified_from_poses(poses, tmp_path):
-    write(tmp_path / "recordings", poses)
-    law = "law={terms:[c01],branches:0,families:0,max_evaluations:3}"
-    folder = run_without_report(tmp_path, *TINY, *TRIALS, law, "mesh_check=null")
-    found = json.loads((folder / "law.json").read_text())
-    assert found["validation"]["trials"] == ["other"]
-    assert found["validation"]["law"] < 0.1
-    assert small_strain(found["constants"]).youngs_modulus == pytest.approx(MODULUS, rel=0.1)
-
-
-def test_parameters_of_sessions_need_sessions():
-    tentacle = ["experiment=tentacle", "mesh.layers=4", "mesh.nodes=20"]
-    with pytest.raises(InputError, match=r"per is session, but no trial names one: set data\.trials\.NAME\.session"):
-        check(
-            composed(
-                *tentacle,
-                "data.folder=recordings",
-                "data.trials=null",
-                "+data.trials={one: {file: one.csv, inputs: [1.0, 0.0]}, other: {file: other.csv, inputs: [0.0, 1.0]}}",
-                "+identify.parameters.tendon_tension_factor={lower: 0.8, upper: 1.2, per: session, "
-                "prior: {mean: 1.0, deviation: 0.1}}",
-            )
-        )
 
 
 @pytest.mark.slow
@@ -276,6 +213,13 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
     ("overrides", "said"),
     [
         (["data.axes=[x,x,y]"], "data.axes is .*twice"),
+        (
+            [
+                "+identify.parameters.tendon_tension_factor={lower: 0.8, upper: 1.2, per: session, "
+                "prior: {mean: 1.0, deviation: 0.1}}"
+            ],
+            r"per is session, but no trial names one: set data\.trials\.NAME\.session",
+        ),
         (["data.axes=null"], "markers.reference names 1: static poses need 3 .*, or data.axes and one"),
         (
             ["identify.parameters.tendon_offset_1_first.upper=0.03"],

@@ -8,7 +8,6 @@ import dataclasses
 import json
 import re
 import shutil
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,13 +18,9 @@ from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, without_reports
 from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
-from warp_resphys.data.actuation import InputSequences
-from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learn, reconstruct
-from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.files import Dataset
@@ -35,14 +30,7 @@ from warp_resphys.io.errors import InputError, ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
-from warp_resphys.learning.bounds import Bounds
-from warp_resphys.learning.identification import Identifier
-from warp_resphys.learning.predictors import Range
-from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.mesh import select_vertices
-from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.stages import EvaluateStage, ReconstructStage, TrainStage
-from warp_resphys.stepping.inputs import Inputs
 
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 COMMAND = ["experiment=tiny", TRACKED, *QUIET]
@@ -177,23 +165,6 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     assert float((turned.outputs[0] - kept.outputs[0]).abs().max()) > 1e-3 * size
 
 
-@pytest.mark.slow
-def test_recordings_in_a_folder_give_what_the_simulation_that_made_them_gave(
-    finished, monkeypatch, no_report, tmp_path
-):
-    """The same trials from files, in two processes; those at higher pressures are not among them."""
-    assert {path.stem for path in (finished / "run" / "recordings").iterdir()} == {"t000", "t001", "t002", "t003"}
-    assert [path.stem for path in (finished / "run" / "recordings_scaled").iterdir()] == ["t003_x1.5"]
-    place_segment(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    places = [f"data.folder={finished / 'run' / 'recordings'}", "data.train=[t000,t001]", "data.validation=[t002]"]
-    code, err = run(*COMMAND, *places, "data.test=[t003]", "parallel.processes=2", "parallel.batch=1")
-    assert code == 0, err
-    first, second = metrics(finished), metrics(tmp_path)
-    for model in ("simulation", "sysid"):
-        assert second["errors_mm"][model]["mean"] == pytest.approx(first["errors_mm"][model]["mean"], rel=5e-3)
-
-
 def refused(finished, folder, *overrides):
     """The sentence with which recordings are refused, before the run or by its import."""
     path = f"hydra.searchpath=[file://{finished / 'configs'}]"
@@ -321,70 +292,6 @@ def test_a_response_before_its_command_or_backwards_is_refused(word):
     wanted = f"+identify.parameters.pressure_{word}={{lower: -0.1, upper: 0.1}}"
     with pytest.raises(InputError, match=rf"identify\.parameters\.pressure_{word}\.lower is -0\.1: .* not negative"):
         check(composed("experiment=sopra", wanted))
-
-
-def driven_motions(simulator, steps=12, count=2):
-    """Motions of a simulator under pressures, seen at a few vertices."""
-    chambers = simulator.counts["pressure"]
-    sequences = InputSequences(rest=0.01, correlation_time=0.05)
-    drawn = [sequences.draw(steps, 0.01, chambers, np.random.default_rng(i))[1:] for i in range(count)]
-    inputs = Inputs(pressure=simulator.tensor(np.stack(drawn, axis=1)))
-    mesh = simulator.body.mesh
-    places = mesh.vertices[select_vertices(mesh, z=-0.1)[:4]]
-    read = bind_markers(mesh, places, ["a", "b", "c", "d"]).to(simulator.rest_positions)
-    with torch.no_grad():
-        state = simulator.static_equilibrium(batch=count)
-        path = simulator.rollout(state, steps, inputs).q
-    markers = torch.stack([read(q) for q in path], 1)
-    times = simulator.tensor(0.01 * np.arange(steps + 1)).expand(count, -1)
-    names = tuple(f"m{i}" for i in range(count))
-    return Trials(names, times, markers, markers[:, 0], inputs), read
-
-
-def at_rest(simulator, motions):
-    return Start.resting(simulator.rest_positions.expand(len(motions.names), -1, -1))
-
-
-def tiny_simulator(**material):
-    small = settings("experiment=sopra", "mesh=segment", "mesh.size=0.03", "mesh.layers=0.05", "chambers.count=3")
-    return build_simulator(small, MaterialSettings(**{**small.simulation.plain(), **material}))
-
-
-def test_identification_finds_the_stiffness_that_made_motions_and_the_valves_lag():
-    """The start depends on the stiffness as much as the motion does: gravity stretches the body before that."""
-    simulator = tiny_simulator(youngs_modulus=150e3)
-    motions, read = driven_motions(simulator)
-    replay = Replay(tiny_simulator(), read, motions)
-    bounds = {"youngs_modulus": Bounds(5e4, 5e5, True), "pressure_rise": Bounds(0.0, 0.1)}
-    identifier = Identifier([(replay, at_rest(simulator, motions))], bounds)
-    results = identifier.run([{"youngs_modulus": 264e3, "pressure_rise": 0.02}], 25)
-    assert results.parameters["youngs_modulus"] == pytest.approx(150e3, rel=0.01)
-    assert results.parameters["pressure_rise"] < 1e-3
-    with pytest.raises(InputError, match="no parameter 'colour'"):
-        Identifier([(replay, at_rest(simulator, motions))], {"colour": Bounds(0.0, 1.0)})
-
-
-def test_the_replays_gradient_is_that_of_differences():
-    simulator = replace(tiny_simulator(stiffness_damping=2e-3), relative_tolerance=1e-11)  # differences are small
-    motions, read = driven_motions(simulator, steps=4)
-    replay = Replay(simulator, read, motions)
-    release = at_rest(simulator, motions)
-    of_commands = (("pressure_rise", 0.02), ("pressure_delay", 0.013), ("pressure_factor", 1.3))
-    for name, value in (("youngs_modulus", 2e5), ("stiffness_damping", 3e-3), *of_commands):
-        x = torch.tensor([value], dtype=torch.float64, requires_grad=True)
-        loss = lambda x, name=name: 1e6 * replay.errors(replay(release, {name: x})).square().sum()  # noqa: E731
-        (gradient,) = torch.autograd.grad(loss(x), x)
-        with torch.no_grad():
-            step = 1e-3 * value  # with smaller ones, differences are of the size of the solver's tolerance
-            difference = (loss(x + step) - loss(x - step)) / (2 * step)
-        assert float(gradient) == pytest.approx(float(difference), rel=2e-5)
-
-
-def test_leaving_the_range_of_the_training_is_noticed():
-    inputs = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
-    watched = Range.restore(Range.of(inputs).description(), inputs)
-    probe = torch.tensor([[2.4, 2.0], [2.6, 2.0], [1.0, 0.4], [1.0, torch.nan]])
-    assert watched.excludes(probe).tolist() == [False, True, True, False]
 
 
 def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from support.configured import settings
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.recording import ARM
 from warp_resphys.data.rigid_bodies import angles, motion_between
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
@@ -142,33 +141,3 @@ def test_a_rest_without_an_orientation_is_refused(tmp_path):
     )
     with pytest.raises(DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"):
         run_stages(acquisition_stages(run), tmp_path)
-
-
-def test_a_table_with_quaternions_is_imported_like_the_recordings_of_the_laboratory(tmp_path):
-    """One of its files has other names, which the trial's labels replace."""
-    expected = imported(tmp_path / "played", "laboratory.train=[p0]", "laboratory.test=[p30]")
-    bases = ["Base - 1", "Base - 2", "Base - 3"]
-    for name, labels in (("p0", ["plate", *bases]), ("p30", ["body", "a", "b", "c"])):
-        recording = read_recording(tmp_path / "played" / "recordings" / f"{name}.h5")
-        places = recording.select(["plate", "plate +x", "plate +y", "plate +z"]).positions
-        axes = np.swapaxes(places[:, 1:] - places[:, :1], 1, 2) / ARM
-        rows = [1e3 * places[:, 0], *1e3 * recording.select(bases).positions.swapaxes(0, 1)]
-        quaternions = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
-        heads = ["time [s]", *(f"{label}.{axis} [mm]" for label in labels for axis in "xyz")]
-        heads += [f"{labels[0]}.q{axis}" for axis in "wxyz"]
-        content = np.concatenate([recording.time[:, None], *rows, quaternions], axis=1)
-        np.savetxt(tmp_path / f"{name}.csv", content, "%.12g", ",", header=",".join(heads), comments="")
-    named = f"file: p30.csv, begins: static, payload: 0.03, labels: [plate, {', '.join(bases)}]"
-    run = settings(
-        *HANGS,
-        f"data.folder={tmp_path}",
-        f"data.trials={{p0: {{file: p0.csv, begins: static}}, p30: {{{named}}}}}",
-        "~data.folds",
-        "data.train=[p0]",
-        "data.test=[p30]",
-    )
-    run_stages(acquisition_stages(run), tmp_path)
-    results = read_dataset(tmp_path / DATASET)
-    assert results.labels == expected.labels
-    np.testing.assert_allclose(results.bound, expected.bound, atol=1e-9)
-    np.testing.assert_allclose(results.observed, expected.observed, atol=1e-9)

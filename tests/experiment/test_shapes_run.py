@@ -7,7 +7,6 @@ import pytest
 
 from support.configured import check, composed
 from support.main_job import IN_RUN, run_without_report
-from warp_resphys.experiment import shapes
 from warp_resphys.fem.stretches import share_outside
 from warp_resphys.io.errors import InputError
 
@@ -63,28 +62,6 @@ def test_a_target_on_another_mesh_leaves_the_error_of_the_mesh(run):
 def test_the_metrics_have_the_errors(run):
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["shapes"] == results(run)
-
-
-@pytest.mark.slow
-def test_an_interrupted_stage_goes_on(run, monkeypatch):
-    before, tried = results(run), []
-    (run / "stages" / "shapes.json").unlink()
-    (run / "shapes.json").unlink()
-    compared = shapes._compared
-
-    def stopped(experiment, settings, shape):
-        tried.append(shape)
-        if len(tried) == 3:
-            raise KeyboardInterrupt
-        return compared(experiment, settings, shape)
-
-    monkeypatch.setattr(shapes, "_compared", stopped)
-    with pytest.raises((KeyboardInterrupt, SystemExit, AssertionError)):
-        run_without_report(run.parent, *KNOWN, *SHAPES)
-    run_without_report(run.parent, *KNOWN, *SHAPES)
-    assert len(tried) == 5  # the two that are left, of which one was begun before
-    for name, found in results(run).items():
-        assert found["errors_mm"]["simulation"] == pytest.approx(before[name]["errors_mm"]["simulation"], rel=1e-6)
 
 
 def test_stretches_outside_of_a_range_are_counted():

@@ -14,14 +14,13 @@ from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET, read_dataset
-from warp_resphys.experiment.laboratory import laboratory_simulator
 from warp_resphys.experiment.simulate import simulate, vertices_in
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import MotionStage, PlayedSettings
+from warp_resphys.settings.stages import MotionStage
 from warp_resphys.stepping.inputs import Inputs
 
 SIZE = (0.1, 0.03, 0.03)
@@ -139,18 +138,6 @@ def test_the_marker_ablation_follows_its_target(tmp_path):
     at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in build_body(run).mesh.vertices]
     np.testing.assert_allclose(seen, q[::2, at], atol=1e-8)
     np.testing.assert_allclose(uncorrected[0], seen[0], atol=1e-15)
-
-
-def test_the_laboratory_has_regions_rigid_parts_and_muscles_of_its_own():
-    regions = "laboratory.regions={root:{x:[0.0,0.05]},tip:{x:[0.05,0.1]}}"
-    run = settings("experiment=beam_real", regions, "laboratory.rigid={tip:{}}", "laboratory.integrator=bdf2", PASSIVE)
-    simulator = laboratory_simulator(PlayedSettings.of(run, files={}), np.array([0.0, 0.0, -9.8]))
-    (muscles,) = (energy for energy in simulator.body.energies if isinstance(energy, Muscles))
-    assert (muscles.stiffness, muscles.toe) == (80e3, 0.02)
-    assert list(simulator.body.rigid) == ["tip"]
-    plain = build_body(run)
-    assert not plain.rigid
-    assert not plain.energies
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,8 @@ import pytest
 from support.configured import check, composed
 from support.main_job import IN_RUN, run
 from support.played_run import check_robots
-from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_array, read_hdf5
 from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
 
@@ -27,26 +25,6 @@ TINY = [
     *("network={position_modes:2,velocity_modes:0,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
     *("trainer.batch_size=16", *QUIET),
 ]
-
-
-@pytest.mark.slow
-def test_a_body_that_tendons_pull_goes_through_every_stage(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    code, err = run(*TINY)
-    assert (code, err[-500:] if code else "") == (0, "")
-    with read_hdf5(Path("run/dataset.h5"), "dataset") as file:
-        results = read_array(file, "inputs/tendon_tension") if "inputs" in file else read_array(file, "tendon_tension")
-    recorded = read_recording(Path("run/recordings/t000.h5")).actuation
-    assert recorded.shape[1] == results.shape[2] == 3
-    np.testing.assert_allclose(results[0][: len(recorded) - 1], recorded[1:], atol=1e-6)
-    assert results.max() > 0.3  # N
-    errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
-    assert {"simulation", "sysid", "simfree", "resphys"} <= errors.keys()
-    assert all(np.isfinite(summary["mean"]) for summary in errors.values())
-    page = Path("run/report.html").read_text()
-    for said in ("3 tendons under tension", "The body and its tensions", "Tensions of", "the limit of 1.5 N"):
-        assert said in page
-    assert "pressure" not in page.split("<style")[0] + page.split("</style>")[-1].split("<script")[0]
 
 
 MUSCLES = (

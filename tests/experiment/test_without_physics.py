@@ -69,17 +69,6 @@ def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
     assert np.isfinite(after).all()
 
 
-def test_frames_that_are_not_predicted_leave_the_others_alone():
-    """Beside longer motions, the frames of a trial end early, and so do those of interpolation."""
-    fake = experiment([1.0, 2.0, 3.0, 2.5], ("rest",) * 4, ["a", "b", "c"])
-    fake.dataset.observed[:, 30:] = np.nan
-    before = without_physics(fake, ["d"])[0]
-    fake.settings.release = ReleaseSettings(delay=0.01, window=0.3, noise=1e-3)
-    after = without_physics(fake, ["d"])[0]
-    assert before.keys() == after.keys() == {"rest", "interpolation", "regression", "linear"}
-    np.testing.assert_allclose(after["interpolation"][0, :30], before["interpolation"][0, :30], atol=1e-3)
-
-
 def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.learned_steps = lambda steps: steps // 2
@@ -114,20 +103,6 @@ def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart
     values, _ = without_physics(fake, ["c"])
     np.testing.assert_allclose(values["rest"][0, 0], ends, atol=1e-6)
     np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
-
-
-@pytest.mark.parametrize("inputs", [{}, {"pressure": np.zeros((3, 2 * FRAMES, 1))}])
-def test_a_released_body_is_at_rest_at_the_end_of_what_was_learned(inputs):
-    decay, far = np.exp(-TIMES / 0.02)[:, None, None], np.array([5.0, 0.0, -1.0])
-    held = np.array([0.5, 1.0, 0.8])[:, None, None] * SHAPE
-    more = {"held": far + held, "observed": far + held[:, None] * decay}
-    fake = experiment([1.0, 2.0, 1.5], ("released",) * 3, ["a", "b"], inputs=inputs, **more)
-    values, _ = without_physics(fake, ["c"])
-    np.testing.assert_allclose(values["interpolation"][0, :5], fake.dataset.observed[2, :5], atol=1e-3)
-    fake.learned_steps = lambda steps: steps // 2
-    fake.dataset.observed[:2, 5:10, 0] = np.nan
-    values, _ = without_physics(fake, ["c"])
-    np.testing.assert_allclose(values["rest"][0, 0], np.broadcast_to(far, (2, 3)), atol=1e-3)
 
 
 def test_the_motion_of_a_base_is_an_input():

@@ -9,18 +9,16 @@ from numpy.typing import NDArray
 
 from ..data.markers import Markers
 from ..data.rigid import RigidTransform, kabsch
-from ..energies.contact import MOTION, SHIFT, Contact
+from ..energies.contact import MOTION, Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..report.obstacles import ObstacleSurface
-from ..report.render import upwards
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.quantity import Quantity
-from .hand import HAND, RADIUS, with_hand, without_contact
 
 FloatArray = NDArray[np.float64]
 MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
@@ -32,9 +30,6 @@ _WIDE: Final = 1.4  # Logarithm of the factor by which a parameter may be change
 _BEYOND: Final = 1.25  # Largest input, over that of the trials.
 _BASE_SPEED: Final = 1.0  # Largest speed of the base, in sizes of the body, and rad, a second.
 _MOVED: Final = (0.25, 0.5)  # Largest displacement of base and obstacles, over the body's size, and rotation [rad].
-_CLEAR: Final = 0.2  # Gap between the hand and the body where it appears, over its radius.
-_END: Final = 0.95  # Least distance of the free end from the clamp, over the largest.
-_SHARES: Final = (1.0, 0.25, 0.0)  # Of the hand's way in a step that are tried one after the other.
 
 
 class LiveRobot:
@@ -52,7 +47,6 @@ class LiveRobot:
         parameters: quantities and original values of the parameters that may be changed, by name.
         time: since the start of the motion [s].
         failure: why the simulation stopped; empty while it runs.
-        hand: (3,) place of the sphere that pushes the body [m]; None if there is none.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -70,10 +64,7 @@ class LiveRobot:
         self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of held vertices, (3,) target [m]
         self._on_body = _markers_on_body(robot)
         self._placed: dict[str, FloatArray] = {}  # (O,) inputs that moved obstacles in the last step
-        self._touched: Robot | None = None
-        self.hand: FloatArray | None = None
         self.state: RobotState
-        self._hand_target: FloatArray | None = None
         self.trial: RecordedTrial | None = None
         self.failure = ""
         self.reset()
@@ -147,54 +138,15 @@ class LiveRobot:
 
     @property
     def moved(self) -> Mapping[str, FloatArray]:
-        """(O,) inputs that moved the robot's own obstacles in the last step, by name."""
-        own = {name: len(declared.parts) for name, declared in self._original.inputs.items()}
-        return {name: values[: own[name]] for name, values in self._placed.items() if name in own}
+        """(O,) inputs that moved obstacles in the last step, by name."""
+        return self._placed
 
     @property
     def obstacles(self) -> ObstacleSurface:
-        """The robot's own obstacles, without the hand, at its parameters."""
-        return ObstacleSurface.of(self._original.simulator.body, self.robot.parameters)
+        """The robot's obstacles, at its parameters."""
+        return ObstacleSurface.of(self.robot.simulator.body, self.robot.parameters)
 
     # Interactions
-
-    def show_hand(self) -> None:
-        """Puts a sphere beside the free end of the body, which `move_hand` moves and which pushes the body.
-
-        Raises:
-            InputError: see `hand.with_hand`.
-        """
-        if self.hand is not None:
-            return
-        if self._touched is None:
-            self._touched = with_hand(self._original)
-        changed = {name: value for name, value in self.robot.parameters.items() if name in self.parameters}
-        self.robot = self._touched.with_parameters(**changed)
-        up, q = upwards(np.asarray(self.robot.simulator.gravity, dtype=np.float64)), self.positions
-        fixed, rest = self.robot.simulator.body.fixed_vertices, self.robot.simulator.body.mesh.vertices
-        clamp = rest[fixed].mean(axis=0) if len(fixed) else rest.mean(axis=0)
-        away = np.linalg.norm(rest - clamp, axis=1)
-        end = q[away > _END * away.max()].mean(axis=0) if len(fixed) else q.mean(axis=0)
-        gap = RADIUS * self.size * (1.0 + _CLEAR)
-        place = end + gap * up
-        while np.linalg.norm(q - place, axis=1).min() < gap:
-            place = place + 0.5 * gap * up
-        self.hand, self._hand_target = place, place
-        self.state = without_contact(self.state)
-
-    def hide_hand(self) -> None:
-        """Takes the sphere away."""
-        if self.hand is None:
-            return
-        changed = {name: value for name, value in self.robot.parameters.items() if name in self.parameters}
-        self.robot = self._original.with_parameters(**changed)
-        self.hand = self._hand_target = None
-        self.state = without_contact(self.state)
-
-    def move_hand(self, target: FloatArray) -> None:
-        """Sets the point (3,) [m] towards which the hand moves, by as much in a step as contact allows."""
-        if self.hand is not None:
-            self._hand_target = np.asarray(target, dtype=np.float64)
 
     def set_input(self, name: str, part: int, value: float) -> None:
         """Commands a value; a trial that plays ends."""
@@ -242,7 +194,6 @@ class LiveRobot:
     def reset(self) -> None:
         """Restarts from the initial state of the trial, or from rest without inputs."""
         self.time, self.failure, self._held, self._placed = 0.0, "", None, {}
-        self.hide_hand()
         for values in self.inputs.values():
             values[:] = 0.0
         with torch.no_grad():
@@ -250,7 +201,7 @@ class LiveRobot:
 
     def restore(self) -> None:
         """Undoes every change of a parameter."""
-        self.robot = self._original if self.hand is None or self._touched is None else self._touched
+        self.robot = self._original
 
     # Time
 
@@ -263,27 +214,15 @@ class LiveRobot:
             weights, target = self._held
             acting["external_force"] = weights[:, None] * (self._stiffness * (target - weights @ self.positions))
         wanted = {name: np.asarray(acting.pop(name)) for name in [q.name for q in MOTION] if name in acting}
-        for share in _SHARES if self.hand is not None else _SHARES[:1]:
-            hand = None if self.hand is None else self._hand_after(share)
-            placed = self._obstacles(wanted, hand)
-            try:
-                with torch.no_grad():
-                    state = self.robot.step(self.state, **acting, **placed)
-            except (ConvergenceError, InputError) as error:
-                self.failure = f"Stopped: {error}"
-                continue
-            self.state, self.time, self.failure = state, self.time + self.robot.time_step, ""
-            self.hand, self._placed = hand, placed
-            return True
-        return False
-
-    def _hand_after(self, share: float) -> FloatArray:
-        """Place of the hand (3,) after a step, towards its target by a share of what contact allows in a step [m]."""
-        assert self.hand is not None
-        assert self._hand_target is not None
-        way = self._hand_target - self.hand
-        far = share * self._reach
-        return np.asarray(self.hand + way * min(1.0, far / max(float(np.linalg.norm(way)), 1e-300)))
+        placed = self._obstacles(wanted)
+        try:
+            with torch.no_grad():
+                self.state = self.robot.step(self.state, **acting, **placed)
+        except (ConvergenceError, InputError) as error:
+            self.failure = f"Stopped: {error}"
+            return False
+        self.time, self._placed = self.time + self.robot.time_step, placed
+        return True
 
     @property
     def _reach(self) -> float:
@@ -291,8 +230,8 @@ class LiveRobot:
         contacts = [energy for energy in self.robot.simulator.body.energies if isinstance(energy, Contact)]
         return min((contact.distance for contact in contacts), default=np.inf)
 
-    def _obstacles(self, wanted: Mapping[str, FloatArray], hand: FloatArray | None) -> dict[str, FloatArray]:
-        """Inputs (O,) that move obstacles in the next step by name, with the hand's place (3,).
+    def _obstacles(self, wanted: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Inputs (O,) that move obstacles in the next step, by name.
 
         In a trial obstacles move as recorded; by sliders, by as much as contact allows in a step.
         """
@@ -302,15 +241,10 @@ class LiveRobot:
             values = np.zeros(len(self.robot.inputs[name].parts))
             if name in wanted:
                 target = wanted[name]
-                before = self._placed.get(name, np.zeros_like(values))[: len(target)]
+                before = self._placed.get(name, np.zeros_like(values))
                 far = self._reach if number < 3 else self._reach / self.size
                 step = target - before if self.trial is not None else np.clip(target - before, -far, far)
-                values[: len(target)] = before + step
-            if hand is not None and number < 3:
-                shared = self.robot.parameters.get(SHIFT[number].name, 0.0)  # An identified one, of all obstacles.
-                values[-1] = (
-                    hand[number] - self.robot.description.settings.obstacles[HAND].position[number] - float(shared)
-                )
+                values = before + step
             placed[name] = values
         return placed
 

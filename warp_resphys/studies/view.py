@@ -26,7 +26,6 @@ from ..report.render import MEASURED, upwards
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
 from ..robot.robot import Robot
-from .hand import RADIUS
 from .live import LiveRobot, range_of
 from .live_twin import LiveTwin, TwinSettings
 from .tables import show
@@ -43,7 +42,7 @@ _EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of 
 _HIGHEST_PORT: Final = 65535
 _DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
 _HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
-*Hand* puts a sphere beside the body: drag it to push. Keys: **space** pauses, **R** resets, **H** is the hand."""
+Keys: **space** pauses, **R** resets."""
 _HELP_TWIN: Final = """Blue: the estimate. Grey: where the robot will be, if its commands stay. Dots: measured markers.
 Drag to turn the view, scroll to zoom, right-drag to move. Keys: **space** pauses, **R** starts again."""
 _SPEEDS: Final = {"a tenth": 0.1, "a quarter": 0.25, "half": 0.5, "real time": 1.0, "double": 2.0}
@@ -202,9 +201,6 @@ class Page:
             "/measured body", places, live.faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
         )
         self._obstacles: Any = None
-        self._hand: Any = None
-        self._by_sphere: Any = None
-        self._refused = ""  # Why there is no hand.
         around = self._around()
         if len(around.points):
             self._obstacles = server.scene.add_mesh_simple(
@@ -227,7 +223,6 @@ class Page:
 
         if isinstance(live, LiveTwin):
             return
-        self._set_hand(live)
 
         @self._body.on_drag
         async def _(event: Any) -> None:  # Without awaiting, so that events are handled in their order.
@@ -245,34 +240,6 @@ class Page:
         async def _(client: Any) -> None:
             if client.client_id == self._holder:
                 self._let_go()
-
-    def _set_hand(self, live: LiveRobot) -> None:
-        """The sphere that pushes the body: it is dragged in the plane of the screen."""
-        self._hand = self._server.scene.add_icosphere(
-            "/hand", RADIUS, color=_bytes(OBSTACLE), position=(0.0, 0.0, 0.0), visible=False
-        )
-        grip = np.zeros(3)  # From the point that is dragged to the centre.
-
-        @self._hand.on_drag
-        async def _(event: Any) -> None:
-            nonlocal grip
-            if live.hand is None or event.phase == "end":
-                return
-            if event.phase == "start":
-                grip = live.hand - self._real(event.start_position)
-            self._ask(partial(live.move_hand, self._real(event.end_position) + grip))
-
-    def _show_hand(self, shown: bool) -> None:
-        """Puts the hand beside the body, or takes it away."""
-        self._refused = ""
-        try:
-            if shown:
-                self._driven.show_hand()
-            else:
-                self._driven.hide_hand()
-        except ResphysError as error:  # The simulation goes on without a hand.
-            self._refused = str(error)
-        self._by_sphere.value = self._driven.hand is not None
 
     def _around(self) -> ObstacleSurface:
         """Obstacles of the robot, with its current parameters."""
@@ -328,9 +295,6 @@ class Page:
             name = _BY_HAND if live.trial is None else live.trial.name
             self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
             self._trial.on_update(lambda _: self._ask(self._choose))
-        self._by_sphere = gui.add_checkbox("Hand", False, hint="A sphere to be dragged, which pushes the body.")
-        self._by_sphere.on_update(lambda _: self._ask(lambda: self._show_hand(self._by_sphere.value)))
-        gui.add_command("Hand", hotkey="H").on_trigger(lambda _: self._ask(lambda: self._show_hand(live.hand is None)))
         for name, robot_input in robot.inputs.items():
             words = f"{robot_input.quantity.plural or robot_input.name}".capitalize() if name != BASE else "Base"
             with gui.add_folder(words, expand_by_default=robot_input.low is not None):
@@ -381,8 +345,6 @@ class Page:
 
     def _reset(self) -> None:
         self._live.reset()
-        if isinstance(self._live, LiveRobot):
-            self._show_hand(False)
         self._set_sliders()
 
     def _choose(self) -> None:
@@ -458,11 +420,6 @@ class Page:
             self._obstacles.vertices = self._shown(self._around().points)
         elif self._obstacles is not None and isinstance(live, LiveRobot) and live.moved:
             self._obstacles.vertices = self._shown(self._surface.moved(live.moved).points)
-        if self._hand is not None and isinstance(live, LiveRobot):
-            if live.hand is not None:
-                self._hand.position = self._shown(live.hand)
-            if self._hand.visible != (live.hand is not None):
-                self._hand.visible = live.hand is not None
         if self._shown_state is live.state and self._shown_trial is live.trial:
             return
         self._shown_state, self._shown_trial = live.state, live.trial
@@ -502,8 +459,6 @@ class Page:
             lines += map(_plain, live.words)
         if live.has_left:
             lines.append("**The body is outside the training range.**")
-        if self._refused:
-            lines.append(f"**No hand: {_plain(self._refused)}**")
         if live.failure:
             lines.append(f"**{_plain(live.failure)}**")
         self._status.content = "\n\n".join(lines)

@@ -191,17 +191,13 @@ class TestUserErrors:
         ("arguments", "sentence"),
         [
             ("experiment=beam_twst", "unknown experiment 'beam_twst', did you mean 'beam_twist'"),
-            ("experiment=zzz", "unknown experiment 'zzz'; known are beam, beam_twist"),
             ("sed=1", "unknown key 'sed', did you mean 'seed'? (--cfg job lists all keys"),
             (
                 "youngs_modulus=1",
                 "unknown key 'youngs_modulus', did you mean 'material.model.youngs_modulus'?",
             ),
-            ("relative=1", "unknown key 'relative', did you mean 'solver.tolerances.relative'?"),
-            ("material.densty=1", "unknown key 'material.densty', did you mean 'material.density'"),
             ("--multirun sed=1,2", "unknown key 'sed', did you mean 'seed'"),
             ("seed=[1", "cannot read the override 'seed=[1'"),
-            ("run seed", "cannot read the override 'seed'"),
             ("seed", "unknown command 'seed' (--help lists all)"),
             ("seed=1 inspct", "unknown command 'inspct', did you mean 'inspect'?"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
@@ -363,6 +359,7 @@ def documented():
     return sorted(line for line in commands_found if "=" in line and not _OWN & {*re.split(r"[ =]", line)})
 
 
+@pytest.mark.slow
 def test_every_documented_line_has_keys_that_exist():
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         for line in documented():
@@ -451,8 +448,6 @@ class TestProcess:
         ("arguments", "code", "lines"),
         [
             ("--help", NOBODY_READS, 0),
-            ("--cfg job", NOBODY_READS, 0),
-            ("seed=1", NOBODY_READS, 0),
             ("--multirun seed=1,2", NOBODY_READS, 0),
             ("sed=1", 2, 1),
         ],

@@ -114,6 +114,7 @@ def test_the_source_archive_holds_kernels_and_configurations_and_a_fallback_vers
         assert {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / folder).rglob(f"*.{suffix}")} <= names
 
 
+@pytest.mark.slow
 def test_the_main_job_runs_from_an_empty_folder(installed, tmp_path):
     where = call(installed / "python", "-c", "import warp_resphys; print(warp_resphys.__file__)", folder=tmp_path)
     assert Path(where.strip()).is_relative_to(installed.parent)
@@ -158,6 +159,7 @@ print(json.dumps(helps))
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_command_runs_from_an_empty_folder(installed, tmp_path):
     arguments = ["mesh=arm_generated", "mesh.layers=0.03", "save=arm.msh", "picture=false"]
     out = call(installed / "warp-resphys", "inspect", *arguments, folder=tmp_path)

@@ -147,16 +147,6 @@ def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a
     assert Path("run/ablation.h5").stat().st_mtime_ns == written
 
 
-@pytest.mark.slow
-def test_the_published_method_gives_the_same_errors(folder):
-    small = [*TINY, "ablation.counts=[4]", "ablation.draws=1", "data.steps=3", "reconstruction.regularisation=1e-4"]
-    assert run(*small)[0] == 0
-    ours = errors()
-    assert run(*small, "reconstruction=lbfgsb")[0] == 0
-    np.testing.assert_allclose(errors(), ours, rtol=1e-3)
-    assert not np.array_equal(errors(), ours)
-
-
 @pytest.mark.parametrize(
     ("overrides", "key"),
     [

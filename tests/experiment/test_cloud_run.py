@@ -175,15 +175,3 @@ def test_two_cameras_have_a_lens_each(beam, folder):
 )
 def test_bad_input_of_clouds_and_lenses_gets_a_sentence(beam, changes, sentence):
     assert sentence in refusal(*FILMED, *film(beam, 1.0), *changes)
-
-
-def test_a_depth_image_of_another_unit_is_said(beam):
-    lenses = film(beam, 1.0)
-    pose = beam[0]
-    depth = np.load(pose / "left.npy")
-    np.save(pose / "left.npy", (1e4 * depth).astype(np.uint16))  # tenths of a millimetre
-    message = refusal(*FILMED, *lenses)
-    assert "left.npy: 0 of its" in message
-    assert "data.cloud.depth_unit of a depth image" in message
-    np.save(pose / "left.npy", depth[:100])
-    assert "left.npy has 640 x 100 pixels, and its mask 640 x 360" in refusal(*FILMED, *lenses)

@@ -12,7 +12,7 @@ from support.played_run import check_robots
 from warp_resphys.data.actuation import InputWaves
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.experiment.report import read_recordings
-from warp_resphys.io.errors import InputError, ResphysError
+from warp_resphys.io.errors import ResphysError
 from warp_resphys.robot.loading import load
 
 OTHER = "{youngs_modulus: 7.5e4, poissons_ratio: 0.45, density: 1070, model: corotated, stiffness_damping: 8.0e-3}"
@@ -93,17 +93,3 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
 def test_trials_and_places_that_do_not_fit_are_refused(given, said):
     with pytest.raises(ResphysError, match=said):
         check(composed("experiment=crawler", *given))
-
-
-def test_waves_are_of_simulated_trials():
-    config = composed("experiment=crawler")
-    config["data"] |= {
-        "folder": ".",
-        "trials": {name: {"file": f"{name}.h5"} for name in ("fast", "back", "slow")},
-        "train": ["fast"],
-        "validation": ["slow"],
-        "test": ["back"],
-    }
-    config["data"]["trials"]["fast"]["waves"] = config["laboratory"]["trials"]["fast"]["waves"]
-    with pytest.raises(InputError, match=r"data\.trials\.fast\.waves is of simulated trials"):
-        check(config)

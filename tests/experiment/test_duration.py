@@ -52,19 +52,6 @@ def test_the_work_is_trials_by_steps_by_epochs(data):
     assert works_of(data, "simfree.trainer.epochs=80")["train_simfree"][2] == pytest.approx(2.0 * batches)
 
 
-def test_an_identification_counts_trials_evaluations_and_parameters(data):
-    ranges = "identify.parameters={youngs_modulus: {lower: 1.0e5, upper: 1.0e6}"
-    one, two = f"{ranges}}}", f"{ranges}, mass_damping: {{lower: 0.0, upper: 9.0}}}}"
-    works = {}
-    for name, own in {"one": one, "two": two}.items():
-        for starts in (1, 2):
-            more = (f"identify.starts={starts}", "identify.candidates=0", "identify.max_evaluations=6")
-            works[name, starts] = works_of(data, own, *more)["identify"][0]
-    assert works["one", 1] == pytest.approx(5 * 6 * 5.0 * 1.2)  # trials, steps, evaluations of 6, and one derivative
-    assert works["two", 1] == pytest.approx(5 * 6 * 5.0 * 1.4)
-    assert works["one", 2] == 2.0 * works["one", 1]
-
-
 def test_a_sentence_says_how_long_and_what_helps(data, monkeypatch):
     """Folds multiply the duration, workers share the reconstruction."""
     folder, _ = data

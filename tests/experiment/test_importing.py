@@ -1,7 +1,6 @@
 """Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
 
 import json
-import logging
 import re
 from pathlib import Path
 
@@ -204,32 +203,6 @@ def test_a_trial_that_is_tested_does_not_say_where_markers_sit(shelf):
     assert np.abs(shelf.bring_in()["bound"] - first).max() > 2e-4
 
 
-def test_a_rate_that_does_not_fit_the_step_keeps_its_frames(shelf, caplog):
-    shelf.write("bare", rate=130.0)
-    with caplog.at_level(logging.INFO):
-        results = shelf.bring_in()
-    assert "bare.h5 has 130 frames per second and the simulation 100 steps" in caplog.text
-    steps = np.diff(results["times"][0])
-    np.testing.assert_allclose(steps[steps > 0.0], 1.0 / 130.0)
-    assert "load52.h5 has" not in caplog.text
-
-
-def test_each_trial_stands_where_the_mean_of_all_does(shelf):
-    shelf.write("load101", positions=shelf.recordings["load101"].positions + [0.002, 0.001, -0.001])
-    whole = shelf.bring_in()
-    shelf.config["data"]["trials"].pop("load101")
-    rest = shelf.bring_in()
-    np.testing.assert_allclose(whole["bound"], rest["bound"], rtol=0.0, atol=3e-5)
-    np.testing.assert_allclose(whole["observed"][2, 0], whole["bound"], rtol=0.0, atol=1e-3)
-    shelf.move("load52", "Tip - 2", [0.0, 0.0012, 0.0])
-    moved = shelf.bring_in()
-    swing, same = (results["observed"][1] - results["bound"] for results in (rest, moved))
-    np.testing.assert_allclose(swing, same, rtol=0.0, atol=4e-4)  # a registration that is turned a little
-    assert moved["held"][1] == pytest.approx(moved["bound"])
-    shift = read_json(shelf.folder / REGISTRATION)["load52"]["shift_mm"]["Tip - 2"]
-    assert np.linalg.norm(shift) == pytest.approx(0.6 * 0.7, abs=0.2)  # half of 1.2 mm, less what the fit takes up
-
-
 def test_a_trial_with_markers_of_its_own(shelf):
     """In one trial a marker sits elsewhere, and has another name: it is bound by that trial, and nowhere else there."""
     whole = shelf.bring_in()
@@ -399,31 +372,6 @@ def test_a_changed_recording_is_imported_again(shelf):
     assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) == before
     shelf.move("load52", "Tip - 1", 1e-6)
     assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) != before
-
-
-def test_the_three_beams(shared_data, tmp_path):
-    run = settings("experiment=beam_real", f"data.folder={shared_data / 'beam_mocap'}")
-    check_run(run)
-    run_stages(acquisition_stages(run), tmp_path)
-    registration = read_json(tmp_path / REGISTRATION)
-    rms = {name: round(trial["rms_mm"], 2) for name, trial in registration.items()}
-    assert rms == {"bare": 0.81, "load52": 0.83, "load101": 1.13}  # docs/registration.md
-    dataset, motions = read_motions(tmp_path, run)
-    bound, gravity = dataset.bound, dataset.gravity
-    assert bool(motions.seen[motions.times < 1.38].all())
-    np.testing.assert_allclose(motions.inputs.attached_mass.sum(1) * 9.80709, [0.0, 0.51012, 1.00062], atol=1e-4)
-    assert int((motions.inputs.attached_mass[1] > 0.0).sum()) == 4
-    nominal = np.array(list(run.markers.tracked.values()))
-    assert np.linalg.norm(bound - nominal, axis=1).max() < 2e-3
-    assert np.degrees(np.arccos(-gravity[2] / np.linalg.norm(gravity))) < 10.0
-    for row, name in enumerate(("gravity", "load52", "load101")):  # a rigid motion keeps every distance
-        tip = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(TIPS).positions.mean(1)
-        farthest = np.linalg.norm(tip - np.median(tip[15:40], axis=0), axis=1).max()
-        moved = (motions.observed - motions.held[:, None])[row].mean(1).nan_to_num().norm(dim=1).max()
-        assert float(moved) == pytest.approx(farthest, rel=0.02)
-        assert farthest > 0.009
-    quality = read_json(tmp_path / QUALITY)
-    assert any("Base - 1 jumps" in warning for warning in quality["load101"]["warnings"])
 
 
 TUTORIAL = [ROOT / "docs" / "bring_your_robot" / f"{page}.md" for page in ("mesh", "first_run", "tentacle")]

@@ -13,10 +13,9 @@ from warp_resphys import select_vertices
 from warp_resphys.experiment import identify_law
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import build_target, initial_state
-from warp_resphys.experiment.trials import all_trials, split_of
+from warp_resphys.experiment.trials import all_trials
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.learning.baselines import BASELINES
-from warp_resphys.mesh.poses import twisted
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.stepping.inputs import Inputs
@@ -115,18 +114,6 @@ class TestALawThatHelps:
         assert trials["160 g"]["resphys"] != trials["160 g"]["law"]
         assert finished_experiment(rubber).sources("resphys") == (LAW, LAW)
 
-    def test_the_force_of_a_robot_fades_out_as_well(self, rubber):
-        robot = warp_resphys.load(rubber, model="resphys")
-        rest = robot.simulator.rest_positions
-        data = finished_experiment(rubber).dataset
-        seen = torch.as_tensor(np.stack([data.observed[0, 4], data.velocity[0, 4]])).to(rest)
-        twist = twisted(rest, rest.new_tensor([np.pi / 2.0]))[0]
-        with torch.no_grad():
-            state = State(torch.stack([seen[0], twist]), torch.stack([seen[1], torch.zeros_like(rest)]))
-            force = robot._predictor(None, None)(state, 0)
-        assert force[0].abs().max() > 0.0
-        assert not force[1].any()
-
     def test_another_run_takes_it(self, rubber, tmp_path):
         others = [word for word in RUBBER if not word.startswith("law.")]
         given = read(rubber, "law.json")
@@ -181,8 +168,6 @@ class TestALawThatDoesNotHelp:
         ),
         (["law.terms=[ogden_2]"], r"^law\.terms: ogden has the exponent 2"),
         (["data.others.a={weight_g:50,twist_deg:10}"], r"^data\.others\.a\.weight_g is 50 and twist_deg 10: "),
-        (["data.others.a={direction:[0,0,1]}"], r"^data\.others\.a\.weight_g is 0 and twist_deg 0: "),
-        (["data.others.a={weight_g:50,direction:[0,0,0]}"], "others.a.direction"),
         (["data.others.a={weight_g:50,at:{x:0.3}}"], r"data\.others\.a\.at: no vertex lies"),
         (["law.relaxation_times=[0.1,0.01]"], r"law\.relaxation_times.* must rise"),
     ],
@@ -223,11 +208,6 @@ class TestOtherLoads:
         assert not state.v.any()
         return simulator, dict(zip((trial.name for trial in trials), state.q, strict=True))
 
-    def test_they_are_in_the_test_split_alone(self):
-        split = split_of(settings("experiment=law_beam"))
-        assert split.test == ("70 g", "120 g", "140 g", "200 g", "220 g", *OTHERS)
-        assert not {*OTHERS} & {*split.train, *split.validation}
-
     @pytest.mark.parametrize(
         ("name", "x", "weight"),
         [
@@ -249,8 +229,3 @@ class TestOtherLoads:
         moved = float((released - q).abs().max())
         assert moved > 1e-4
         assert float((balanced - q).abs().max()) < 1e-4 * moved
-
-    def test_a_twist_turns_the_tip(self, held):
-        simulator, states = held
-        expected = twisted(simulator.rest_positions, simulator.tensor([np.pi / 2.0]))[0]
-        torch.testing.assert_close(states["twist 90°"], expected)

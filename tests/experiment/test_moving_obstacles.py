@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run
@@ -16,15 +15,13 @@ from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.data.obstacle_motion import contact_inputs, recorded
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.energies.contact import Contact
-from warp_resphys.energies.obstacles import Box, ObstacleSet, Pose, Sphere
-from warp_resphys.experiment.build import build_simulator
+from warp_resphys.energies.obstacles import Box, Sphere
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.settings.trials import MotionSettings
-from warp_resphys.stepping.inputs import Inputs
 
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN]
 PUSHED = [
@@ -82,24 +79,6 @@ def test_inputs_of_contact_move_obstacles_rigidly():
     np.testing.assert_allclose(moved.points[:, corners], expected, atol=1e-15)
     assert np.ptp(expected, axis=0).max() > 0.02
     np.testing.assert_array_equal(moved.at(3).points, moved.points[3])
-
-
-def test_obstacles_are_drawn_where_contact_has_them():
-    """Corners at identified and moved poses are at the distance zero from the obstacle of the simulator."""
-    text = "{block: {shape: box, position: [0.05, 0.015, -0.04], edges: [0.02, 0.03, 0.04], moves: true}}"
-    configured = settings("mesh.divisions=[4,1,1]", f"obstacles={text}")
-    simulator = build_simulator(configured, configured.simulation)
-    parameters = {"obstacle_x": 0.004, "obstacle_turn_y": 0.2}
-    inputs = contact_inputs(simulator.body, {"block": prescribed(swing(), np.array([0.4]))})
-    tensors = {name: simulator.tensor([[value]]) for name, value in parameters.items()}
-    acting = Inputs(**{name: simulator.tensor(values) for name, values in inputs.items()})
-    memory = simulator.step(simulator.rest_state(), acting, tensors)[0].memory
-    (contact,) = simulator.body.energies
-    shapes = ObstacleSet(tuple(contact.obstacles.values()), 1e-3, torch.device("cpu"))
-    pose = Pose(memory["contact_place"], memory["contact_turn"], torch.zeros(1, 1, dtype=torch.float64))
-    surface = ObstacleSurface.of(simulator.body, parameters).moved(inputs)
-    assert shapes.distances(torch.from_numpy(surface.points), pose)[0].abs().max() < 1e-12
-    assert np.abs(surface.points - ObstacleSurface.of(simulator.body).points).max() > 0.01
 
 
 def shown(poses, places, rate=100.0, labels=("ball",)):

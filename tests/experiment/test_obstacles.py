@@ -2,14 +2,13 @@
 
 from unittest.mock import MagicMock
 
-import meshio
 import numpy as np
 import pytest
 import torch
 
 from support.configured import check, composed, settings
 from warp_resphys.energies.contact import Contact
-from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
+from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
@@ -29,30 +28,6 @@ FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
 TWO = (
     "{floor: {shape: half_space, position: [0, 0, -0.05]}, ball: {shape: sphere, position: [0, 0, 0.1], radius: 0.01}}"
 )
-
-
-def test_every_shape_is_built_with_its_own_friction():
-    shapes = {
-        "floor": "{shape: half_space, position: [0, 0, -0.1], axis: [0, 1, 1]}",
-        "ball": "{shape: sphere, radius: 0.01}",
-        "finger": "{shape: capsule, radius: 0.01, length: 0.03}",
-        "bar": "{shape: cylinder, radius: 0.02, length: 0.04, axis: [0, 1, 0]}",
-        "block": "{shape: box, edges: [0.1, 0.2, 0.3]}",
-    }
-    obstacles = ", ".join(f"{name}: {text}" for name, text in shapes.items())
-    friction = "{block: 0.5, floor: 0.1, ball: 0.2, finger: 0.3, bar: 0.4}"
-    contact = build_contact(
-        settings(f"obstacles={{{obstacles}}}", f"contact={{friction: {friction}, distance: 2e-3, stiffness: 5e4}}")
-    )
-    assert dict(contact.obstacles) == {
-        "floor": HalfSpace(position=(0.0, 0.0, -0.1), axis=(0.0, 1.0, 1.0)),
-        "ball": Sphere(radius=0.01),
-        "finger": Capsule(radius=0.01, length=0.03),
-        "bar": Cylinder(radius=0.02, length=0.04, axis=(0.0, 1.0, 0.0)),
-        "block": Box(edges=(0.1, 0.2, 0.3)),
-    }
-    assert contact.constants["contact_friction"] == [0.1, 0.2, 0.3, 0.4, 0.5]
-    assert (contact.stiffness, contact.distance, contact.slip_speed) == (5e4, 2e-3, 1e-3)
 
 
 def test_regions_of_the_body_have_factors_of_friction():
@@ -158,14 +133,6 @@ def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
     for _ in range(12):
         state, again = robot.step(state), loaded.step(again)
     np.testing.assert_array_equal(again.q, state.q)
-
-
-def test_files_of_a_motion_have_the_obstacle_where_identification_put_it(robot, tmp_path):
-    motion = robot.rollout(robot.begin(), 2)
-    motion.write_vtk(tmp_path / "beam.pvd")
-    plate = meshio.read(tmp_path / "beam_obstacles" / "beam_obstacles_2.vtu")
-    assert plate.points[:, 2].max() == pytest.approx(-4e-3)
-    assert len(plate.cells_dict["triangle"]) == 12
 
 
 def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):

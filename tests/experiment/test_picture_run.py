@@ -72,12 +72,6 @@ def test_the_material_of_a_simulated_laboratory_comes_back(played):
     assert (folder / "figures" / "outlines.png").stat().st_size > 1e4
 
 
-@pytest.mark.slow
-def test_other_commands_say_what_pictures_are(played):
-    folder, _ = played
-    assert "has pictures, from which no robot is made" in refusal("view", f"run={folder}")
-
-
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
     """Folder of the pictures of a simulated camera."""

@@ -1,7 +1,5 @@
 """Configurations of experiments on recordings: what is refused, what a budget changes, and which choice wins."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,6 @@ from warp_resphys.io.settings import parse
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.settings.trials import Split
 
-ROOT = Path(__file__).parents[2]
 REAL = ("experiment=beam_real", "data.folder=recordings")
 
 
@@ -145,11 +142,6 @@ def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
         split_of(settings("experiment=fish_tail", "data.folder=recordings", "data.train_fraction=1"))
 
 
-def test_a_budget_takes_fewer_simulated_trials():
-    split = split_of(settings("experiment=beam_real", "budget=quick"))
-    assert [len(part) for part in (split.train, split.validation, split.test)] == [3, 1, 1]
-
-
 def test_a_budget_takes_fewer_folds():
     folds = folds_of(settings(*REAL, "budget=quick"))
     assert {name: fold.train for name, fold in folds.items()} == {"bare": ("load52", "load101")}
@@ -177,27 +169,6 @@ def test_a_network_or_trainer_on_the_command_line_is_taken_whole(group, option):
     assert getattr(run, group) == getattr(run.simfree, group) == wanted
     other = "network" if group == "trainer" else "trainer"
     assert getattr(run, other) == getattr(settings("experiment=beam_synthetic"), other)
-
-
-@pytest.mark.parametrize(
-    ("experiment", "modes", "layers"), [("beam_real", (2, 2, 2), 0), ("beam_synthetic", (3, 3, 4), 2)]
-)
-def test_without_a_choice_few_recordings_train_a_small_network(experiment, modes, layers):
-    run, default = settings(f"experiment={experiment}"), settings()
-    network = run.network
-    assert (network.kind, network.blocks, network.layers, network.width) == ("reduced", 1, layers, 16)
-    assert (network.position_modes, network.velocity_modes, network.force_modes) == modes
-    own = {"position_modes": 6, "velocity_modes": 6, "layers": 3, "width": 128}
-    assert run.simfree.network == network.changed(**own)
-    assert run.simfree.trainer == default.trainer.changed(epochs=200, rollout_every=20)
-    assert run.trainer == default.trainer
-
-
-def test_the_identification_of_e_and_nu_alone_can_be_left_out():
-    run = settings(*REAL, "identify.elastic=null", "~identify.parameters.mass_damping")
-    check_run(run)
-    assert run.identify.elastic is None
-    assert list(run.identify.parameters) == ["youngs_modulus", "stiffness_damping"]
 
 
 @pytest.mark.parametrize("experiment", ["beam_oscillation", "sopra"])

@@ -1,6 +1,5 @@
 """A rigid body on a hanging cap: its mounting follows from the pose of its part, and is refused where none shows it."""
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +10,7 @@ from support.configured import settings
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.rigid_bodies import angles, motion_between
-from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
-from warp_resphys.experiment.reading import Reader
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.io.stages import run_stages
@@ -95,34 +92,6 @@ def standing(path, places, frames=20, **arrays):
     repeated = (np.repeat(np.array(x)[None], frames, 0) for x in ([*places.values()], turns))
     named = dict(zip(("positions", "quaternions"), repeated, strict=True))
     np.savez(path, labels=[*places], rate_hz=100.0, **named, **arrays)
-
-
-def test_a_trial_without_a_rigid_body_is_named(tmp_path, caplog):
-    """A trial has all points of the rigid bodies among its labels, and none of others."""
-    places = {"plate": [0.095, 0.015, 0.015], "tip": [0.1, 0.015, 0.03], **BASES}
-    trials = []
-    for name, absent in (("a", "tip"), ("b", "plate")):
-        kept = {label: place for label, place in places.items() if label != absent}
-        standing(tmp_path / f"{name}.npz", kept)
-        trials.append(f"{name}: {{file: {name}.npz, begins: static, labels: [{', '.join(kept)}]}}")
-    run = settings(
-        *HANGS,
-        "+markers.tracked={tip: [0.1, 0.015, 0.03]}",
-        f"data.folder={tmp_path}",
-        f"data.trials={{{', '.join(trials)}}}",
-        "~data.folds",
-        "data.train=[a]",
-        "data.test=[b]",
-    )
-    imported = acquisition_stages(run)[0].settings
-    reader = Reader(imported, tmp_path, build_simulator(imported, imported.simulation), None)
-    with caplog.at_level(logging.INFO):
-        reader.read(imported.trials)
-    warned = [record.getMessage() for record in caplog.records if record.name.endswith("reading")]
-    assert warned == [
-        "import: a has no 'tip', by data.trials.a.labels",
-        "import: b has no 'plate', by data.trials.b.labels",
-    ]
 
 
 def test_a_rest_without_an_orientation_is_refused(tmp_path):

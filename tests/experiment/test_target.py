@@ -48,16 +48,6 @@ def test_keys_that_are_left_out_are_those_of_the_simulator():
     assert settings("experiment=sopra_fibres", "laboratory.fibres=null").laboratory.fibres is None
 
 
-def test_null_takes_a_constant_of_the_target_out():
-    rubber = ("target.material.model=mooney_rivlin", "target.material.c10=30e3")
-    own = settings("target.youngs_modulus=null", "target.poissons_ratio=null", *rubber).target.material
-    assert own.model == "mooney_rivlin"
-    assert own.constants == {"c10": 30e3, "density": 1070.0, "mass_damping": 0.0, "stiffness_damping": 0.0}
-    check(composed("target.youngs_modulus=null", "target.poissons_ratio=null", *rubber))
-    with pytest.raises(InputError, match=r"target\.material: mooney_rivlin has no constant '(youngs|poissons)_"):
-        check(composed(*rubber))
-
-
 def test_a_law_of_the_material_is_a_model_as_any_other():
     out = [f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping")]
     law = "simulation={model:law,c10:40e3,bulk_1:2e6,ogden_m3:5e3,shear_viscosity:20.0}"

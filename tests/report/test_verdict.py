@@ -104,6 +104,7 @@ class TestSentences:
         assert "kernel regression without physics is 340 times more accurate than ResPhys (90 % interval " in first
         assert first.endswith("so this split cannot judge a simulator.")
         assert do.startswith("To judge the simulator, test it on trials unlike those of the training")
+        assert recommended(known_errors(errors)) == ""
 
     def test_a_difference_that_other_draws_of_the_trials_do_not_show(self):
         said = sentences({**self.ERRORS, "resphys": [0.5, 0.6, 0.6, 0.5, 0.6]})

@@ -1,21 +1,24 @@
-"""A picture of a body at rest with its chambers or tendons."""
+"""Pictures of a body at rest: with its chambers or tendons, and with its registered markers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 
 from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
-from .bodies import face_edges, obstacle_layers, sharp_edges
+from .bodies import face_edges, obstacle_layers, sharp_edges, stems
+from .data import Recordings
 from .figures import CHAMBER_COLOURS, in_style
 from .obstacles import ObstacleSurface
 from .render import (
@@ -26,6 +29,7 @@ from .render import (
     FloatArray,
     IntArray,
     Layer,
+    Pixels,
     Renderer,
     RenderScene,
     View,
@@ -48,6 +52,9 @@ _ENTRY: Final = 1.9  # Width of an entry of the legend [inch]
 _LINE: Final = 0.24  # Height of a line of text [inch]
 _CUBIC_CENTI: Final = 1e6
 _ROPE: Final = 4.0  # Width of a tendon over that of a thin line.
+_SIDES: Final = {"From above": TOWARDS_VIEWER, "From the side": (0.0, -1.0, 0.0)}  # Towards the viewer.
+_RING: Final = 1.6  # Radius of a nominal position's ring, in radii of a marker.
+NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +113,89 @@ def draw_mesh(
     ]
     labels += [name.replace("_", " ") for name in summary.tendons]
     handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
-    titles = ["Outside", "Cut open", summary.inside][: len(views)]
-    width, height = len(views) * size[0] / _DPI, size[1] / _DPI
+    figure = _with_titles(picture, ["Outside", "Cut open", summary.inside][: len(views)], handles)
+    with atomic_path(path) as target:
+        figure.savefig(target, format="png", dpi=_DPI)
+
+
+@in_style()
+def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, renderer: Renderer | None = None) -> None:
+    """Draw the translucent body, its measured markers on stems, and rings at their nominal positions, from two sides.
+
+    Lines connect rings with the markers outside of them, whose names and residuals are written beside them.
+
+    Args:
+        path: The PNG file to write.
+        recordings: With the markers; those that were not seen are not drawn.
+        fixed: Vertices of the clamped region.
+        renderer: Process that draws, in place of a new one.
+
+    Raises:
+        DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
+        DataFileError: The file cannot be written.
+    """
+    mesh, markers = recordings.mesh, recordings.positions
+    radius = _DOT * float(np.ptp(mesh.vertices, axis=0).max())
+    ends = np.concatenate([markers, recordings.nominal])
+    shown = np.concatenate([mesh.vertices, ends - _RING * radius, ends + _RING * radius])
+    turned = [view_axes(towards) for towards in _SIDES.values()]
+    frames = [frame_of(shown, axes, _MARGIN) for axes in turned]
+    half = np.max([own for _, own in frames], axis=0)
+    half = np.maximum(half, _NARROWEST * half.max())
+    size = picture_size(half, _LONGER_SIDE)
+    away = np.linalg.norm(markers - recordings.nominal, axis=1) > _RING * radius  # Not those that were not seen.
+    layers = _registered(recordings, fixed, away, radius, max(1.0, size[1] / 900.0))
+    views = [View(layers, axes, focus, half[1]) for axes, (focus, _) in zip(turned, frames, strict=True)]
+    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
+    none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
+    handles = [
+        Line2D([], [], **none, color=MEASURED, label="measured"),
+        Line2D([], [], **none, color=NOMINAL, markerfacecolor="none", markersize=9, label="nominal"),
+        *([Patch(color=CLAMPED, label="clamped")] if len(fixed) else []),
+    ]
+    figure = _with_titles(picture, list(_SIDES), handles)
+    for at, (axes, (focus, _)) in enumerate(zip(turned, frames, strict=True)):
+        across, up = ((markers - focus) @ axes[:2].T).T / half[1] * (0.5 * size[1])  # [px] from the middle.
+        for marker in np.flatnonzero(away):
+            place: Any = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
+            name = f"{recordings.labels[marker]}: {recordings.residual_mm[marker]:.2f} mm"
+            name += ", left out" * (recordings.labels[marker] in recordings.outliers)
+            left = across[marker] > 0.0
+            figure.axes[0].annotate(
+                name,
+                place,
+                (-9 if left else 9, 0),
+                textcoords="offset points",
+                ha="right" if left else "left",
+                va="center",
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            )
+    with atomic_path(path) as target:
+        figure.savefig(target, format="png", dpi=_DPI)
+
+
+def _registered(recordings: Recordings, fixed: IntArray, away: FloatArray, radius: float, line: float) -> list[Layer]:
+    """Layers of the body and its markers; those outside of their rings (M,) are connected with them."""
+    mesh, markers, nominal = recordings.mesh, recordings.positions, recordings.nominal
+    q, triangles, seen = mesh.vertices, boundary_triangles(mesh), np.isfinite(markers).all(axis=1)
+    layers = [
+        Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28)),
+        Layer("lines", q, face_edges(mesh), INK, opacity=0.22, size=line),
+        Layer("rings", nominal, None, NOMINAL, size=_RING * radius, shift=4.0 * radius),
+    ]
+    if len(sharp := sharp_edges(q, triangles)):
+        layers.append(Layer("lines", q, sharp, CLAMPED, opacity=0.75, size=1.8 * line))
+    if len(clamped := triangles[np.isin(triangles, fixed).all(axis=1)]):
+        layers.append(Layer("surface", q, clamped, CLAMPED, opacity=0.75, light=(0.7, 0.22), shift=0.1 * radius))
+    if seen.any():
+        layers.append(stems(recordings.feet[seen], markers[seen], INK, 3.0 * line))
+        layers.append(Layer("balls", markers[seen], None, MEASURED, size=radius, light=(0.72, 0.41)))
+    return [*layers, *([stems(nominal[away], markers[away], NOMINAL, 2.0 * line)] if away.any() else [])]
+
+
+def _with_titles(picture: Pixels, titles: Sequence[str], handles: Sequence[Any]) -> Figure:
+    """A figure of views side by side, in pixels, with titles above and a legend below."""
+    width, height = picture.shape[1] / _DPI, picture.shape[0] / _DPI
     columns = max(1, int(width / _ENTRY))
     legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0
     total = height + legend + _LINE
@@ -119,8 +207,7 @@ def draw_mesh(
         figure.text((at + 0.5) / len(titles), 1.0, title, ha="center", va="top")
     if handles:
         figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False)
-    with atomic_path(path) as target:
-        figure.savefig(target, format="png", dpi=_DPI)
+    return figure
 
 
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:

@@ -219,10 +219,12 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     shown = f"The body at rest with the registered markers of the trial {recordings.drawn}"
 
     def picture(path: Path) -> Drawn:
-        from .registration_picture import draw_registration
+        from .body_picture import draw_registration
 
         draw_registration(path, recordings, data.fixed, canvas.renderer)
-        caption = f"{shown}, which fits worst. Rings are nominal positions of the markers."
+        caption = (
+            f"{shown}, which fits worst. Rings are nominal positions; a line leads to a marker outside of its ring."
+        )
         return drawn_file(path, f"{shown}, from two sides.", caption)
 
     blocks = canvas.attempt("registration.png", picture)

@@ -150,9 +150,12 @@ def best_pair(known: Known) -> tuple[str, str]:
 def recommended(known: Known) -> str:
     """Returns the simplest model that is not significantly worse than the one of least mean error; empty without any.
 
-    With fewer than five trials it is the one of least mean error.
+    With fewer than five trials it is the one of least mean error. Where that one knows only what lies between the
+    training trials, the split cannot judge a simulator, and none is recommended.
     """
     best = _least(known, _RANKED)
+    if best in _BETWEEN:
+        return ""
     others = {m: ModelComparison(best, m, known[best], own) for m, own in known.items() if m != best}
     worse = {model for model, own in others.items() if own.outcome in ("helps", "few")}
     return next((model for model in _RANKED if model in known and model not in worse), "")

@@ -40,7 +40,7 @@ def test_a_logarithmic_axis_has_enough_labels(errors, labels):
 def test_lines_have_their_style_in_every_panel_and_none_hides_another():
     still = np.zeros((20, 3))
     paths = {"target": np.sin(still + np.arange(20)[:, None]), "regression": still, "sysid": still, "resphys": still}
-    motion, distance = motion_figures.tip_displacement(paths, 0.01, narrow=False).axes
+    motion, distance = motion_figures.tip_displacement(paths, 0.01).axes
     above, below = ({line.get_label(): line for line in axes.lines} for axes in (motion, distance))
     for label in ("Regression", "SysID", "ResPhys"):
         assert above[label].get_linestyle() == below[label].get_linestyle()
@@ -53,7 +53,7 @@ def test_lines_have_their_style_in_every_panel_and_none_hides_another():
 class TestErrors:
     def test_a_model_without_error_does_not_hide_the_others(self):
         rows = np.full((2, 5), 0.5)
-        (axes,) = figures.error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01, narrow=False).axes
+        (axes,) = figures.error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01).axes
         low, high = axes.get_ylim()
         assert axes.get_yscale() == "log"
         assert low <= 0.5 <= high
@@ -63,25 +63,25 @@ class TestErrors:
         rows = np.ones((2, 200))
         rows[:, 100:110] = 9.0
         rows[1, 180:] = np.inf
-        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, window=1.0, narrow=True).axes
+        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, window=1.0).axes
         thin, thick = axes.lines
         assert thin.get_linewidth() < 1.0 < thick.get_linewidth()
         assert np.nanmax(thin.get_ydata()) == 9.0
         assert np.nanmax(thick.get_ydata()) == 1.0
         np.testing.assert_allclose(thick.get_xdata()[[0, -1]], [0.0, 1.99])
         assert np.isnan(thin.get_ydata()[180:]).all()
-        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, narrow=False).axes
+        (axes,) = figures.error_over_time({"resphys": rows}, 0.01).axes
         (only,) = axes.lines
         assert np.nanmax(only.get_ydata()) == 9.0
 
     def test_lines_end_where_a_trial_diverged(self):
         rows = np.array([[1.0, 1.0, 1.0], [3.0, np.nan, np.inf]])
-        (line,) = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0), narrow=False).axes[0].lines
+        (line,) = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0)).axes[0].lines
         np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
 
     def test_points_are_missing_where_a_rollout_diverged(self):
         errors = {"resphys": {1.0: 2.0, 1.5: 3.0}, "simfree": {1.0: 4.0}}
-        (axes,) = figures.error_over_scale(errors, narrow=False).axes
+        (axes,) = figures.error_over_scale(errors).axes
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, 3.0])
         np.testing.assert_array_equal(axes.lines[1].get_ydata(), [4.0, np.nan])
 
@@ -89,14 +89,14 @@ class TestErrors:
 class TestLearning:
     def test_one_epoch_is_seen_and_named_by_a_whole_number(self):
         record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
-        losses, rate = learning_figures.training_curves([record], narrow=False).axes
+        losses, rate = learning_figures.training_curves([record]).axes
         assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
         low, high = rate.get_xlim()
         assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
 
     def test_the_start_that_was_kept_is_bold(self):
         histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
-        (axes,) = learning_figures.loss_histories(histories, narrow=False).axes
+        (axes,) = learning_figures.loss_histories(histories).axes
         assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
         np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
 
@@ -104,7 +104,7 @@ class TestLearning:
 class TestMotion:
     def test_a_model_that_runs_away_does_not_set_the_scale(self):
         wild = MEASURED + np.exp(50.0 * TIMES)[:, None, None]
-        figure = motion_figures.marker_paths(TIMES, MEASURED, {"resphys": wild}, ["A"], narrow=False)
+        figure = motion_figures.marker_paths(TIMES, MEASURED, {"resphys": wild}, ["A"])
         spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
         assert spans[2] < 50.0
         assert 0.05 * np.ptp(MEASURED[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
@@ -115,14 +115,14 @@ class TestMotion:
         measured[10] = np.nan
         wild = measured * np.exp(angle)[:, None]
         wild[40:] = np.nan
-        flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild}, narrow=False)
+        flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild})
         for axes in flat.axes:
             assert np.ptp(axes.get_xlim()) == np.ptp(axes.get_ylim()) < 70.0  # [mm], of a motion of 40
 
     def test_prediction_intervals_are_bands_around_their_model(self):
         shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}
         widths = {"resphys": np.linspace(1e-3, 3e-3, 20)[:, None]}
-        figure = motion_figures.marker_paths(TIMES, MEASURED, shown, ["A"], bands=widths, narrow=False)
+        figure = motion_figures.marker_paths(TIMES, MEASURED, shown, ["A"], bands=widths)
         (band,) = figure.axes[2].collections
         corners = band.get_paths()[0].vertices
         for time, middle, width in zip(TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True):
@@ -133,7 +133,7 @@ class TestMotion:
         times = 0.1 * np.arange(4)
         moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
         driven = Driven(PRESSURE, ("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
-        figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven, narrow=False)
+        figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven)
         *coordinates, below = figure.axes
         assert len(coordinates) == 3
         assert all(axes.get_xlim() == below.get_xlim() for axes in coordinates)
@@ -147,7 +147,7 @@ class TestInputs:
     def test_pressures_are_in_kilopascal_in_the_chambers_colours(self):
         pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
         driven = Driven(PRESSURE, ("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
-        figure = motion_figures.input_sequences(0.5, driven, narrow=False)
+        figure = motion_figures.input_sequences(0.5, driven)
         first, second = figure.axes
         assert second.get_xlim() == (0.0, 1.0)
         assert [line.get_ydata()[0] for line in first.lines] == [20.0]
@@ -158,7 +158,7 @@ class TestInputs:
 
     def test_those_of_poses_are_bars_of_the_chambers_in_use(self):
         poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b (test)": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
-        figure = motion_figures.pose_inputs(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4), narrow=False)
+        figure = motion_figures.pose_inputs(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4))
         (axes,) = figure.axes
         assert axes.get_xlabel() == "pressure [kPa]"
         assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
@@ -173,13 +173,12 @@ class TestInputs:
         assert input_sequences(replace(driven, poses=tuple("pabq")), trials) == {}
 
 
-@pytest.mark.parametrize("narrow", [False, True])
-def test_followed_paths_are_drawn_in_their_plane(narrow):
+def test_followed_paths_are_drawn_in_their_plane():
     path = np.stack([np.linspace(0.0, 0.02, 5), np.zeros(5), np.linspace(0.0, 0.01, 5)], axis=1)
     paths = [
         FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path}) for name in ("line", "bow")
     ]
-    figure = motion_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]], narrow=narrow)
+    figure = motion_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]])
     asked, driven = figure.axes[0].lines
     np.testing.assert_allclose(np.ptp(asked.get_xdata()), 20.0)  # [mm]
     np.testing.assert_allclose(np.ptp(driven.get_ydata()), 11.0)

@@ -39,7 +39,7 @@ def no_figures(no_drawing, monkeypatch):
 
     def figure(canvas, name, _, alt, caption):
         (canvas.folder / f"{name}.png").touch()
-        return Drawn(name, caption, Picture("data:,", "data:,", alt))
+        return Drawn(name, caption, Picture("data:,", alt))
 
     monkeypatch.setattr(Canvas, "figure", figure)
 

@@ -95,7 +95,7 @@ def test_errors_of_exactly_zero_are_a_report(tmp_path):
     write_run(tmp_path, SETTINGS, models=("reconstruction",))
     trials = read_trials(tmp_path, SETTINGS)
     trials.positions["reconstruction"][:] = trials.target
-    figure = figures.error_over_time(trials.errors_mm, 0.01, narrow=False)
+    figure = figures.error_over_time(trials.errors_mm, 0.01)
     assert "zero, or diverged, throughout" in [text.get_text() for text in figure.axes[0].texts]
     assert "0.000" in report(tmp_path, SETTINGS).text
 

@@ -133,17 +133,16 @@ def describe_boxes(metrics: Mapping[str, Any]) -> str:
 
 
 @in_style()
-def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float, *, narrow: bool) -> Figure:
+def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
     """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
 
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
         uncorrected: Error without any correction [mm].
-        narrow: Whether the figure is for a narrow page.
     """
     ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
     grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
-    figure = new_figure(3.6, 3.4, narrow=narrow)
+    figure = new_figure(3.6)
     axes, count = figure.subplots(), len(errors)
     lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
     axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)

@@ -1,6 +1,6 @@
 """The style of all figures, and the figures of errors.
 
-Every figure exists in two widths, for a page and, with `narrow`, for a phone. Its colours follow the reader's theme.
+Their colours follow the reader's theme.
 """
 
 import io
@@ -60,7 +60,6 @@ FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', A
 ROUND_STEPS: Final = (1, 2, 5, 10)  # Distances of ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
-NARROW: Final = 3.7  # [in]
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
 _DASHED: Final = {
     **dict.fromkeys(BASELINES, (0, (2, 1))),
@@ -117,7 +116,6 @@ def error_over_time(
     of: str = "vertex",
     window: float | None = None,
     panels: Mapping[str, Sequence[int]] | None = None,
-    narrow: bool,
 ) -> Figure:
     """Draw each model's mean error over time and, for the main models, the range of the trials.
 
@@ -128,12 +126,10 @@ def error_over_time(
         window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
             unfiltered one as a thin line. None for no filter.
         panels: Rows of trials by title, with a panel for each; without any, one panel has all trials.
-        narrow: Whether the figure is for a narrow page; panels are then stacked.
     """
     groups: dict[str, Any] = {**panels} if panels else {"": slice(None)}
-    figure = new_figure(3.5, 1.2 + 2.7 * len(groups), narrow=narrow)
-    shape = (len(groups), 1) if narrow else (1, len(groups))
-    every = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    figure = new_figure(3.5)
+    every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
     lowest: list[float] = []
     for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
         lowest += _error_lines(axes, {model: own[rows] for model, own in errors.items()}, times, window)
@@ -146,7 +142,7 @@ def error_over_time(
         axes.set_xlabel("time [s]")
     for axes in every[:, 0]:
         axes.set_ylabel(f"mean {of} error [mm]")
-    legend_above(figure, every[0, 0], narrow=narrow)
+    legend_above(figure, every[0, 0])
     return figure
 
 
@@ -181,9 +177,9 @@ def mean_of_trials(rows: FloatArray) -> FloatArray:
 
 
 @in_style()
-def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: bool) -> Figure:
+def error_over_scale(errors: Mapping[str, Mapping[float, float]]) -> Figure:
     """Draw the mean errors [mm] by model over the scale of the inputs, without those that diverged."""
-    figure = new_figure(3.0, 3.6, narrow=narrow)
+    figure = new_figure(3.0)
     axes = figure.subplots()
     scales = sorted({scale for means in errors.values() for scale in means})
     for model, means in errors.items():
@@ -192,7 +188,7 @@ def error_over_scale(errors: Mapping[str, Mapping[float, float]], *, narrow: boo
     use_logarithm(axes)
     axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
     axes.set(xlabel="inputs over those of the training", ylabel="mean marker error [mm]")
-    legend_above(figure, axes, narrow=narrow)
+    legend_above(figure, axes)
     return figure
 
 
@@ -234,16 +230,15 @@ def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
     return {**look, "linewidth": width, "label": LABELS[model]}
 
 
-def new_figure(height: float, narrow_height: float, *, narrow: bool) -> Figure:
-    """Return an empty figure of one of the two widths, with its height for each of them [in]."""
-    size = (NARROW, narrow_height) if narrow else (WIDE, height)
-    return Figure(figsize=size, layout="constrained")
+def new_figure(height: float) -> Figure:
+    """Return an empty figure of the page's width and a height [in]."""
+    return Figure(figsize=(WIDE, height), layout="constrained")
 
 
-def legend_above(figure: Figure, axes: Axes, *, narrow: bool) -> None:
-    """Put the legend above the figure: in rows of four, or of two in a narrow figure."""
+def legend_above(figure: Figure, axes: Axes) -> None:
+    """Put the legend above the figure, in rows of four if there are many names."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = 2 if narrow else len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
+    columns = len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 

@@ -19,20 +19,19 @@ _MARGIN: Final = 0.15  # Of the drawn range, over the range of the strains.
 
 
 @in_style()
-def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Figure:
+def training_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the losses and, where they were recorded, the validation roll-out error and the learning rate.
 
     Args:
         records: One for each epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or all epochs
             `rollout_error_mm` and `learning_rate`; values that were not measured are None or absent.
-        narrow: Whether the figure is for a narrow page.
     """
     heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
     heights = {key: height for key, height in heights.items() if key == "losses" or len(_measured(records, key)[0])}
     muted, strong = TONES["muted"].light, TONES["resphys"].light
     thin: dict[str, Any] = {"linewidth": 1.1, "marker": "." if len(records) == 1 else ""}
     height = 0.6 + 0.57 * sum(heights.values())
-    figure = new_figure(height, height + 0.2, narrow=narrow)
+    figure = new_figure(height)
     rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()])[:, 0]
     axes = dict(zip(heights, rows, strict=True))
     for key, label, colour in (
@@ -58,16 +57,14 @@ def training_curves(records: Sequence[Mapping[str, Any]], *, narrow: bool) -> Fi
 
 
 @in_style()
-def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]], *, narrow: bool) -> Figure:
+def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> Figure:
     """Draw the best loss so far over the evaluations of each start, with a panel for each identification.
 
     Args:
         histories: By identification: for every start its records with `loss`, one for each evaluation.
-        narrow: Whether the figure is for a narrow page.
     """
-    shape = (len(histories), 1) if narrow else (1, len(histories))
-    figure = new_figure(2.6, 0.4 + 2.1 * len(histories), narrow=narrow)
-    panels = list(figure.subplots(*shape, sharey=True, squeeze=False).flat)
+    figure = new_figure(2.6)
+    panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
         ends = [record["loss"] for start in starts for record in start if record["loss"] is not None]
         for start in filter(None, starts):
@@ -81,8 +78,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
         _count(axes.xaxis, 5)
     for axes in panels:  # Once everything is drawn, as they share their axis.
         use_logarithm(axes)
-    for axes in panels if narrow else panels[:1]:
-        axes.set_ylabel("loss")
+    panels[0].set_ylabel("loss")
     return figure
 
 
@@ -122,8 +118,6 @@ def stress_over_stretch(
     curves: Mapping[str, tuple[FloatArray, FloatArray]],
     modulus: float,
     ranges: Mapping[str, tuple[float, float]],
-    *,
-    narrow: bool,
 ) -> Figure:
     """Draw stress against stretch, the line of Young's modulus dashed, and the stretches of trials as shades.
 
@@ -131,9 +125,8 @@ def stress_over_stretch(
         curves: Stretches (S,) and nominal stress (S,) [Pa], by label.
         modulus: Young's modulus at rest, of the first curve [Pa].
         ranges: Least and largest stretch in trials, by name.
-        narrow: Whether the figure is for a narrow page.
     """
-    figure = new_figure(3.3, 3.7, narrow=narrow)
+    figure = new_figure(3.3)
     axes = figure.subplots()
     law, ink = TONES["law"].light, TONES["ink"].light
     stretches = next(iter(curves.values()))[0]
@@ -152,6 +145,5 @@ def stress_over_stretch(
     axes.set(xlim=(stretches[0], stretches[-1]), ylim=(_KILO * (lowest - 0.1 * span), _KILO * (highest + 0.1 * span)))
     axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")
     handles, labels = axes.get_legend_handles_labels()
-    columns = 1 if narrow else 2
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
+    figure.legend(handles, labels, loc="outside upper left", ncols=2, columnspacing=1.6)
     return figure

@@ -19,7 +19,6 @@ from .figures import (
     CHAMBER_COLOURS,
     LABELS,
     LARGEST_SHOWN,
-    NARROW,
     ROUND_STEPS,
     STYLE,
     TONES,
@@ -42,22 +41,21 @@ _LEAST: Final = 0.25  # Shortest side of a view, over the longest.
 _LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
 _BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
 _LINES: Final[Mapping[str, Any]] = {"open": (0, (4, 2)), "receding": "-"}  # By beginning of a controller's name.
-_COLUMNS: Final = {False: 5, True: 2}  # Of followed paths on a wide page, on a narrow one.
+_COLUMNS: Final = 5  # Of followed paths.
 
 
 @in_style()
-def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, *, narrow: bool) -> Figure:
+def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float) -> Figure:
     """Draw the displacement of the tip and, below it, the distance of each model's tip from the target's.
 
     Args:
         displacements: (T+1, 3) displacement [m] of the tip from rest, of the "target" and of the models.
         time_step: Time between two states [s].
-        narrow: Whether the figure is for a narrow page.
     """
     target = displacements["target"]
     axis = int(np.argmax(np.ptp(target, axis=0)))
     time = np.arange(len(target)) * time_step
-    figure = new_figure(3.9, 4.2, narrow=narrow)
+    figure = new_figure(3.9)
     motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     motion.plot(time, _MILLI * target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
     for model in (name for name in displacements if name != "target"):
@@ -71,7 +69,7 @@ def tip_displacement(displacements: Mapping[str, FloatArray], time_step: float, 
     motion.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))
     use_logarithm(distance)
     distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, time[-1]))
-    legend_above(figure, motion, narrow=narrow)
+    legend_above(figure, motion)
     return figure
 
 
@@ -90,21 +88,19 @@ def _keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0
 
 
 @in_style()
-def shape_comparison(pictures: Pixels | None, largest: Mapping[str, float | None], *, narrow: bool) -> Figure:
+def shape_comparison(pictures: Pixels | None, largest: Mapping[str, float | None]) -> Figure:
     """Show the deformed bodies of models side by side, coloured by the distance from the target's vertices.
 
     Args:
         pictures: (H, V * W, 4) of the V models that did not diverge, drawn from `bodies.distance_scene`.
         largest: Distance [m] with the last colour, by model; None for a model that diverged.
-        narrow: Whether the figure is for a narrow page.
     """
     kept = [model for model, most in largest.items() if most is not None]
     drawn = {} if pictures is None else dict(zip(kept, np.split(pictures, len(kept), axis=1), strict=True))
     rise = pictures.shape[0] * len(kept) / pictures.shape[1] if pictures is not None else 0.5  # Height over width.
-    height = (NARROW if narrow else WIDE / len(largest)) * rise + 0.75
-    figure = new_figure(height, height * len(largest), narrow=narrow)
-    grid = (len(largest), 1) if narrow else (1, len(largest))
-    for axes, (model, most) in zip(figure.subplots(*grid, squeeze=False).flat, largest.items(), strict=True):
+    height = WIDE / len(largest) * rise + 0.75
+    figure = new_figure(height)
+    for axes, (model, most) in zip(figure.subplots(1, len(largest), squeeze=False).flat, largest.items(), strict=True):
         axes.set_title(LABELS[model])
         axes.set_axis_off()
         if most is None:
@@ -131,7 +127,6 @@ def marker_paths(
     *,
     coordinates: Sequence[int] = (0, 1, 2),
     bands: Mapping[str, FloatArray] | None = None,
-    narrow: bool,
 ) -> Figure:
     """Draw the coordinates of markers over time, measured as dots, simulated as lines, and below them the inputs.
 
@@ -143,13 +138,12 @@ def marker_paths(
         driven: Inputs of this trial; all panels are then stacked.
         coordinates: Observed ones of x, y and z.
         bands: (T, M) half-widths of prediction intervals [m], by model.
-        narrow: Whether the figure is for a narrow page; the panels are then stacked, too.
     """
     many = len(coordinates)
-    count, stacked = len(labels), narrow or driven is not None
+    count, stacked = len(labels), driven is not None
     rows, columns = (many * count, 1) if stacked else (count, many)
     height = 0.9 + 1.25 * count if driven is None else 2.9 + 0.95 * many * count
-    figure = new_figure(height, 1.2 + 1.05 * many * count if driven is None else height + 0.5, narrow=narrow)
+    figure = new_figure(height)
     ratios = [1.0] * rows + [1.5] * (driven is not None)
     panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(_MILLI * target), axis=0).max())
@@ -175,28 +169,27 @@ def marker_paths(
         ((title, values),) = driven.values.items()
         _inputs(panels[-1, 0], times, values, driven)
         panels[-1, 0].set_title(title)
-        _part_legend(figure, driven, narrow=narrow)
+        _part_legend(figure, driven)
     for axes in panels[-1]:
         axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))
     figure.align_ylabels(panels[:, 0])
-    legend_above(figure, panels[0, 0], narrow=narrow)
+    legend_above(figure, panels[0, 0])
     return figure
 
 
 @in_style()
-def tip_planes(target: FloatArray, models: Mapping[str, FloatArray], *, narrow: bool) -> Figure:
+def tip_planes(target: FloatArray, models: Mapping[str, FloatArray]) -> Figure:
     """Draw the path of the tip in the plane across gravity, with a panel for each model, over the measured one.
 
     Args:
         target: (T, 3) displacement from rest [m], NaN where it was not seen.
         models: (T, 3) [m] by model.
-        narrow: Whether the figure is for a narrow page; there are then two panels in a row.
     """
     count = len(models)
-    columns = min(count, 2 if narrow else 4)
+    columns = min(count, 4)
     rows = -(-count // columns)
-    height = 0.75 + rows * (min((NARROW if narrow else WIDE) / columns, 3.4) + 0.15)
-    figure = new_figure(height, height, narrow=narrow)
+    height = 0.75 + rows * (min(WIDE / columns, 3.4) + 0.15)
+    figure = new_figure(height)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     centre, half = _range(target[:, :2])
     reach = half.max() * np.array([-1.0, 1.0])
@@ -214,7 +207,7 @@ def tip_planes(target: FloatArray, models: Mapping[str, FloatArray], *, narrow: 
         lowest.tick_params(labelbottom=True)
     for row in panels:
         row[0].set_ylabel("y [mm]")
-    legend_above(figure, panels[0, 0], narrow=narrow)
+    legend_above(figure, panels[0, 0])
     return figure
 
 
@@ -235,10 +228,10 @@ def _shown(path: FloatArray) -> FloatArray:
 
 
 @in_style()
-def input_sequences(time_step: float, driven: Driven, *, narrow: bool) -> Figure:
+def input_sequences(time_step: float, driven: Driven) -> Figure:
     """Draw inputs over time, with a panel for each trial; the time step is in [s]."""
     height = 0.9 + 1.35 * len(driven.values)
-    figure = new_figure(height, height + 0.4, narrow=narrow)
+    figure = new_figure(height)
     panels = figure.subplots(len(driven.values), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     longest = 0.0
     for (title, rows), axes in zip(driven.values.items(), panels, strict=True):
@@ -247,7 +240,7 @@ def input_sequences(time_step: float, driven: Driven, *, narrow: bool) -> Figure
         _inputs(axes, times, rows, driven)
         axes.set_title(title)
     panels[-1].set(xlabel="time [s]", xlim=(0.0, longest))
-    _part_legend(figure, driven, narrow=narrow)
+    _part_legend(figure, driven)
     return figure
 
 
@@ -267,14 +260,14 @@ def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> 
 
 
 @in_style()
-def pose_inputs(driven: Driven, *, narrow: bool) -> Figure:
+def pose_inputs(driven: Driven) -> Figure:
     """Draw the last inputs of each pose as bars beside its name; parts without inputs are left out."""
     factor = driven.quantity.shown_factor
     names, values = list(driven.values), factor * np.stack([rows[-1] for rows in driven.values.values()])
     used = np.flatnonzero(values.any(axis=0))
     count = max(1, len(used))
     height = 0.9 + len(names) * max(0.25, 0.1 * count)
-    figure = new_figure(height, height + 0.3, narrow=narrow)
+    figure = new_figure(height)
     axes = figure.subplots()
     for place, part in enumerate(used):
         middle = np.arange(len(names)) + _BARS * ((place + 0.5) / count - 0.5)
@@ -287,11 +280,11 @@ def pose_inputs(driven: Driven, *, narrow: bool) -> Figure:
     axes.set(xlabel=_axis_label(driven.quantity), ylim=(len(names) - 0.5, -0.5))
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=ROUND_STEPS))
     axes.grid(visible=False, axis="y")
-    _part_legend(figure, driven, used.tolist(), narrow=narrow)
+    _part_legend(figure, driven, used.tolist())
     return figure
 
 
-def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = (), *, narrow: bool) -> None:
+def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = ()) -> None:
     """Draw a legend of the parts, or of the used ones, below the figure."""
     handles: list[Any] = [
         Line2D([], [], color=CHAMBER_COLOURS[at % len(CHAMBER_COLOURS)], label=driven.channels[at].replace("_", " "))
@@ -299,25 +292,22 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int] = (), *, na
     ]
     if driven.limit is not None:
         handles.append(Line2D([], [], color=TONES["muted"].light, linestyle=(0, (4, 3)), label="limit"))
-    figure.legend(handles=handles, loc="outside lower left", ncols=2 if narrow else _LEGEND_ROW, columnspacing=1.4)
+    figure.legend(handles=handles, loc="outside lower left", ncols=_LEGEND_ROW, columnspacing=1.4)
 
 
 @in_style()
-def motion_instants(frames: Pixels, titles: Sequence[str], *, narrow: bool) -> Figure:
+def motion_instants(frames: Pixels, titles: Sequence[str]) -> Figure:
     """Show the body at a few instants, each with a second view of its markers.
 
     Args:
         frames: (F, H, 2 * W, 4) drawn from `bodies.ComparedMotion.scene`.
         titles: Of the F instants.
-        narrow: Whether the figure is for a narrow page.
     """
     count, height, width, _ = frames.shape
     rise = 2.0 * height / width
-    size = NARROW / 2.0 if narrow else WIDE / count
-    total = count * (rise * size + 0.3) if narrow else 2.0 * rise * size + 0.35
-    figure = new_figure(total, total, narrow=narrow)
-    panels = figure.subplots(*((count, 2) if narrow else (2, count)), squeeze=False)
-    for row, frame, title in zip(panels if narrow else panels.T, frames, titles, strict=True):
+    figure = new_figure(2.0 * rise * WIDE / count + 0.35)
+    panels = figure.subplots(2, count, squeeze=False)
+    for row, frame, title in zip(panels.T, frames, titles, strict=True):
         for axes, picture in zip(row, np.split(frame, 2, axis=1), strict=True):
             axes.imshow(picture)
             axes.set_axis_off()
@@ -326,21 +316,17 @@ def motion_instants(frames: Pixels, titles: Sequence[str], *, narrow: bool) -> F
 
 
 @in_style()
-def followed_paths(
-    paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray, *, narrow: bool
-) -> Figure:
+def followed_paths(paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray) -> Figure:
     """Draw paths and the paths of the controlled point, side by side in their plane.
 
     Args:
         paths: Paths and points.
         controllers: Names in words of the controllers that are drawn.
         plane: (2, 3) directions of the width and of the height.
-        narrow: Whether the figure is for a narrow page.
     """
-    columns = min(_COLUMNS[narrow], len(paths))
+    columns = min(_COLUMNS, len(paths))
     rows = -(-len(paths) // columns)
-    width = NARROW if narrow else WIDE
-    figure = Figure(figsize=(width, width / columns * rows + 0.35), layout="constrained")
+    figure = new_figure(WIDE / columns * rows + 0.35)
     every = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     first = plane[0] / np.linalg.norm(plane[0])
     second = plane[1] - (plane[1] @ first) * first
@@ -363,7 +349,5 @@ def followed_paths(
     for axes in every:
         axes.tick_params(labelsize=STYLE["xtick.labelsize"] - 1.5)
     every[0].set_ylabel("mm")
-    figure.legend(
-        list(lines.values()), list(lines), loc="outside upper left", ncols=1 if narrow else 4, columnspacing=1.6
-    )
+    figure.legend(list(lines.values()), list(lines), loc="outside upper left", ncols=4, columnspacing=1.6)
     return figure

@@ -67,10 +67,9 @@ class PageTable:
 
 
 class Picture(NamedTuple):
-    """A figure in two widths as data addresses, and its description."""
+    """A figure as a data address, and its description."""
 
-    wide: str
-    narrow: str
+    address: str
     alt: str
 
 
@@ -100,7 +99,6 @@ class Drawn:
     caption: str
     picture: Picture | None = None
     film: str = ""  # Address of a film, in place of a picture.
-    scrolls: bool = False  # Whether it stays wide on a narrow page.
 
 
 @dataclass(frozen=True)
@@ -154,22 +152,21 @@ class Canvas:
     renderer: Renderer = field(default_factory=Renderer)  # Of the pictures that are drawn here.
 
     def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
-        """Draw a figure in two widths, for a wide and for a narrow page, and save the wide one as a PNG file.
+        """Draw a figure, and save it as a PNG file too.
 
         Args:
             name: Of the figure, and of the file.
-            draw: Makes the figure; takes the keyword `narrow`.
+            draw: Makes the figure.
             alt: Description of the figure.
             caption: Below the figure.
         """
         from . import figures
 
-        both = [draw(narrow=narrow) for narrow in (False, True)]
-        for figure in both:
-            figures.settle(figure)
-        figures.save_png(both[0], self.folder / f"{name}.png")
-        wide, narrow = (data_address(figures.themed_svg(figure, name), "image/svg+xml") for figure in both)
-        return Drawn(name, caption, Picture(wide, narrow, alt))
+        figure = draw()
+        figures.settle(figure)
+        figures.save_png(figure, self.folder / f"{name}.png")
+        address = data_address(figures.themed_svg(figure, name), "image/svg+xml")
+        return Drawn(name, caption, Picture(address, alt))
 
     def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
         """Return a picture drawn into a file, or a sentence why it cannot be drawn, once for each reason.
@@ -327,9 +324,8 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def drawn_file(path: Path, alt: str, caption: str) -> Drawn:
-    """Return a PNG file as a picture that stays wide on a narrow page."""
-    address = data_address(path.read_bytes(), "image/png")
-    return Drawn(path.stem, caption, Picture(address, address, alt), scrolls=True)
+    """Return a PNG file as a picture."""
+    return Drawn(path.stem, caption, Picture(data_address(path.read_bytes(), "image/png"), alt))
 
 
 def data_address(content: bytes, kind: str) -> str:

@@ -87,7 +87,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
     heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]
     colours = dict(zip(recording.labels, cycle(MARKER_COLOURS), strict=False))
     with mpl.rc_context(STYLE):
-        figure = new_figure(sum(heights) + 1.0, sum(heights) + 1.0, narrow=False)
+        figure = new_figure(sum(heights) + 1.0)
         *rows, last = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for axes, panel in zip(rows, panels, strict=True):
             for marker in result.markers:

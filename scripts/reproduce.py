@@ -20,7 +20,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Final
 
 import yaml
@@ -32,12 +31,12 @@ from warp_resphys.io.labels import run_label
 from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
 from warp_resphys.learning.baselines import BASELINES
-from warp_resphys.learning.metrics import PUBLISHED_MM, paired_gain
-from warp_resphys.report.page import duration_text, error_parts, number_text, published_parts
+from warp_resphys.learning.metrics import PUBLISHED_MM
+from warp_resphys.report.data import Errors, trial_errors
+from warp_resphys.report.page import MINUS, NONE, duration_text, error_parts, in_a_row, number_text, published_parts
+from warp_resphys.report.verdict import LEAST_TRIALS, ModelComparison, best_pair, known_errors
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
-LEAST_TRIALS: Final = 5  # for an interval over trials
-NONE, MINUS = "\N{EN DASH}", "\N{MINUS SIGN}"
 INTERRUPTED, USER_ERROR = 130, 2
 
 # Models: name in tables, and in sentences.
@@ -225,15 +224,13 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     """Returns the results of a robot's run, as robots.json keeps them."""
     metrics = run.metrics
     folds = metrics.get("folds", {})
-    parts = list(folds.values()) or [metrics]
     tested = list(folds) or [row["name"] for row in metrics["per_trajectory"]]
     records = [read_json(path) for fold in (".", "fold_*") for path in run.folder.glob(f"{fold}/stages/evaluate.json")]
     made = max(records, key=lambda record: str(record["finished"]))
     how = "each held out once" if len(folds) > 1 else "held out"
     if run.data.get("train_fraction", 1.0) < 1.0 and {*tested} <= {*run.data["train"]}:
         how = "in the part that was not used for training"
-    trials = [row["errors_mm"] for part in parts for row in part.get("per_trajectory", ())]
-    errors = {model: [row.get(model) for row in trials] for model in MODELS}
+    errors = {model: own for model, own in trial_errors(metrics).items() if model in MODELS}
     intervals = metrics.get("intervals", {}).get("models", {}).get("resphys")
     return {
         "day": str(made["finished"]).partition("T")[0],
@@ -251,21 +248,19 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _best_pair(errors: Mapping[str, Sequence[Any]]) -> dict[str, Any] | None:
+def _best_pair(errors: Errors) -> dict[str, Any] | None:
     """The corrected model of least mean error beside the best of all others; None where one of them is missing."""
-    known = {m: fmean(e) for m, e in errors.items() if e and None not in e}
-    corrected = min((m for m in known if m in CORRECTED), key=known.__getitem__, default="")
-    other = min((m for m in known if m not in CORRECTED), key=known.__getitem__, default="")
-    gain = _gain(errors, other, corrected) if corrected and other else None
+    corrected, other = best_pair(known_errors(errors))
+    gain = _gain(errors, other, corrected)
     return gain and {"corrected": corrected, "other": other, "gain": gain}
 
 
-def _gain(errors: Mapping[str, Sequence[Any]], before: str, after: str) -> dict[str, Any] | None:
-    """Share of the error of one model that another removes; None where a roll-out of one diverged."""
-    pair = errors[before], errors[after]
-    if not pair[0] or any(None in own for own in pair) or 0.0 in pair[0]:
+def _gain(errors: Errors, before: str, after: str) -> dict[str, Any] | None:
+    """Share of the error of one model that another removes; None where one is missing or has diverged."""
+    if not {before, after} <= errors.keys():
         return None
-    return dict(paired_gain(*pair)._asdict())
+    gain = ModelComparison(after, before, errors[after], errors[before]).gain
+    return gain and dict(gain._asdict())
 
 
 def robots_page(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], pictures: Path) -> str:
@@ -296,7 +291,7 @@ def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str,
     models = ("simulation", "sysid", "simfree", "resphys")
     rows = []
     for name, row in results.items():
-        errors, title = row["errors_mm"], str(ROWS["robots"][name]["title"])
+        errors, title = row["errors_mm"], _title(name)
         small = [*row["beyond"], *([f"failed since {row['day']}"] if name in failed else [])]
         means = {m: errors[m]["mean"] for m in BASELINES if m in errors and errors[m]["mean"] is not None}
         best = min(means, key=means.__getitem__, default="")
@@ -361,19 +356,17 @@ def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
     words = []
     for which, of in ((0, [n for n, row in results.items() if row["beside"]]), (1, [*results])):
         clear = [n for n in of if (g := gains[n][which]) and g["trials"] >= LEAST_TRIALS and g["lower"] > 0.0]
-        words.append(f"{len(clear)} of {len(of)} robots" + (f" ({_in_a_row(clear)})" if clear else ""))
+        words.append(f"{len(clear)} of {len(of)} robots" + (f" ({in_a_row([*map(_title, clear)])})" if clear else ""))
     few = [name for name, row in results.items() if len(row["tested"]) < LEAST_TRIALS]
     return (
         "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
         f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and the "
         f"learned force reduces the error of identification on {words[1]}."
-    ) + (f" {_in_a_row(few)}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
+    ) + (f" {in_a_row([*map(_title, few)])}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
 
 
-def _in_a_row(names: Sequence[str]) -> str:
-    """Titles of robots as a list in a sentence."""
-    titles = [str(ROWS["robots"][name]["title"]) for name in names]
-    return " and ".join([", ".join(titles[:-1]), titles[-1]] if len(titles) > 1 else titles)
+def _title(name: str) -> str:
+    return str(ROWS["robots"][name]["title"])
 
 
 def beams_page(runs: Sequence[Run], figures: Path) -> str:

@@ -22,10 +22,11 @@ from hydra.plugins.config_source import ConfigSource
 
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
+from support.scenes import body_scene
 from warp_resphys.io import atomic
 from warp_resphys.io.settings import Settings
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report import bodies, figures, render
+from warp_resphys.report import figures, render
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -79,7 +80,7 @@ def can_draw() -> None:
     """Skips where bodies cannot be drawn."""
     mesh = box_hexahedra(divisions=(1, 1, 1))
     try:
-        render.draw(bodies.distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices))
+        render.draw(body_scene(mesh))
     except render.DrawingError as error:
         pytest.skip(str(error))
 

@@ -110,7 +110,6 @@ def test_limbs_are_identified_by_their_shape(swum, tmp_path, monkeypatch):
     )
     drawn = {path.stem for path in Path("run/figures").glob("*.png")}
     assert {"markers", "motion"} <= drawn
-    assert "plane" not in drawn  # which a camera does not tell
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < errors["sysid"] + 0.25 * NOISE  # nothing is left to learn
     check_robots("run")

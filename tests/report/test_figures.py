@@ -79,12 +79,6 @@ class TestErrors:
         (line,) = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0)).axes[0].lines
         np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
 
-    def test_points_are_missing_where_a_rollout_diverged(self):
-        errors = {"resphys": {1.0: 2.0, 1.5: 3.0}, "simfree": {1.0: 4.0}}
-        (axes,) = figures.error_over_scale(errors).axes
-        np.testing.assert_array_equal(axes.lines[0].get_ydata(), [2.0, 3.0])
-        np.testing.assert_array_equal(axes.lines[1].get_ydata(), [4.0, np.nan])
-
 
 class TestLearning:
     def test_one_epoch_is_seen_and_named_by_a_whole_number(self):
@@ -108,16 +102,6 @@ class TestMotion:
         spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
         assert spans[2] < 50.0
         assert 0.05 * np.ptp(MEASURED[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
-
-    def test_it_does_not_set_the_scale_of_the_tip_either(self):
-        angle = np.linspace(0.0, 6.0, 50)
-        measured = 0.02 * np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
-        measured[10] = np.nan
-        wild = measured * np.exp(angle)[:, None]
-        wild[40:] = np.nan
-        flat = motion_figures.tip_planes(measured, {"sysid": measured, "resphys": wild})
-        for axes in flat.axes:
-            assert np.ptp(axes.get_xlim()) == np.ptp(axes.get_ylim()) < 70.0  # [mm], of a motion of 40
 
     def test_prediction_intervals_are_bands_around_their_model(self):
         shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}

@@ -13,7 +13,7 @@ from support.vertex_run import settings, write_run
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.report.data import errors_by_load
-from warp_resphys.report.law_section import law_text, not_needed_text, open_text, outside_text, wording
+from warp_resphys.report.law_section import law_text, not_needed_text, outside_text, wording
 from warp_resphys.report.learning_figures import drawn_stretches
 from warp_resphys.report.page import percent_text
 from warp_resphys.report.run_page import range_texts
@@ -113,16 +113,7 @@ def test_a_law_by_file_that_its_own_run_did_not_use_is_said_to_be_so():
     assert law_text({**given, "accepted_there": False}).endswith("did not use it: it was not clearly closer there.")
 
 
-def test_constants_that_the_trials_leave_open_are_named():
-    said = open_text(law())
-    assert said == (
-        "Change of volume is not determined by these trials, and is held near its first guess. Relaxing branch 1: "
-        "relaxation time ended at a bound of its range: another value may suit the trials better."
-    )
-    zero = {"constants": {"fibre_slack_1": 0.0, "fibre_azimuth_1": 1e-6}, "units": {"fibre_azimuth_1": "rad"}}
-    known = open_text({**zero, "at_bounds": ["fibre_slack_1"], "deviation": {"fibre_azimuth_1": 1e-3}})
-    assert known == "Fibres 1: slack ended at zero: the trials show none of it."
-    assert open_text({**law(at_bounds=[]), "deviation": {}}) == ""
+def test_terms_that_the_law_does_not_have_are_named():
     assert "viscosity in volume and fibres." in not_needed_text(law(), LawSettings(terms=()))
     assert wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 

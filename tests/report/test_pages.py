@@ -28,7 +28,7 @@ from warp_resphys.settings.stages import ReportStage
 
 BEAM = beam.config()
 FIGURES_OF_AN_ARM = {
-    *("error_over_time", "loss_history", "markers", "plane", "inputs"),
+    *("error_over_time", "loss_history", "markers", "inputs"),
     *("training_resphys", "training_simfree"),
 }
 
@@ -97,7 +97,6 @@ class TestArms:
         text, scales = report(tmp_path, settings).text, errors_of(tmp_path)["scales"]
         assert all(f"{scales[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
         assert "none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
-        assert "error_over_scale" in figures_in(tmp_path)
         trials, pressures = read_trials(tmp_path, settings), read_driven(tmp_path, settings)
         assert trials.names == ("test_00", "test_01")
         assert len(pressures.scaled) == 4
@@ -179,7 +178,7 @@ class TestArms:
         assert list(pressures.values) == ["train_00", "train_01", "test_00", "test_01", "test_02"]
         assert pressures.values["test_00"].shape == (100, 6)
 
-    def test_the_tip_is_shown_where_its_place_in_space_is_known(self, tmp_path):
+    def test_markers_are_drawn_over_time(self, tmp_path):
         settings = arm_settings()
         write_run(tmp_path, settings, steps=40)
         trials, mesh = read_trials(tmp_path, settings), build_mesh(settings.mesh)
@@ -191,8 +190,7 @@ class TestArms:
             return None if part is None else part.blocks
 
         driven = read_driven(tmp_path, settings)
-        assert drawn(trials, driven) == ["markers", "plane"]
-        assert drawn(replace(trials, axes=(0, 2)), driven) == ["markers"]
+        assert drawn(trials, driven) == ["markers"]
         assert drawn(trials, None) == ["paths_worst", "paths_best"]
         assert drawn(replace(trials, labels=()), None) is None
 

@@ -6,11 +6,11 @@ import sys
 import matplotlib.colors
 import numpy as np
 import pytest
-from matplotlib import colormaps
 
+from support.scenes import MARGIN, SHADE, TOWARDS_VIEWER, body_scene
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles, box_hexahedra, box_tetrahedra
 from warp_resphys.report import render, render_process
-from warp_resphys.report.bodies import MARGIN, SHADE, TOWARDS_VIEWER, distance_scene, largest_distances, sharp_edges
+from warp_resphys.report.bodies import sharp_edges
 
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(3, 2, 2)),
@@ -20,26 +20,10 @@ MESHES = {
 VIEWER = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
 
 
-def draw(mesh: Mesh, errors: np.ndarray, count: int = 1) -> list[np.ndarray]:
-    """(H, W, 4) pictures of the undeformed body, with (N,) errors [m] along x."""
-    target = mesh.vertices - errors[:, None] * [1.0, 0.0, 0.0]
-    bodies = {str(number): mesh.vertices for number in range(count)}
-    assert [*largest_distances(mesh, bodies, target).values()] == pytest.approx([errors.max()] * count, rel=1e-6)
-    return drawn(mesh, bodies, target)
-
-
-def drawn(mesh: Mesh, bodies: dict[str, np.ndarray], target: np.ndarray) -> list[np.ndarray]:
-    """(H, W, 4) red, green, blue and opacity in [0, 1] of each body."""
-    scene = distance_scene(mesh, bodies, target)
-    assert scene is not None
-    ((picture,),) = render.draw(scene)
-    return np.split(picture / 255.0, len(bodies), axis=1)
-
-
-def shaded(value: float, normal: tuple[float, float, float]) -> np.ndarray:
-    """(3,) colour of a value in [0, 1] on a face that looks along a normal."""
+def shaded(normal: tuple[float, float, float]) -> np.ndarray:
+    """(3,) colour of the body on a face that looks along a normal."""
     facing = max(0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT)))
-    return np.asarray(colormaps[render.COLOUR_MAP](value)[:3]) * (1.0 - SHADE * (1.0 - facing))
+    return np.asarray(matplotlib.colors.to_rgb(render.BODY)) * (1.0 - SHADE * (1.0 - facing))
 
 
 def share(pixels: np.ndarray, colour: np.ndarray) -> float:
@@ -50,15 +34,16 @@ def share(pixels: np.ndarray, colour: np.ndarray) -> float:
 
 @pytest.mark.usefixtures("can_draw")
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
-def test_a_body_is_drawn_whole_to_scale_and_in_the_colours_of_the_scale(mesh: Mesh) -> None:
-    # With one error everywhere each visible face has one colour, in the share of the picture that it covers.
+def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh) -> None:
+    # Each visible face has one colour, in the share of the picture that it covers.
     faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
     covered = {normal: area * float(np.dot(normal, VIEWER)) for normal, area in faces.items()}
-    pictures = draw(mesh, np.full(len(mesh.vertices), 1e-3), count=2)
+    ((picture,),) = render.draw(body_scene(mesh, views=2))
+    pictures = np.split(picture / 255.0, 2, axis=1)
     for pixels in pictures:
         for normal, area in covered.items():
             expected = area / sum(covered.values())
-            assert share(pixels, shaded(1.0, normal)) == pytest.approx(expected, abs=0.06)  # Edges, outline.
+            assert share(pixels, shaded(normal)) == pytest.approx(expected, abs=0.06)  # Edges, outline.
         rows, columns = np.nonzero(pixels[..., 3] == 1.0)
         for seen, length in ((rows, pixels.shape[0]), (columns, pixels.shape[1])):
             margin = MARGIN * max(pixels.shape)
@@ -69,36 +54,11 @@ def test_a_body_is_drawn_whole_to_scale_and_in_the_colours_of_the_scale(mesh: Me
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_colours_are_where_the_errors_are_and_what_stands_before_hides_what_is_behind() -> None:
-    mesh = box_hexahedra((0.1, 0.03, 0.03), (1, 1, 1))
-    low, high = (shaded(value, (0.0, -1.0, 0.0)) for value in (0.0, 1.0))
-    (pixels,) = draw(mesh, np.where(mesh.vertices[:, 0] > 0.05, 1e-3, 0.0))
-    middle = pixels[pixels.shape[0] // 2, :, :3]
-    np.testing.assert_allclose(middle[round(0.04 * len(middle))], low, atol=0.05)
-    np.testing.assert_allclose(middle[round(0.86 * len(middle))], high, atol=0.12)
-
-    hidden = np.all(mesh.vertices == [0.0, 0.03, 0.0], axis=1)  # The corner behind the three visible faces.
-    (pixels,) = draw(mesh, np.where(hidden, 1e-3, 0.0))
-    assert share(pixels, low) > 0.4
-    assert pixels[pixels[..., 3] == 1.0][:, 0].max() < 0.55  # Dark violet and the grey outline.
-
-
-@pytest.mark.usefixtures("can_draw")
 def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
     mesh = box_hexahedra(divisions=(3, 1, 1))
-    moved = mesh.vertices + [0.0, 0.0, 0.05]
-    (pixels,) = drawn(mesh, {"moved": moved}, moved)
+    ((pixels,),) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)))
+    pixels = pixels / 255.0
     assert share(pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
-
-
-def test_only_what_has_not_diverged_is_drawn() -> None:
-    mesh = box_hexahedra(divisions=(1, 1, 1))
-    diverged = {"far": mesh.vertices + 2.0, "gone": np.full_like(mesh.vertices, np.nan)}
-    assert largest_distances(mesh, diverged, mesh.vertices) == {"far": None, "gone": None}
-    assert distance_scene(mesh, diverged, mesh.vertices) is None
-    some = distance_scene(mesh, {**diverged, "box": mesh.vertices}, mesh.vertices)
-    assert some is not None
-    assert len(some.views) == 1
 
 
 def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():
@@ -124,7 +84,7 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
     (tmp_path / "modules" / "pyvista.py").write_text(script)
     monkeypatch.setattr(render, "TIME_OUT", time_out)
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    scene = body_scene(mesh)
     with pytest.raises(render.DrawingError) as caught:
         render.draw(scene)
     assert reason in str(caught.value)
@@ -138,8 +98,8 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
 @pytest.mark.usefixtures("can_draw")
 def test_one_process_draws_scene_after_scene():
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    small = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
-    wide = distance_scene(mesh, {"box": mesh.vertices, "other": mesh.vertices}, mesh.vertices)
+    small = body_scene(mesh)
+    wide = body_scene(mesh, views=2)
     with render.Renderer() as renderer:
         (first,), (both,) = render.draw(small, wide, renderer=renderer)
         process = renderer._process
@@ -156,7 +116,7 @@ def test_one_process_draws_scene_after_scene():
 @pytest.mark.usefixtures("can_draw")
 def test_the_program_answers_with_the_size_and_the_pixels_of_every_frame():
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    scene = body_scene(mesh)
     program = [sys.executable, "-m", render_process.__name__]
     out = subprocess.run(program, input=2 * render.packed(scene), capture_output=True, check=True).stdout
     ((pixels,),) = render.draw(scene)
@@ -168,7 +128,7 @@ def test_the_program_answers_with_the_size_and_the_pixels_of_every_frame():
 def test_a_film_that_cannot_be_encoded_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = distance_scene(mesh, {"box": mesh.vertices}, mesh.vertices)
+    scene = body_scene(mesh)
     with pytest.raises(render.DrawingError, match="imageio-ffmpeg"):
         render.write_film(tmp_path / "motion.mp4", scene)
     assert not [*tmp_path.iterdir()]

@@ -287,7 +287,7 @@ def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
     if run.markers is None:
         return {}
     view = marker_view_of(run.markers, labels, dataset.sets)
-    return {"axes": tuple(axis for axis in range(3) if axis != view.unseen), "own_frame": view.own}
+    return {"axes": tuple(axis for axis in range(3) if axis != view.unseen)}
 
 
 def _read_scaled(folder: Path) -> Dataset | None:

@@ -1,4 +1,4 @@
-"""Scenes of bodies: coloured by their distance from a target, or in motion with measured and simulated markers."""
+"""Scenes of bodies in motion, with measured and simulated markers, and their edges, obstacles and stems."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,18 +24,10 @@ from .render import (
     height_of,
     motion_axes,
     pace,
-    picture_size,
-    view_axes,
 )
 
-_LONGER_SIDE: Final = 1100  # Of a picture of a body coloured by its distance [px].
-MARGIN: Final = 0.02  # Around the bodies; this and the next lengths are over the longer side of the view.
-_WIDTHS: Final = (0.0034, 0.0018)  # Of the outline, and of the lines around faces.
-_NUDGE: Final = 0.005  # Shift of the outline behind the body, where they coincide.
-TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)  # A body along x is seen from the side, the end of high x nearer.
-SHADE: Final = 0.25  # Share of the colour that depends on the light.
 _SHARP: Final = 30.0  # Least angle between the normals of faces at an edge of the outline [degrees].
-_DIVERGED: Final = 10.0  # Distance from the target or from rest beyond which nothing is drawn, over the body's size.
+_DIVERGED: Final = 10.0  # Distance from rest beyond which nothing is drawn, over the body's size.
 
 _FAST: Final = 2.5  # Longest duration of a motion that is shown in slow motion [s],
 _FINE: Final = 0.025  # if its frames are no farther apart than this [s].
@@ -57,53 +49,6 @@ _BEFORE: Final = {
     "rings": 2.5,
     "dots": 5.0,
 }  # Shift to the viewer, over half a view's height.
-
-
-def largest_distances(mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray) -> dict[str, float | None]:
-    """Return the largest distance of each body (N, 3) from the target's vertices (N, 3) [m]; None if it diverged."""
-    far = _DIVERGED * np.ptp(mesh.vertices, axis=0).max()
-    return {
-        name: float(np.linalg.norm(q - target, axis=1).max()) if np.all(np.abs(q - target) < far) else None
-        for name, q in positions.items()
-    }
-
-
-def distance_scene(
-    mesh: Mesh, positions: Mapping[str, FloatArray], target: FloatArray, obstacles: ObstacleSurface | None = None
-) -> RenderScene | None:
-    """Return deformed bodies, coloured by the distance from the target's vertices, from zero to the largest of each.
-
-    Args:
-        mesh: The undeformed body, drawn as an outline.
-        positions: (N, 3) deformed positions [m] by name; diverged bodies are left out.
-        target: (N, 3) positions of the target [m].
-        obstacles: That the body touches.
-
-    Returns:
-        A view of each body; None if all of them have diverged.
-    """
-    distances = largest_distances(mesh, positions, target)
-    largest = {name: max(most, 1e-15) for name, most in distances.items() if most is not None}
-    if not largest:
-        return None
-    axes = view_axes(TOWARDS_VIEWER)
-    shown = np.concatenate([mesh.vertices, *(positions[name] for name in largest)])
-    around = [] if obstacles is None else obstacle_layers(obstacles)
-    if obstacles is not None:
-        shown = np.concatenate([shown, obstacles.near(shown)])
-    focus, half = frame_of(shown, axes, MARGIN)
-    nudge = 2.0 * _NUDGE * half.max()  # [m]
-    triangles, edges = boundary_triangles(mesh), face_edges(mesh)
-    outline, line = (width * _LONGER_SIDE for width in _WIDTHS)
-    sharp = sharp_edges(mesh.vertices, triangles)
-    rest = Layer("lines", mesh.vertices, sharp, OUTLINE, size=outline, shift=-nudge)
-    views = []
-    for name, most in largest.items():
-        q, paint = positions[name], np.linalg.norm(positions[name] - target, axis=1) / most
-        surface = Layer("surface", q, triangles, paint=paint, light=(1.0 - SHADE, SHADE))
-        rims = Layer("lines", q, edges, "black", size=line, opacity=0.35, shift=0.2 * nudge)
-        views.append(View([surface, rims, rest, *around], axes, focus, half[1]))
-    return RenderScene(views, picture_size(half, _LONGER_SIDE))
 
 
 def face_edges(mesh: Mesh) -> IntArray:

@@ -60,7 +60,6 @@ class TrialResults:
     gravity: FloatArray  # (3,) [m/s^2]
     time_step: float  # Of the simulation [s].
     axes: tuple[int, ...] = (0, 1, 2)  # Observed axes of the body.
-    own_frame: bool = False  # Whether the position of the body in the recordings is not known.
     since: FloatArray | None = None  # (R, T) since the last change of the inputs [s].
     # (R, T, M) variance due to the identified parameters [m^2], by model.
     spreads: Mapping[str, FloatArray] = field(default_factory=dict)

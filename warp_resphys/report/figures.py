@@ -176,22 +176,6 @@ def mean_of_trials(rows: FloatArray) -> FloatArray:
     return mean
 
 
-@in_style()
-def error_over_scale(errors: Mapping[str, Mapping[float, float]]) -> Figure:
-    """Draw the mean errors [mm] by model over the scale of the inputs, without those that diverged."""
-    figure = new_figure(3.0)
-    axes = figure.subplots()
-    scales = sorted({scale for means in errors.values() for scale in means})
-    for model, means in errors.items():
-        values = positive(np.array([means.get(scale, np.nan) for scale in scales]))
-        axes.plot(scales, values, marker="o", **model_line(model))
-    use_logarithm(axes)
-    axes.set_xticks(scales, [f"{scale:g}" for scale in scales])
-    axes.set(xlabel="inputs over those of the training", ylabel="mean marker error [mm]")
-    legend_above(figure, axes)
-    return figure
-
-
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure with a white background."""
     figure.savefig(path, format="png", dpi=200, facecolor="white")

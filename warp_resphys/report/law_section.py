@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -77,9 +77,6 @@ _GROUPS: Final[Mapping[str, str]] = {
     "fibres": "fibres",
 }
 _MATERIALS: Final = ("sysid", "law")  # Models whose material can be put on another body, the better one last.
-_OPEN: Final = 0.5  # Deviation from which on a constant is not determined, over its value.
-# The same for constants that may well be zero, in an SI unit.
-_OPEN_BY_UNIT: Final[Mapping[str, float]] = {"rad": 0.25, "": 0.05}
 
 
 def law_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -92,7 +89,7 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     blocks += [Text(" ".join(notes), note=True)] if law.get("deviation") else []
-    said = (open_text(law), not_needed_text(law, settings), outside_text(data))
+    said = (not_needed_text(law, settings), outside_text(data))
     blocks += [Text(unbroken(text)) for text in said if text]
     blocks += [_moduli_table(data, constants), *_curve(data, constants, canvas)]
     return Part("Law of the material", [*blocks, *_classes(law)])
@@ -147,34 +144,6 @@ def _terms_table(law: Mapping[str, Any]) -> PageTable:
         cells += [Cell("yes" if name in bounds else "")] if bounds else []
         rows.append(Row(words, cells, small=meaning))
     return PageTable("Term", ["Identified", "Unit", *(["At a bound"] if bounds else [])], rows)
-
-
-def open_text(law: Mapping[str, Any]) -> str:
-    """Return sentences on constants that the trials do not determine; empty if they determine all of them."""
-    constants, deviation, units = law["constants"], law.get("deviation", {}), law.get("units", {})
-    zero = [name for name in law.get("at_bounds", ()) if constants.get(name) == 0.0]
-    bound = [name for name in law.get("at_bounds", ()) if name in constants and name not in zero]
-    unsure: list[str] = []
-    for name, value in constants.items():
-        limit = _OPEN_BY_UNIT.get(units.get(name, ""), _OPEN * abs(value)) if name in units else _OPEN * abs(value)
-        if name not in (*bound, *zero) and deviation.get(name, 0.0) >= limit > 0.0:
-            unsure.append(name)
-    sentences = []
-    if unsure:
-        verb = "is" if len(unsure) == 1 else "are"
-        guesses = "its first guess" if len(unsure) == 1 else "their first guesses"
-        sentences.append(f"{_sentence(unsure)} {verb} not determined by these trials, and {verb} held near {guesses}.")
-    if bound:
-        its = "its range" if len(bound) == 1 else "their ranges"
-        sentences.append(f"{_sentence(bound)} ended at a bound of {its}: another value may suit the trials better.")
-    if zero:
-        sentences.append(f"{_sentence(zero)} ended at zero: the trials show none of it.")
-    return " ".join(sentences)
-
-
-def _sentence(names: Sequence[str]) -> str:
-    words = in_a_row([_lower(wording(name)[0][0]) for name in names])
-    return words[:1].upper() + words[1:]
 
 
 def _lower(words: str) -> str:

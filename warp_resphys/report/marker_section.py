@@ -1,4 +1,4 @@
-"""The section on markers: paths of the tip of driven bodies, coordinates of the markers of others."""
+"""The section on markers: their coordinates over time, of driven bodies with the inputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,7 +10,6 @@ import numpy as np
 from ..learning.baselines import BASELINES
 from ..learning.intervals import Intervals
 from .data import (
-    MODELS,
     Driven,
     FloatArray,
     RunReport,
@@ -18,7 +17,6 @@ from .data import (
     best_and_worst,
     drawn_markers,
     shown_markers,
-    tip_markers,
 )
 from .page import Canvas, Drawn, Part, mm_text
 
@@ -31,11 +29,10 @@ _CALIBRATED: Final = {  # Source of prediction intervals.
     "folds": "the errors of the other folds",
 }
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
-_PLANE_SECONDS: Final = 5.0  # Of a path in the plane.
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the motion of the tip where inputs drive the body, else the coordinates of the markers."""
+    """Return the coordinates of the markers over time."""
     trials = data.trials
     if trials is None or not trials.labels or not trials.moves:
         return None
@@ -47,10 +44,7 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
     if data.driven is None:
         drawn = [_coordinates(data, trials, row, at, which[at], canvas) for at, row in places.items()]
         return Part("Marker by marker", drawn)
-    markers = _driven_markers(data, trials, places["worst"], data.driven, canvas)
-    if trials.own_frame or len(trials.axes) < 3:  # The position of the tip in space is not known.
-        return Part("Marker by marker", [markers])
-    return Part("The tip", [markers, _plane(data, trials, places["worst"], which["worst"], canvas)])
+    return Part("Marker by marker", [_driven_markers(data, trials, places["worst"], data.driven, canvas)])
 
 
 def _coordinates(data: RunReport, trials: TrialResults, row: int, place: str, which: str, canvas: Canvas) -> Drawn:
@@ -131,31 +125,3 @@ def _start(trials: TrialResults, row: int) -> FloatArray:
     """First measured positions (M, 3) of the markers [m]."""
     first = trials.target[row, 0]
     return np.where(np.isfinite(first), first, trials.bound)
-
-
-def _tip_paths(data: RunReport, trials: TrialResults, row: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Displacements (T, 3) of the mean of the markers at the tip [m]: measured, and by model."""
-    shown = shown_markers(trials.target[row])
-    tip = np.intersect1d(tip_markers(trials.bound, data.mesh.vertices[data.fixed]), shown)
-    tip = tip if len(tip) else shown
-    rest = _start(trials, row)[tip].mean(axis=0)
-    near = trials.times[row] <= _PLANE_SECONDS + 1e-9
-    models = {m: trials.positions[m] for m in MODELS if m in trials.positions}
-    seen, *paths = (q[row][near][:, tip].mean(axis=1) - rest for q in (trials.target, *models.values()))
-    return seen, dict(zip(models, paths, strict=True))
-
-
-def _plane(data: RunReport, trials: TrialResults, row: int, which: str, canvas: Canvas) -> Drawn:
-    """Draws the path of the tip in the plane across gravity."""
-    from . import motion_figures
-
-    name = trials.names[row]
-    seen, paths = _tip_paths(data, trials, row)
-    return canvas.figure(
-        "plane",
-        partial(motion_figures.tip_planes, seen, paths),
-        f"Path of the tip in the plane of x and y in the trial {name}: measured in grey, the models over it.",
-        f"Path of the tip across gravity over the first {min(_PLANE_SECONDS, trials.times[row, -1]):g} s of the trial "
-        f"{name}{which}: displacement of the mean of the markers at the tip, measured in grey. Paths are cut at the "
-        "frame.",
-    )

@@ -4,11 +4,8 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any, Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -17,7 +14,6 @@ from ..stepping.quantity import Quantity
 from .data import Driven, FloatArray, FollowedPath
 from .figures import (
     CHAMBER_COLOURS,
-    LABELS,
     LARGEST_SHOWN,
     ROUND_STEPS,
     STYLE,
@@ -30,14 +26,12 @@ from .figures import (
     positive,
     use_logarithm,
 )
-from .render import COLOUR_MAP, Pixels
+from .render import Pixels
 
 _MILLI: Final = 1e3
 _MOST_DOTS: Final = 75  # Dots along a time axis.
 _BAND: Final = 0.16  # Opacity of prediction intervals.
 _LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
-_ABOVE: Final = 0.35  # Margin around the measured path, over its longest side.
-_LEAST: Final = 0.25  # Shortest side of a view, over the longest.
 _LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
 _BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
 _LINES: Final[Mapping[str, Any]] = {"open": (0, (4, 2)), "receding": "-"}  # By beginning of a controller's name.
@@ -85,36 +79,6 @@ def _keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0
         bottom, top = max(low - margin, bottom), min(high + margin, top)
         more = max(0.0, 0.5 * (least - (top - bottom)))
         axes.set_ylim(bottom - more, top + more)
-
-
-@in_style()
-def shape_comparison(pictures: Pixels | None, largest: Mapping[str, float | None]) -> Figure:
-    """Show the deformed bodies of models side by side, coloured by the distance from the target's vertices.
-
-    Args:
-        pictures: (H, V * W, 4) of the V models that did not diverge, drawn from `bodies.distance_scene`.
-        largest: Distance [m] with the last colour, by model; None for a model that diverged.
-    """
-    kept = [model for model, most in largest.items() if most is not None]
-    drawn = {} if pictures is None else dict(zip(kept, np.split(pictures, len(kept), axis=1), strict=True))
-    rise = pictures.shape[0] * len(kept) / pictures.shape[1] if pictures is not None else 0.5  # Height over width.
-    height = WIDE / len(largest) * rise + 0.75
-    figure = new_figure(height)
-    for axes, (model, most) in zip(figure.subplots(1, len(largest), squeeze=False).flat, largest.items(), strict=True):
-        axes.set_title(LABELS[model])
-        axes.set_axis_off()
-        if most is None:
-            axes.text(0.5, 0.5, "diverged before this time", ha="center", transform=axes.transAxes)
-            continue
-        axes.imshow(drawn[model])
-        factor, unit = (1e3, "mm") if most >= 1e-4 else (1e6, "µm")
-        scale = ScalarMappable(Normalize(0.0, factor * most or 1.0), mpl.colormaps[COLOUR_MAP])
-        bar = figure.colorbar(scale, ax=axes, orientation="horizontal", shrink=0.8, aspect=34, pad=0.02)
-        bar.outline.set_visible(False)
-        bar.set_label(f"distance from the target [{unit}]")
-        bar.locator = MaxNLocator(5, steps=ROUND_STEPS)
-        bar.update_ticks()
-    return figure
 
 
 @in_style()
@@ -175,50 +139,6 @@ def marker_paths(
     figure.align_ylabels(panels[:, 0])
     legend_above(figure, panels[0, 0])
     return figure
-
-
-@in_style()
-def tip_planes(target: FloatArray, models: Mapping[str, FloatArray]) -> Figure:
-    """Draw the path of the tip in the plane across gravity, with a panel for each model, over the measured one.
-
-    Args:
-        target: (T, 3) displacement from rest [m], NaN where it was not seen.
-        models: (T, 3) [m] by model.
-    """
-    count = len(models)
-    columns = min(count, 4)
-    rows = -(-count // columns)
-    height = 0.75 + rows * (min(WIDE / columns, 3.4) + 0.15)
-    figure = new_figure(height)
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    centre, half = _range(target[:, :2])
-    reach = half.max() * np.array([-1.0, 1.0])
-    for axes in panels.flat[count:]:
-        axes.set_axis_off()
-    for (model, path), axes in zip(models.items(), panels.flat, strict=False):
-        axes.plot(*(_MILLI * target[:, :2]).T, color=TONES["target"].light, linewidth=2.6, label="Measured")
-        axes.plot(*_shown(path[:, :2]).T, color=TONES[model].light, linewidth=0.9)
-        axes.set(title=LABELS[model], xlim=centre[0] + reach, ylim=centre[1] + reach, aspect="equal")
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(MaxNLocator(5, steps=ROUND_STEPS))
-    for column in range(columns):
-        lowest = panels[(count - 1 - column) // columns, column]
-        lowest.set_xlabel("x [mm]")
-        lowest.tick_params(labelbottom=True)
-    for row in panels:
-        row[0].set_ylabel("y [mm]")
-    legend_above(figure, panels[0, 0])
-    return figure
-
-
-def _range(target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The middle (D,) of a measured path (T, D) [m], and half the size (D,) of a view of it [mm]."""
-    seen = _MILLI * target[np.isfinite(target).all(axis=1)]
-    if not len(seen):
-        return np.zeros(target.shape[1]), np.ones(target.shape[1])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    widest = max(float((high - low).max()), 0.1)
-    return 0.5 * (low + high), 0.5 * np.maximum(high - low, _LEAST * widest) + 0.5 * _ABOVE * widest
 
 
 def _shown(path: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..learning.baselines import BASELINES
-from .bodies import ComparedMotion, distance_scene, largest_distances
+from .bodies import ComparedMotion
 from .data import (
     MODELS,
     Driven,
@@ -23,9 +23,8 @@ from .data import (
     shown_markers,
     shown_models,
 )
-from .obstacles import ObstacleSurface
 from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text, unbroken
-from .render import Pixels, Renderer, draw, hangs, write_film
+from .render import Renderer, draw, hangs, write_film
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the interactive view.
@@ -33,25 +32,16 @@ _SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
-    """Start a process that draws the motion: instants, coloured bodies where vertices are observed, and the film."""
+    """Start a process that draws the motion: instants, and the film where markers are observed."""
     motion = motion_of(data)
     if motion is None:
         return {}
     renderer = Renderer()
-    started: dict[str, Future[Any]] = {"pictures": pool.submit(_draw_pictures, data, motion, renderer)}
+    started: dict[str, Future[Any]] = {"pictures": pool.submit(lambda: draw(motion.scene(), renderer=renderer)[0])}
     # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
     if data.sees_markers and len(motion.times) > 1:
         started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film(), renderer)
     return started
-
-
-def _draw_pictures(data: RunReport, motion: ComparedMotion, renderer: Renderer) -> list[Pixels]:
-    shape = (
-        None
-        if data.trials is None or data.sees_markers
-        else distance_scene(data.mesh, *_bodies(data.trials), _worst_obstacles(data, data.trials))
-    )
-    return draw(motion.scene(), *([] if shape is None else [shape]), renderer=renderer)
 
 
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
@@ -94,27 +84,8 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     )
 
 
-def worst_state(trials: TrialResults, row: int) -> int:
-    """Return the frame of a trial with the largest error of the uncorrected simulation or the first model."""
-    errors = trials.plain_errors_mm[row]
-    return int(np.argmax(np.where(np.isfinite(errors), errors, -1.0)))
-
-
-def _bodies(trials: TrialResults) -> tuple[dict[str, FloatArray], FloatArray]:
-    """Positions (N, 3) [m] in the worst frame of the worst trial: by model, and of the target."""
-    at = trials.worst, worst_state(trials, trials.worst)
-    return {m: trials.positions[m][at] for m in shown_models(trials.positions)}, trials.target[at]
-
-
-def _worst_obstacles(data: RunReport, trials: TrialResults) -> ObstacleSurface:
-    """Obstacles in the worst frame of the worst trial."""
-    row = trials.worst
-    at = worst_state(trials, row)
-    return data.obstacles_at(trials.names[row], trials.times[row, at : at + 1]).at(0)
-
-
 def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return a film and a few instants of a trial and, where vertices are observed, its tip and the coloured bodies."""
+    """Return a film, a view in space and a few instants of a trial and, where vertices are observed, its tip."""
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
@@ -122,7 +93,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]][0]}."
-    blocks: list[Block] = [] if data.sees_markers else _vertex_figures(data, trials, canvas)
+    blocks: list[Block] = [] if data.sees_markers else _tip_figure(data, trials, canvas)
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"
@@ -168,7 +139,7 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
     """Draws the body and its markers at a few instants."""
     from . import motion_figures
 
-    frames = canvas.started["pictures"].result()[0]
+    frames = canvas.started["pictures"].result()
     titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
     caption, when = f"{name} at {len(titles)} instants, one with the largest error of the grey body.", ", ".join(titles)
     if len(motion.times) == 1:  # A pose.
@@ -184,41 +155,27 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
     return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, caption)
 
 
-def _vertex_figures(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
-    """Draws the tip over time, and the bodies coloured by their error."""
+def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
+    """Draws the tip over time."""
     from . import motion_figures
 
-    row, blocks = trials.worst, list[Block]()
+    if not trials.moves or not len(data.tip):
+        return []
+    row = trials.worst
     drawn = [m for m in (*BASELINES, "simulation", "sysid", "law", "resphys") if m in trials.positions]
-    if trials.moves and len(data.tip):
-        rest = data.mesh.vertices[data.tip].mean(axis=0)
-        paths = {"target": trials.target[row], **{m: trials.positions[m][row] for m in drawn}}
-        paths = {name: q[:, data.tip].mean(axis=1) - rest for name, q in paths.items()}
-        reached = (f"{MODELS[m][0]} leaves the target by up to {_largest(paths[m] - paths['target'])}" for m in drawn)
-        blocks.append(
-            canvas.figure(
-                "tip_displacement",
-                partial(motion_figures.tip_displacement, paths, float(np.median(np.diff(trials.times[row])))),
-                f"Tip displacement over time. {'; '.join(reached)}.",
-                "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
-                "the target’s, on a logarithmic axis.",  # noqa: RUF001
-            )
+    rest = data.mesh.vertices[data.tip].mean(axis=0)
+    paths = {"target": trials.target[row], **{m: trials.positions[m][row] for m in drawn}}
+    paths = {name: q[:, data.tip].mean(axis=1) - rest for name, q in paths.items()}
+    reached = (f"{MODELS[m][0]} leaves the target by up to {_largest(paths[m] - paths['target'])}" for m in drawn)
+    return [
+        canvas.figure(
+            "tip_displacement",
+            partial(motion_figures.tip_displacement, paths, float(np.median(np.diff(trials.times[row])))),
+            f"Tip displacement over time. {'; '.join(reached)}.",
+            "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
+            "the target’s, on a logarithmic axis.",  # noqa: RUF001
         )
-    bodies, target = _bodies(trials)
-    reached = (f"{MODELS[m][0]}, up to {_largest(q - target)}" for m, q in bodies.items())
-    moment = f"{trials.times[row, worst_state(trials, row)]:.2f} s, where the error of the first body is largest"
-    caption = (
-        f"The same trial{f' at {moment}' if trials.moves else ''}: each body coloured by the distance of its vertices "
-        "from the target’s. The colour scales differ. Grey: the undeformed body. Drawn to scale."  # noqa: RUF001
-    )
-    alt = f"The deformed body, coloured by its distance from the target: {'; '.join(reached)}."
-
-    def shape(_: Path) -> Drawn:
-        _, *pictures = canvas.started["pictures"].result()
-        picture, largest = pictures[0][0] if pictures else None, largest_distances(data.mesh, bodies, target)
-        return canvas.figure("shape", partial(motion_figures.shape_comparison, picture, largest), alt, caption)
-
-    return blocks + canvas.attempt("shape.png", shape)
+    ]
 
 
 def _largest(differences: FloatArray) -> str:

@@ -38,7 +38,6 @@ _LOG = logging.getLogger(__name__)
 COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_process")
 TIME_OUT: Final = 300.0  # [s] for a scene; a picture takes about one.
 LARGEST_RATE: Final = 25.0  # Frames a second of a film, at most.
-COLOUR_MAP: Final = "viridis"
 BODY: Final = "#a9bccf"
 CLAMPED: Final = "#33485e"
 MEASURED: Final = "#d55e00"  # Vermilion of Okabe and Ito (2008).
@@ -64,8 +63,7 @@ class Layer:
     kind: str  # surface, lines, balls, rings (towards the viewer), slice or slice_edges (of solid cells, by a plane).
     points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres of balls and rings, which are hidden one by one.
     cells: IntArray | None = None  # (S, 3) triangles, (E, 2) lines or (C, 4 | 8) solid cells.
-    colour: str = INK  # Used without `paint`.
-    paint: FloatArray | None = None  # (P,) values in [0, 1], in the colours of `COLOUR_MAP`.
+    colour: str = INK
     size: float = 1.0  # Radius of balls and rings [m], or width of lines [px].
     opacity: float = 1.0
     light: tuple[float, float] | None = None  # Shares of ambient and scene light; None draws the plain colour.

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 
-from .render import COLOUR_MAP, INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Pixels
+from .render import INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Pixels
 
 _FAR: Final = 20.0  # Distance of the eye, in half heights of the view.
 _PEELS: Final = 12  # Sorted layers of translucent surfaces.
@@ -130,13 +130,10 @@ class _DrawnLayer:
             self.around, corners = _ball(layer.size) if layer.kind == "balls" else _ring(layer.size, axes)
             cells = np.concatenate([corners + len(self.around) * place for place in range(points.shape[1])])
         self.mesh = _mesh(layer, self._places(0), cells)
-        style = {"opacity": layer.opacity, "lighting": layer.light is not None, "smooth_shading": layer.kind == "balls"}
+        style = {"color": layer.colour, "opacity": layer.opacity, "smooth_shading": layer.kind == "balls"}
+        style["lighting"] = layer.light is not None
         if layer.light is not None:
             style |= {"ambient": layer.light[0], "diffuse": layer.light[1]}
-        if layer.paint is None:
-            style |= {"color": layer.colour, "scalars": None}
-        else:
-            style |= {"scalars": "paint", "cmap": COLOUR_MAP, "clim": (0.0, 1.0), "show_scalar_bar": False}
         if layer.kind in ("lines", "rings", "slice_edges"):
             style["line_width"] = _RING_WIDTH if layer.kind == "rings" else layer.size
         if layer.kind == "slice_edges":
@@ -169,8 +166,6 @@ def _mesh(layer: Any, points: FloatArray, cells: Any) -> Any:
     if cells.shape[1] == 2:  # VTK expects the number of points before each line.
         return pyvista.PolyData(points, lines=np.insert(cells, 0, 2, axis=1).ravel())
     surface = pyvista.PolyData.from_regular_faces(points, cells)
-    if layer.paint is not None:
-        surface.point_data["paint"] = layer.paint
     return surface if layer.plane is None else surface.clip(normal=layer.plane[0], origin=layer.plane[1])
 
 

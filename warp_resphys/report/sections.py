@@ -175,24 +175,8 @@ def published_growth(published: Mapping[str, Mapping[str, PublishedError]], firs
 
 def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the errors at multiples of the inputs."""
-    scales = data.metrics.get("scales", {})
-    table = scale_table(scales)
-    if table is None:
-        return None
-    from . import figures
-
-    diverged = any(summary["diverged"] for errors in scales.values() for summary in errors.values())
-    means = {
-        model: {float(s): e[model]["mean"] for s, e in scales.items() if model in e and e[model]["mean"] is not None}
-        for model in models_in_figures(scales[min(scales, key=float)])
-    }
-    figure = canvas.figure(
-        "error_over_scale",
-        partial(figures.error_over_scale, means),
-        "Mean marker error of the models against the scale of the inputs, on a logarithmic axis.",
-        f"Mean error over the roll-outs.{' Points with diverged roll-outs are missing.' if diverged else ''}",
-    )
-    return Part("Beyond the inputs of the training", [table, figure])
+    table = scale_table(data.metrics.get("scales", {}))
+    return None if table is None else Part("Beyond the inputs of the training", [table])
 
 
 def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:

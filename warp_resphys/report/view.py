@@ -21,11 +21,12 @@ from .data import MODELS, FloatArray, mean_distance
 from .figures import TONES
 from .obstacles import OBSTACLE
 from .page import ViewInSpace
-from .render import COLOUR_MAP, MEASURED, OUTLINE, frame_of, motion_axes, upwards
+from .render import MEASURED, OUTLINE, frame_of, motion_axes, upwards
 
 _TOLERANCE: Final = 2e-4  # Largest error of a drawn vertex, over the body's size,
 _MOST_MODES: Final = 96  # unless it takes more modes than these.
 _DIVERGED: Final = 3.0  # Distance from rest beyond which a body is not drawn, over the body's size.
+_COLOUR_MAP: Final = "viridis"
 _STOPS: Final = 32  # Of the colour map.
 _LEVELS: Final = 255  # Of the errors of a model, from zero to the largest.
 
@@ -98,7 +99,7 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         "up": upwards(motion.gravity).tolist(),
         "centre": centre.tolist(),
         "half": half.tolist(),
-        "colours": [to_hex(stop) for stop in colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, _STOPS))],
+        "colours": [to_hex(stop) for stop in colormaps[_COLOUR_MAP](np.linspace(0.0, 1.0, _STOPS))],
         "ink": {"light": TONES["ink"].light, "dark": TONES["ink"].dark},
         "outline": OUTLINE,
         "solid": OBSTACLE,

@@ -111,21 +111,6 @@ def test_an_equilibrium_lasts(model):
     np.testing.assert_allclose(model.observe(motion.end)[0], model.rest_observed(np.array([3.0, 1.5]))[0], atol=1e-5)
 
 
-def test_a_transition_is_linearised(model):
-    random, inputs = np.random.default_rng(3), np.array([2.5, 1.0])
-    start = model.move(model.rest(np.full(PARTS, 2.0)), np.tile(inputs, (4, 1, 1))).end
-    weights, way = random.standard_normal(2 * MODES), random.standard_normal((3, MODES))
-    slopes = np.split(model.transition(start, inputs, np.zeros(MODES))[1], 3, axis=1)
-    for number, slope in enumerate(slopes):
-
-        def after(x, number=number):
-            z, v, b = (x * way[each] * (each == number) for each in range(3))
-            state = model.transition(replace(start, z=start.z + z, v=start.v + v), inputs, b)[0]
-            return float(weights @ np.concatenate([state.z[0], state.v[0]]))
-
-        assert_slope(after, weights @ slope @ way[number])
-
-
 def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(model):
     random, inputs = np.random.default_rng(6), np.array([2.5, 1.0])
     start = model.move(model.rest(np.full(PARTS, 2.0)), np.tile(inputs, (4, 1, 1))).end
@@ -195,11 +180,3 @@ def test_models_at_once_do_not_see_each_other_and_begin_again_by_themselves(mode
     for row, since in enumerate((0, 4, 0)):
         wanted = model.respond(model.rest(rest), inputs[since:, row]).y[-1]
         np.testing.assert_allclose(model.observe(batch)[row], wanted, atol=1e-12)
-
-
-def test_a_state_goes_on_from_its_arrays(model):
-    inputs = 5.0 * np.random.default_rng(5).random((6, 2, PARTS))
-    half = model.move(model.rest(count=2), inputs[:3]).end
-    again = model.move(type(half).from_arrays(half.arrays()), inputs[3:]).end
-    np.testing.assert_array_equal(again.z, model.move(half, inputs[3:]).end.z)
-    np.testing.assert_allclose(again.z, model.move(model.rest(count=2), inputs).end.z, atol=1e-12)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.data.actuation import InputSequences, InputWaves, check_inputs
+from warp_resphys.data.actuation import InputSequences, check_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
@@ -39,12 +39,6 @@ def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
     assert np.corrcoef(p[..., 0].ravel(), p[..., 1].ravel())[0, 1] == pytest.approx(0.6, abs=0.08)
 
 
-def test_sequences_depend_on_the_seed_alone():
-    first, again, other = (InputSequences().draw(100, STEP, 3, np.random.default_rng(i)) for i in (4, 4, 5))
-    np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other).max() > 1e3
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -74,15 +68,3 @@ def test_a_small_zero_error_of_a_gauge_is_accepted_and_a_large_one_refused():
     np.testing.assert_array_equal(check_inputs(tension, TENSION, 2, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
     with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):
         check_inputs(np.array([[0.0], [-0.5]]), TENSION, 1, 2.0, "a.h5")
-
-
-def test_waves_grow_repeat_and_stay_within_the_limit():
-    waves = InputWaves(2.0, (0.0, -np.pi / 2, 0.5), mean=4e3, amplitude=5e3, limit=8e3, start=0.1, ramp=0.4)
-    p = waves.series(200, STEP)
-    assert p.shape == (201, 3)
-    assert not p[:11].any()
-    assert 0.0 < p[11].max() < 0.01 * p.max()  # With zero slope.
-    np.testing.assert_allclose(p[50:150], p[100:200], atol=1e-9)  # A period is 50 steps.
-    assert (p.min(), p.max()) == (0.0, 8e3)
-    assert p[110] == pytest.approx([4e3, 0.0, 4e3 + 5e3 * np.sin(0.5)])  # Two periods after the start.
-    assert InputWaves(1.0, (0.0,), mean=1.0, amplitude=0.5, limit=2.0).series(1, STEP)[0] == pytest.approx([1.0])

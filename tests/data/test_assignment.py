@@ -22,8 +22,7 @@ def seen(places=PLACES, noise=0.0, turn=TURN):
     return ((places - SHIFT) @ turn + noise * drawn)[ORDER]
 
 
-@pytest.mark.parametrize("noise", [0.0, 3e-3])
-@pytest.mark.parametrize("extra", [0, 2])
+@pytest.mark.parametrize(("noise", "extra"), [(0.0, 0), (3e-3, 2)])
 def test_markers_are_named_in_any_order_and_frame(noise, extra):
     others = np.random.default_rng(1).uniform(-1.0, 1.0, (extra, 3))
     result = assign(np.concatenate([others, seen(noise=noise)]), PLACES, NAMES, source="file")
@@ -38,15 +37,6 @@ def test_one_anchor_is_enough_with_known_axes():
     result = assign(seen(moved), PLACES, NAMES, source="file", anchors=[4], rotation=TURN)
     np.testing.assert_array_equal(result.columns, np.argsort(ORDER))
     np.testing.assert_allclose(result.transform.translation, SHIFT, atol=1e-9)
-
-
-def test_three_anchors_determine_the_frame_of_a_bent_body():
-    places = np.concatenate([PLACES, [[-0.05, 0.0, 0.0], [0.0, -0.06, 0.02]]])
-    names, bent = (*NAMES, "base 2", "base 3"), places.copy()
-    bent[:4, 0] += np.array([0.0, 0.01, 0.03, 0.06])
-    result = assign((bent - SHIFT) @ TURN, places, names, source="file", anchors=[4, 5, 6])
-    np.testing.assert_array_equal(result.columns, np.arange(7))
-    np.testing.assert_allclose(result.transform.rotation, TURN, atol=1e-9)
 
 
 def test_ambiguous_markers_are_named():

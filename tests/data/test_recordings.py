@@ -43,7 +43,7 @@ def edit(path, line, change):
     return path
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("delimiter", [",", "\t"])
 def test_table(tmp_path, positions, delimiter):
     positions[7:9, 1] = np.nan
     pressure = np.linspace(0.0, 39.0, 40)
@@ -117,16 +117,6 @@ class TestALogThatBeganBeforeItsWinch:
             self.read(path)
 
 
-def test_a_table_of_markers_in_a_plane(tmp_path):
-    """A single camera sees no depth; and where nothing tells the time, the rate does."""
-    path, flat = tmp_path / "swing.csv", np.random.default_rng(0).uniform(0.0, 90.0, (30, 4))
-    np.savetxt(path, flat, delimiter=",")
-    recording = read_recording(path, units="mm", rate=60.0, table=Table(["a.y", "a.z", "b.y", "b.z"]))
-    np.testing.assert_allclose(recording.positions[..., 1:], 1e-3 * flat.reshape(30, 2, 2), atol=1e-12)
-    assert (recording.positions[..., 0] == 0.0).all()
-    assert recording.rate == 60.0
-
-
 @pytest.mark.parametrize(
     ("columns", "lines", "message"),
     [
@@ -146,35 +136,6 @@ def test_wrong_descriptions_of_tables(tmp_path, columns, lines, message):
         read_recording(tmp_path / "swing.npz", table=Table(columns, lines))
 
 
-def test_table_in_another_order_of_columns(tmp_path, positions):
-    path = tmp_path / "swing.csv"
-    rows = ["frame,b.y,b.x,a.z,b.z,a.x,a.y"]
-    rows += [
-        ",".join(f"{value:.6f}" for value in (frame, b[1], b[0], a[2], b[2], a[0], a[1]))
-        for frame, (a, b, _) in enumerate(positions)
-    ]
-    path.write_text("\n".join(rows))
-    recording = read_recording(path, units="m", rate=50.0)
-    assert recording.labels == ("b", "a")
-    assert recording.rate == 50.0
-    np.testing.assert_allclose(recording.positions, positions[:, [1, 0]], atol=1e-6)
-
-
-@pytest.mark.parametrize("between", [" ", "_"])
-def test_axes_may_stand_behind_a_space_or_an_underscore(tmp_path, positions, between):
-    path = tmp_path / "swing.csv"
-    write_table(path, positions)
-    head, _, rows = path.read_text().partition("\n")
-    renamed = [f"{name[0]}{between}{name[2].upper()}{name[3:]}" if name[1] == "." else name for name in head.split(",")]
-    path.write_text(",".join(renamed) + "\n" + rows)
-    recording = read_recording(path)
-    assert recording.labels == ("a", "b", "c")
-    np.testing.assert_allclose(recording.positions, positions, atol=1e-6)
-    path.write_text(",".join(renamed).replace(f"c{between}Y", "cat").replace(f"c{between}Z", "dog") + "\n" + rows)
-    with pytest.raises(DataFileError, match=f"is named 'c{between}X', which is neither"):
-        read_recording(path)
-
-
 def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     stamps = np.delete(np.arange(40), [10, 11, 12]) / 120.0
     path = write_table(tmp_path / "swing.csv", np.delete(positions, [10, 11, 12], axis=0), stamps=stamps + 3.0)
@@ -192,7 +153,6 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
         (1, lambda line: line.replace("time [s]", "time [min]"), "gives its time in 'min'"),
         (1, lambda line: line.replace("b.y", "b.w"), r"column 6 is named 'b\.w', which is neither"),
         (1, lambda line: line.replace("c.z", "c.y"), r"has two columns named 'c\.y'"),
-        (1, lambda line: line.replace("c.z [mm]", "valve [bar]"), r"marker c has no column 'c\.z'"),
         (1, lambda line: line.replace("c.z [mm]", "c.z [cm]"), "gives positions in 'cm', 'mm'"),
         (1, lambda line: line.replace("[mm]", "[inch]"), "gives positions in 'inch'"),
         (1, lambda line: line.replace("[mm]", ""), "does not say in which unit"),
@@ -201,9 +161,7 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
         (7, lambda line: "0.0499" + line[6:], None),
         (7, lambda line: "0.0540" + line[6:], "line 7"),
         (8, lambda line: "0.0100" + line[6:], "line 8: the time or frame does not rise"),
-        (8, lambda line: line[6:], "line 8: the time or frame does not rise"),
         (8, lambda line: "1e308" + line[6:], "line 8"),
-        (2, lambda line: "-1e308" + line[6:], "line 2"),
         (1, lambda line: line.replace("b.y", "b" + 20_000 * " " + "y"), "column 6 is named"),  # not in cubic time
     ],
 )
@@ -229,14 +187,6 @@ def test_times_that_are_too_close_are_refused(tmp_path, positions, stamps):
         read_recording(path)
 
 
-def test_times_far_apart_do_not_fill_the_memory(tmp_path, positions):
-    path = edit(write_table(tmp_path / "swing.csv", positions), 41, lambda line: "9e9" + line[6:])
-    with pytest.raises(
-        DataFileError, match=r"line 41: from the line before on, time .* to 9e\+09, so that both do not"
-    ):
-        read_recording(path)
-
-
 def qualisys(path, positions, *, names=True, frame=True, missing="0.000", rate="200"):
     lines = ["NO_OF_FRAMES\t40", "NO_OF_CAMERAS\t8", "NO_OF_MARKERS\t3", f"FREQUENCY\t{rate}", "DESCRIPTION\t--"]
     lines += ["TIME_STAMP\t2024-03-01, 10:11:12.131\t4711.0", "DATA_INCLUDED\t3D", "MARKER_NAMES\tTip 1\tTip 2\tBase"]
@@ -250,8 +200,9 @@ def qualisys(path, positions, *, names=True, frame=True, missing="0.000", rate="
     return path
 
 
-@pytest.mark.parametrize(("names", "frame"), [(True, True), (True, False), (False, True), (False, False)])
-@pytest.mark.parametrize("missing", ["0.000", "", "NULL"])
+@pytest.mark.parametrize(
+    ("names", "frame", "missing"), [(True, True, "0.000"), (True, False, ""), (False, True, "NULL"), (False, False, "")]
+)
 def test_qualisys_export(tmp_path, positions, names, frame, missing):
     positions[0:3, 0] = np.nan
     recording = read_recording(qualisys(tmp_path / "swing.tsv", positions, names=names, frame=frame, missing=missing))
@@ -321,10 +272,9 @@ def motive(path, positions, *, parent=False):
     return path
 
 
-@pytest.mark.parametrize("parent", [False, True])
-def test_motive_export(tmp_path, positions, parent):
+def test_motive_export(tmp_path, positions):
     positions[5, 2] = np.nan
-    recording = read_recording(motive(tmp_path / "swing.csv", positions, parent=parent))
+    recording = read_recording(motive(tmp_path / "swing.csv", positions, parent=True))
     assert recording.labels == ("beam:Tip", "beam:Mid", "Unlabeled 12")
     assert recording.rate == 120.0
     np.testing.assert_allclose(recording.positions, positions, atol=1e-8)
@@ -408,10 +358,8 @@ def test_numpy_archive(tmp_path, positions):
         ({"rate_hz": -1.0}, "frame rate of -1"),
         ({"positions": None}, "has no array 'positions'"),
         ({"positions": np.zeros((40, 9))}, r"positions must be \(frames, markers, 3\), not \(40, 9\)"),
-        ({"positions": np.full((40, 3, 3), "x")}, "'positions' does not hold numbers"),
         ({"positions": np.full((40, 3, 3), np.nan)}, "no marker is seen in any frame"),
         ({"labels": np.array(["a", "b"])}, "has 3 markers and 2 labels"),
-        ({"labels": np.array(["a", "b", "c", "d"])}, "has 3 markers and 4 labels"),
         ({"units": "ft"}, "gives positions in 'ft'"),
         (
             {"units": "cm", "positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e5},
@@ -420,16 +368,11 @@ def test_numpy_archive(tmp_path, positions):
         ({"positions": np.random.default_rng(0).normal(size=(40, 3, 3)) * 1e-6}, "all markers lie within"),
         ({"actuation": np.zeros((39, 2))}, r"actuation has the shape \(39, 2\).* each of the 40 frames"),
         ({"actuation": np.full((40, 2), np.nan)}, "an actuation is NaN"),
-        ({"base": np.ones((39, 7))}, r"base has the shape \(39, 7\); it needs a place and a quaternion"),
         ({"base": np.ones((40, 6))}, r"base has the shape \(40, 6\); it needs a place and a quaternion"),
-        ({"base": np.zeros((40, 7))}, "'base'"),
         ({"actuation": np.zeros((40, 2)), "actuation_units": "psi"}, "gives its actuation in 'psi'"),
         ({"rest": np.zeros((2, 3))}, r"rest has the shape \(2, 3\)"),
         ({"start": np.inf}, "its first frame is at inf s"),
-        ({"start": np.nan}, "its first frame is at nan s"),
-        ({"start": np.zeros(2)}, "'start'"),
         ({"rate_hz": np.full(40, 100.0)}, r"'rate_hz' has the shape \(40,\)"),
-        ({"rate_hz": 1e300}, r"gives a frame rate of 1e\+300 Hz"),
         ({"actuation": np.full((40, 2), 1e308), "actuation_units": "bar"}, "an actuation is NaN or infinite"),
     ],
 )
@@ -505,13 +448,6 @@ def test_damaged_and_foreign_files(tmp_path, positions):
         read_recording(tmp_path / "swing.mat")
 
 
-def test_a_marker_with_one_coordinate_missing_is_not_seen(tmp_path, positions):
-    positions[4, 1, 2] = np.nan
-    positions[6, 1, 0] = np.inf
-    recording = read_recording(archive(tmp_path / "swing.npz", positions))
-    np.testing.assert_array_equal(np.argwhere(np.isnan(recording.positions[:, 1]).all(axis=1))[:, 0], [4, 6])
-
-
 def test_arguments_are_checked(tmp_path, positions):
     path = archive(tmp_path / "swing.npz", positions)
     for given, message in (
@@ -555,13 +491,6 @@ def test_hdf5_of_another_program(tmp_path, positions):
         pass
     with pytest.raises(DataFileError, match="'trajectories'"):
         read_recording(tmp_path / "run.h5")
-
-
-def test_a_recording_in_the_wrong_unit_is_refused(shared_data):
-    path = shared_data / "beam_mocap" / "beam_gravity_V2_a.c3d"
-    assert read_recording(path).labels[0] == "Tip - 1"
-    with pytest.raises(DataFileError, match=r"all markers lie within 0\.098 mm"):
-        read_recording(path, units="mm")
 
 
 def plate(count=20):

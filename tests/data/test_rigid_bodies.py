@@ -15,7 +15,6 @@ from warp_resphys.data.rigid_bodies import (
     arms,
     as_markers,
     corners_of,
-    motion_between,
     owners,
     with_axes,
     with_corners,
@@ -52,7 +51,7 @@ def recorded(folder):
     return read_recording(table(folder, rows))
 
 
-@pytest.mark.parametrize("angle", [0.01, 0.5, 2.0])
+@pytest.mark.parametrize("angle", [0.01, 2.0])
 def test_points_weigh_an_angle_by_the_length_about_any_axis(angle):
     """1/4 sum |dx|^2 = |dp|^2 + L^2 (2 sin w/2)^2."""
     for axis in np.random.default_rng(2).normal(size=(5, 3)):
@@ -62,13 +61,6 @@ def test_points_weigh_an_angle_by_the_length_about_any_axis(angle):
         expected = moved @ moved + LENGTH**2 * (2.0 * np.sin(angle / 2.0)) ** 2
         np.testing.assert_allclose(np.square(error).sum(-1).mean(-1), expected, rtol=1e-12)
         np.testing.assert_allclose(angles(corners(PLACES, TURNS), corners(PLACES, turned)), angle, rtol=1e-9)
-
-
-def test_the_configured_deviations_give_the_length():
-    bodies = settings("experiment=beam_regions", "markers.rigid_bodies={plate: {part: cap}}").markers.rigid_bodies
-    assert bodies["plate"].length == pytest.approx(1e-3 / np.radians(1.0))  # A millimetre counts as a degree.
-    deviations = {"position_deviation": 5e-4, "orientation_deviation": 0.25}
-    assert bodies["plate"].changed(**deviations).length == pytest.approx(5e-4 / np.radians(0.25))
 
 
 def test_a_recorded_pose_becomes_four_points(tmp_path):
@@ -106,15 +98,6 @@ def test_a_rigid_body_counts_as_one_marker():
     np.testing.assert_allclose(as_markers(points, labels), expected)
     np.testing.assert_allclose(as_markers(points[..., 0], labels, -1), expected[..., 0])
     assert as_markers(points, list("ABCDEF")) is points
-
-
-def test_motions_of_points_that_were_not_seen():
-    rest, moved = corners(PLACES, TURNS), corners(PLACES + 0.1, TURNS * TURNS)
-    moved[1, 2] = np.nan
-    motion = motion_between(rest, moved)
-    assert np.isnan(motion.rotation[1]).all()
-    assert np.isnan(angles(moved, rest)).tolist() == [False, True, False, False]
-    np.testing.assert_allclose(motion.apply(rest)[[0, 2, 3]], moved[[0, 2, 3]], atol=1e-12)
 
 
 def capped():

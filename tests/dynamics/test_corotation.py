@@ -78,9 +78,10 @@ def adjoints(sim, states, monkeypatch):
     return out, counts
 
 
-@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
-@pytest.mark.parametrize("youngs_modulus", [264e3, 2e9])
-@pytest.mark.parametrize("kind", [kind for kind in BODIES if kind != "tendon"])
+@pytest.mark.parametrize(
+    ("kind", "youngs_modulus", "poissons_ratio"),
+    [("hexahedra", 264e3, 0.499), ("tetrahedra", 2e9, 0.45), ("rigid part", 2e9, 0.499)],
+)
 def test_adjoints_by_a_factor_of_the_rest_state_are_those_of_a_factor_in_double(
     kind, youngs_modulus, poissons_ratio, monkeypatch
 ):
@@ -129,24 +130,6 @@ def test_rotations_are_those_of_the_body_since_the_factor_of_its_environment():
     torch.testing.assert_close(whole, vectors)
 
 
-def test_inverted_vertices_are_not_turned():
-    sim = simulator("hexahedra", "pardiso")
-    potential, vertices = sim.workspace(1).potential, np.arange(sim.body.n_vertices)
-    corotation, rest = Corotation(potential, vertices), sim.rest_state().q
-    potential.positions.copy_(rest)
-    corotation.record()
-    potential.positions.copy_(rest @ turned(0.7).T)
-    corotation.update()
-    vectors = torch.ones_like(rest)
-    corotation.rotate(vectors)
-    moved = (vectors - 1.0).abs().amax(-1)[0] > 0.1
-    assert moved.all()
-    potential.positions.copy_(-rest)
-    corotation.update()
-    corotation.rotate(vectors := torch.ones_like(rest))
-    torch.testing.assert_close(vectors, torch.ones_like(rest))
-
-
 def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
     both = []
     for name in ("pardiso", "banded"):
@@ -158,37 +141,12 @@ def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
     torch.testing.assert_close(*both, rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
 
 
-def test_a_factor_is_replaced_after_a_solution_slower_than_the_mean(monkeypatch):
-    sim = simulator("hexahedra", "pardiso")
-    scripted = iter([3, 6, 6, 6, 12, 12, 4, 4])
-    monkeypatch.setattr(
-        hessian,
-        "conjugate_gradients",
-        lambda operator, preconditioner, right, *limits: SimpleNamespace(
-            x=right, converged=torch.ones(1, dtype=torch.bool), iterations=next(scripted)
-        ),
-    )
-    solver, made = sim.workspace(1).hessian("pardiso").linear, []
-    factor = type(solver).direction_factor
-    monkeypatch.setattr(solver, "direction_factor", lambda *rest: made.append(0) or factor(solver, *rest))
-    counts = []
-    sim.step(sim.rest_state())
-    for _ in range(8):
-        right = torch.zeros(1, sim.body.n_vertices, 3, dtype=torch.float64)
-        sim.workspace(1).hessian("pardiso").solve_with_kept_factor([right])
-        counts.append(len(made))
-    # (25 + 3 + 6 + 6 + 6 + 12) / 5 = 11.6 < 12
-    assert counts == [1, 1, 1, 1, 1, 2, 2, 2]
-
-
 @pytest.mark.parametrize(
     ("kind", "name", "poissons_ratio"),
     [
-        ("tetrahedra", "quasi_newton", 0.45),
         ("tetrahedra", "quasi_newton", 0.499),
-        ("tetrahedra", "newton", 0.499),
-        ("tetrahedra", "projective_dynamics", 0.45),
-        ("rigid part", "quasi_newton", 0.45),
+        ("hexahedra", "projective_dynamics", 0.45),
+        ("rigid part", "newton", 0.45),
         ("tendon", "quasi_newton", 0.45),
     ],
 )
@@ -208,32 +166,6 @@ def test_roll_outs_and_gradients_agree_with_those_of_the_banded_solver(kind, nam
         torch.testing.assert_close(a, b, rtol=0.0, atol=1e-7 * float(b.abs().max()))
 
 
-def test_a_factor_that_rotates_lasts_for_longer(monkeypatch):
-    factors = []
-    for turns in (True, False):
-        if not turns:
-            monkeypatch.setattr(Corotation, "rotate", lambda self, vectors: None)
-            monkeypatch.setattr(Corotation, "rotate_back", lambda self, vectors: None)
-        sim = simulator("tetrahedra", "pardiso", youngs_modulus=3e3, relative_tolerance=1e-6)
-        reports = sim.rollout(sim.rest_state(), 40).reports
-        factors.append([sum(int(getattr(r, count)) for r in reports) for count in ("factorisations", "iterations")])
-    assert factors[0][0] < factors[1][0]
-    assert factors[0][1] < 0.8 * factors[1][1]
-
-
-def test_an_environment_does_not_depend_on_the_others_in_its_batch():
-    """One of them is pressed so hard that it gets new factors within steps, and the other one keeps its own."""
-    options = {"relative_tolerance": 1e-10, "refactor_after": 1}
-    sim = simulator("tetrahedra", "pardiso", youngs_modulus=1e4, **options)
-    force = torch.zeros_like(sim.rest_state(2).q)
-    force[:, :, 0] = torch.tensor([[-0.05], [-0.6]])
-    both = sim.rollout(sim.rest_state(2), 4, Inputs(external_force=force))
-    alone = sim.rollout(sim.rest_state(1), 4, Inputs(external_force=force[:1]))
-    first, second = sum(report.factorisations for report in both.reports).tolist()
-    assert second > first
-    assert torch.equal(both.q[:, :1], alone.q)
-
-
 def test_a_gradient_has_the_size_of_its_loss():
     sim = simulator("tetrahedra", "pardiso")
     gradients = []
@@ -242,26 +174,3 @@ def test_a_gradient_has_the_size_of_its_loss():
         end = sim.rollout(State(q, torch.zeros_like(q)), 2)
         gradients.append(torch.autograd.grad(size * end.q[-1].square().sum(), q)[0] / size)
     torch.testing.assert_close(*gradients, rtol=0.0, atol=1e-11 * float(gradients[0].abs().max()))
-
-
-def test_a_linearised_step_needs_a_factor_only_for_many_right_hand_sides(monkeypatch):
-    factors, refactor = [], hessian.ExactHessian.refactor_exact
-    monkeypatch.setattr(hessian.ExactHessian, "refactor_exact", lambda self: (factors.append(0), refactor(self)))
-    both = []
-    for name in ("pardiso", "banded"):
-        sim = simulator("hexahedra", name)
-        step = sim.linearise(sim.rest_state())
-        force = torch.zeros_like(step.start)
-        force[..., 2] = 0.05
-        bent = step.hold(sim.step(sim.rest_state(), Inputs(external_force=force))[0].q)
-        random = torch.Generator().manual_seed(2)
-        right = torch.randn(1, force[0].numel(), 6, generator=random, dtype=torch.float64)
-        step = sim.linearise(sim.rest_state())
-        step.factorise(bent)
-        step.residual(step.start)
-        few = step.solve(right[..., :2])
-        assert len(factors) == 2 * len(both)
-        both.append((few, step.solve(right)))
-    assert len(factors) == 2
-    for a, b in zip(*both, strict=True):
-        torch.testing.assert_close(a, b, rtol=0.0, atol=1e-9 * float(b.abs().max()))

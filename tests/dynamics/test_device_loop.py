@@ -10,7 +10,6 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
-    Tendons,
     box_hexahedra,
     select_vertices,
 )
@@ -59,9 +58,15 @@ def host(monkeypatch):
     return run
 
 
-@pytest.mark.parametrize("factors", ["double", "single"])
-@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
-@pytest.mark.parametrize(("start", "tolerance"), [(bent, 1e-9), (compressed, 1e-9), (far, 1e-13)])
+@pytest.mark.parametrize(
+    ("name", "start", "tolerance", "factors"),
+    [
+        ("quasi_newton", bent, 1e-9, "single"),
+        ("quasi_newton", far, 1e-13, "double"),
+        ("newton", compressed, 1e-9, "double"),
+        ("newton", bent, 1e-9, "single"),
+    ],
+)
 def test_the_loop_on_the_device_is_that_of_the_host(name, start, tolerance, factors, host, device):
     def rolled():
         s = simulator(name, device, relative_tolerance=tolerance, factors=factors, max_iterations=500)
@@ -77,10 +82,9 @@ def test_the_loop_on_the_device_is_that_of_the_host(name, start, tolerance, fact
         assert bool(one.converged.all())
 
 
-@pytest.mark.parametrize("factors", ["double", "single"])
-def test_an_indefinite_hessian_is_clamped_where_it_is(factors, host, device):
+def test_an_indefinite_hessian_is_clamped_where_it_is(host, device):
     def begun():
-        s = simulator("newton", device, factors=factors, max_iterations=1, on_failure="count")
+        s = simulator("newton", device, factors="single", max_iterations=1, on_failure="count")
         state = s.step(compressed(s))[0]
         return state.q, s.workspace(3).solver("dynamics", s.settings).hessian.clamped.tolist()
 
@@ -102,17 +106,6 @@ def test_a_solve_is_one_launch(monkeypatch, device):
     assert len(launches) == 1
 
 
-def test_a_failure_is_said_and_mends_itself(device):
-    s = simulator("quasi_newton", device, max_iterations=25)
-    calm = bent(s)
-    expected = s.step(calm)[0]
-    wild = calm.v.clone()
-    wild[1] += 1e3
-    with pytest.raises(ConvergenceError, match="environment 1 of 3"):
-        s.step(State(calm.q, wild))
-    torch.testing.assert_close(s.step(calm)[0].q, expected.q, rtol=0.0, atol=1e-9)
-
-
 def test_a_rollout_says_which_of_its_steps_failed_first(device):
     """Also on a GPU, where the host looks only after the last step."""
     s = simulator("quasi_newton", device, max_iterations=25)
@@ -124,11 +117,3 @@ def test_a_rollout_says_which_of_its_steps_failed_first(device):
         s.rollout(start, 4, Inputs(external_force=force))
     assert list(caught.value.report.converged) == [True, True, False]
     torch.testing.assert_close(s.rollout(start, 3).q, expected, rtol=0.0, atol=1e-9)
-
-
-def test_tendons_have_the_host_in_the_loop(device):
-    """The columns by which they couple cells are made by torch."""
-    path = [[[0.0, 0.01, 0.015], [0.03, 0.01, 0.015], [0.06, 0.01, 0.015]]]
-    s = simulator("quasi_newton", device, Body(MESH, fixed=FIXED, energies=(Tendons(path, stiffness=100.0),)))
-    assert s.workspace(1).potential.couples_cells
-    assert bool(s.step(s.rest_state())[1].converged.all())

@@ -7,7 +7,7 @@ import torch
 
 from support.chambered import chambered
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, Tendons, select_vertices
-from warp_resphys.energies.materials import Gent, StableNeoHookean
+from warp_resphys.energies.materials import Gent
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.studies.gradient_check import central_difference
@@ -27,9 +27,7 @@ def driven(**values):
 
 
 CASES = {
-    "at rest": (lambda: beam(Corotated(2e5, 0.45), gravity=(0.0, 0.0, 0.0)), Inputs(), "youngs_modulus", 2e5),
     "nearly incompressible": (lambda: beam(Corotated(2e5, 0.499)), Inputs(), "poissons_ratio", 0.499),
-    "large rotations": (lambda: beam(StableNeoHookean(2e4, 0.45)), Inputs(), "youngs_modulus", 2e4),
     "law": (lambda: beam(Gent(9e3, 3.0, 1e6)), Inputs(), "limit", 3.0),
     "contact": (
         lambda: beam(Corotated(2e4, 0.45), Contact({"floor": FLOOR}, friction=0.3, distance=2e-3)),
@@ -70,17 +68,6 @@ def test_a_step_of_newtons_method_gives_the_derivative_of_an_equilibrium(case):
     moved = here.solve((there.residual(start) - here.residual(start)).reshape(1, -1, 1)).view_as(start)
     derivative = -float((weights * moved).sum()) * 1e3
     assert derivative == pytest.approx(wanted, rel=1e-4, abs=10.0 * error + 1e-12)
-
-
-def test_the_residual_of_an_equilibrium_is_zero_there():
-    simulator = beam(Corotated(2e5, 0.45))
-    state = simulator.static_equilibrium(batch=2)
-    step = simulator.linearise_equilibrium(batch=2)
-    weight = float(step.residual(simulator.rest_state(2).q).norm())
-    assert float(step.residual(state.q).norm()) < 1e-9 * weight
-    resting = step.finish(state.q)
-    assert bool((resting.v == 0.0).all())
-    torch.testing.assert_close(resting.q, state.q)
 
 
 def test_forces_that_follow_the_pose_are_refused():

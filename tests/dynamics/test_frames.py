@@ -6,11 +6,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.chambered import KINDS, chambered
-from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.predictors import LearnedPredictor, Range
+from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.settings.trials import MotionSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
@@ -38,41 +38,6 @@ def test_an_affine_map_has_the_rotation_of_its_polar_decomposition_everywhere(ki
     np.testing.assert_allclose(frames.to_world(rest, (q - rest) / 0.01, force), frames.to_world(q, v, force), atol=1e-9)
 
 
-def test_a_twisted_beam_turns_from_slice_to_slice():
-    body = Body(box_hexahedra((0.1, 0.02, 0.02), (20, 4, 4)))
-    x = body.mesh.vertices - [0.0, 0.01, 0.01]
-    angles = np.radians(900.0) * x[:, 0]  # 90 degrees at the end
-    q = torch.as_tensor(Rotation.from_euler("x", angles[:, None]).apply(x))[None]
-    rotations = VertexFrames(body, 0.01, q).rotations(q)[0].numpy()
-    inside = (x[:, 0] > 0.01) & (x[:, 0] < 0.09)
-    turned = Rotation.from_matrix(rotations[inside]).as_euler("xyz")[:, 0]
-    np.testing.assert_allclose(turned, angles[inside], atol=np.radians(1.5))
-
-
-def test_forces_that_press_from_the_sides_wring_a_beam_unless_they_turn_with_it():
-    """Dead loads do work when the body twists under them; the same loads that turn with it do not."""
-    mesh = box_hexahedra((0.1, 0.02, 0.02), (10, 2, 2))
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
-    material = Corotated(youngs_modulus=1e5, poissons_ratio=0.4, density=1e3, mass_damping=5.0)
-    simulator = Simulator(body, material, time_step=0.005, gravity=(0.0, 0.0, 0.0))
-    frames = VertexFrames(body, simulator.time_step, simulator.rest_positions)
-    centred = simulator.rest_positions - simulator.tensor([0.0, 0.01, 0.01])
-    inward = -6.0 * centred * simulator.tensor([0.0, 1.0, 1.0])
-    nudge = torch.linalg.cross(simulator.tensor([1.0, 0.0, 0.0]).expand_as(centred), centred)
-    twists = {}
-    for follows in (False, True):
-        state = simulator.rest_state()
-        with torch.no_grad():
-            for k in range(120):
-                force = frames.to_world(state.q, state.v, inward[None]) if follows else inward[None]
-                state, _ = simulator.step(state, Inputs(force + (1e-2 * nudge if k < 5 else 0.0)))
-        tip = select_vertices(mesh, x=0.1)
-        turned = frames.rotations(state.q)[0, tip].numpy()
-        twists[follows] = float(np.abs(Rotation.from_matrix(turned).as_euler("xyz", degrees=True)[:, 0]).mean())
-    assert twists[False] > 30.0
-    assert twists[True] < 2.0
-
-
 class Constant:
     """A model that sees nothing and always predicts the same force."""
 
@@ -84,20 +49,6 @@ class Constant:
 
     def decode(self, inputs, hidden):
         return [self.force.expand(len(inputs), -1, -1)], hidden
-
-
-def test_what_a_model_predicts_turns_with_the_body_in_a_roll_out():
-    body = chambered("hexahedron")
-    rest = deformed(body, np.eye(3))
-    force = torch.randn(rest.shape, dtype=rest.dtype, generator=torch.Generator().manual_seed(1))
-    turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
-    q, nothing = deformed(body, turn), torch.zeros(1, 0)
-    range_ = Range.of(torch.zeros(2, 1, dtype=rest.dtype))
-    state, frames = State(q, 0.0 * q), VertexFrames(body, 0.01, q)
-    kept = LearnedPredictor(Constant(rest[0], force), nothing, range_)(state, 0)
-    turned = LearnedPredictor(Constant(rest[0], force), nothing, range_, frames)(state, 0)
-    assert torch.equal(kept, force)
-    np.testing.assert_allclose(turned[0].numpy(), force[0].numpy() @ turn.T, atol=1e-12)
 
 
 STEP = 0.01
@@ -134,17 +85,6 @@ class TestBaseFrame:
             for actual, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
                 torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-11)
             torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
-
-    def test_a_window_has_the_frames_of_its_steps(self):
-        whole, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(3)
-        q, v = (torch.randn(2, 5, 3, dtype=torch.float64, generator=random) for _ in range(2))
-        part = whole.during(torch.tensor([1, 0]), torch.tensor([0, 17]), 4)  # of the second body, then of the first
-        for k in range(4):
-            windowed = part.enter(q, v, k)
-            for row, (body, step) in enumerate([(1, k), (0, 17 + k)]):
-                expected = whole.enter(q[row].expand(2, -1, -1), v[row].expand(2, -1, -1), step)
-                for field, whole_field in zip(windowed, expected, strict=True):
-                    torch.testing.assert_close(field[row], whole_field[body], rtol=0.0, atol=1e-12)
 
     def test_a_roll_out_does_not_depend_on_how_base_and_gravity_are_turned_together(self):
         mesh = box_hexahedra(divisions=(3, 1, 1))

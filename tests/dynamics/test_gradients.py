@@ -17,7 +17,6 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.dynamics import equilibrium
 from warp_resphys.dynamics.hessian import ExactHessian
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS
@@ -47,8 +46,7 @@ def simulator(kind="hexahedron", material=DAMPED, **options):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
-@pytest.mark.parametrize("pose_name", ["rest", "twisted"])
+@pytest.mark.parametrize(("pose_name", "poissons_ratio"), [("rest", 0.45), ("twisted", 0.499)])
 def test_factors_in_single_precision_give_gradients_in_double(pose_name, poissons_ratio):
     material = replace(DAMPED, poissons_ratio=poissons_ratio)
     both = []
@@ -62,30 +60,18 @@ def test_factors_in_single_precision_give_gradients_in_double(pose_name, poisson
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("time_step", [0.01, 1.0])
-def test_single_precision_needs_no_factor_in_double(time_step, monkeypatch):
+def test_single_precision_needs_no_factor_in_double(monkeypatch):
     """Not even where inertia is so small that rounding leaves more than is aimed at."""
     tried = []
     refactor = ExactHessian.refactor_exact
     monkeypatch.setattr(ExactHessian, "refactor_exact", lambda self: (tried.append(self.exact), refactor(self)))
     sim = simulator(
-        material=replace(DAMPED, poissons_ratio=0.499), time_step=time_step, solver=replace(TIGHT, factors="single")
+        material=replace(DAMPED, poissons_ratio=0.499), time_step=1.0, solver=replace(TIGHT, factors="single")
     )
     state = pose(sim, "bent", 2)
     q = state.q.clone().requires_grad_(True)
     torch.autograd.grad(sim.rollout(State(q, state.v), 2).q[-1].square().sum(), q)
     assert tried == [False, False]
-
-
-def test_an_adjoint_that_single_precision_cannot_solve_is_solved_in_double(monkeypatch):
-    monkeypatch.setattr(equilibrium, "_REFINEMENTS", 0)
-    gradients = []
-    for factors in ("single", "double"):
-        sim = simulator(solver=replace(TIGHT, factors=factors))
-        state = pose(sim, "bent", 1)
-        q = state.q.clone().requires_grad_(True)
-        gradients.append(torch.autograd.grad((sim.rollout(State(q, state.v), 2).q[-1] ** 2).sum(), q)[0])
-    torch.testing.assert_close(*gradients, rtol=0.0, atol=1e-11)
 
 
 def assert_equal(rows):
@@ -94,16 +80,19 @@ def assert_equal(rows):
     assert all(row.adjoint != 0.0 for row in rows)
 
 
-@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
-@pytest.mark.parametrize("start", POSES)
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize(
+    ("kind", "start", "poissons_ratio"),
+    [
+        *(("hexahedron", start, nu) for start, nu in zip(POSES, (0.499, 0.499, 0.45), strict=True)),
+        *((kind, "twisted", 0.499) for kind in [*MESHES][1:]),
+    ],
+)
 def test_every_parameter_at_every_pose(kind, start, poissons_ratio, device):
     material = replace(DAMPED, poissons_ratio=poissons_ratio)
     assert_equal(check_gradients(simulator(kind, material, device=device), start, steps=2))
 
 
-@pytest.mark.parametrize("start", ["bent", "twisted"])
-@pytest.mark.parametrize("integrator", [*INTEGRATORS][1:])
+@pytest.mark.parametrize(("integrator", "start"), [*zip([*INTEGRATORS][1:], ["bent", "twisted"], strict=True)])
 def test_every_parameter_with_every_integrator(integrator, start):
     assert_equal(check_gradients(simulator(integrator=integrator), start, steps=3))
 
@@ -114,20 +103,12 @@ def test_every_parameter_with_every_integrator(integrator, start):
         {"material": StableNeoHookean(**DAMPED.constants)},
         {"material": replace(DAMPED, poissons_ratio=-0.2)},
         {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-12)},
-        {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="dense")},
         {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="sparse")},
     ],
-    ids=["stable_neo_hookean", "auxetic", "quasi_newton", "dense", "sparse"],
+    ids=["stable_neo_hookean", "auxetic", "quasi_newton", "sparse"],
 )
 def test_every_parameter_with_other_options(options):
     assert_equal(check_gradients(simulator(**options), "bent", steps=2))
-
-
-def test_parameters_that_change_together_have_the_rows_of_those_that_change_alone():
-    both = [check_gradients(simulator(), "bent", steps=2, together=together) for together in (False, True)]
-    for alone, together in zip(*both, strict=True):
-        assert together.parameter == alone.parameter
-        assert together.difference == pytest.approx(alone.difference, rel=1e-6)
 
 
 def test_a_wrong_derivative_shows_in_all_rows_of_its_shape(monkeypatch):
@@ -157,8 +138,7 @@ def derivative(loss, value, direction):
     return GradientRow("", float((gradient * direction).sum()), *difference)
 
 
-@pytest.mark.parametrize("rounding", [0.0, 1e-12, 1e-9])
-@pytest.mark.parametrize("scale", [1.0, 3.0])
+@pytest.mark.parametrize(("scale", "rounding"), [(1.0, 0.0), (3.0, 1e-12), (3.0, 1e-9)])
 def test_a_difference_is_as_good_as_rounding_allows_and_says_how_good(scale, rounding):
     """A function whose values are off at random by a given amount, with a pole near the first step."""
     random = torch.Generator().manual_seed(0)
@@ -195,9 +175,8 @@ def test_poissons_ratio_of_zero_has_a_derivative():
     assert row.relative_error <= 1e-6
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_gradient_through_a_hundred_and_twenty_steps(integrator):
-    s = simulator(integrator=integrator, material=replace(DAMPED, youngs_modulus=3e4))
+def test_gradient_through_a_hundred_and_twenty_steps():
+    s = simulator(integrator="bdf2", material=replace(DAMPED, youngs_modulus=3e4))
     state, steps = pose(s, "bent", 1), 120
     tip = torch.as_tensor(select_vertices(MESHES["hexahedron"], x=SIZE[0]))
 
@@ -227,8 +206,7 @@ def moving_clamp(s, steps):
     return torch.stack([turned + shift, clamp - 0.5 * shift], dim=1)
 
 
-@pytest.mark.parametrize("kind", MESHES)
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(("integrator", "kind"), [*zip(INTEGRATORS, MESHES, strict=False)])
 def test_a_clamp_that_moves(integrator, kind):
     s = simulator(kind, integrator=integrator)
     state, steps = pose(s, "bent", 2), 4
@@ -251,7 +229,7 @@ def test_a_clamp_that_moves(integrator, kind):
     assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
 
 
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron10"])
 def test_static_equilibrium(kind):
     s = simulator(kind)
     b, n, d = 2, s.body.n_vertices, len(s.fixed)
@@ -275,14 +253,6 @@ def test_static_equilibrium(kind):
     assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
 
 
-def test_static_equilibrium_does_not_depend_on_where_it_starts():
-    s = simulator()
-    start = pose(s, "bent", 1).q.requires_grad_(True)
-    state = s.static_equilibrium(start=start)
-    torch.testing.assert_close(state.q.detach(), s.static_equilibrium().q, rtol=0.0, atol=1e-10)
-    assert not state.q.requires_grad
-
-
 def test_fixed_velocities_and_positions_of_fixed_vertices_have_no_hidden_influence():
     """Forces on fixed vertices change nothing; where they stand at the start matters when nothing moves them."""
     s = simulator()
@@ -294,19 +264,6 @@ def test_fixed_velocities_and_positions_of_fixed_vertices_have_no_hidden_influen
     assert float(gradients[1][:, s.fixed].abs().max()) == 0.0
 
 
-def test_gradients_add_up_over_a_shared_parameter():
-    s = simulator()
-    state = pose(s, "bent", 3)
-    shared = torch.tensor(2e5, dtype=torch.float64, requires_grad=True)
-    separate = torch.full((3, 1), 2e5, dtype=torch.float64, requires_grad=True)
-    weights = noise(*state.q.shape)
-    gradients = []
-    for e in (shared, separate):
-        q = s.rollout(state, 2, parameters={"youngs_modulus": e}).q[-1]
-        gradients.append(torch.autograd.grad((weights * q).sum(), e)[0])
-    torch.testing.assert_close(gradients[0], gradients[1].sum(), rtol=1e-9, atol=0.0)
-
-
 @pytest.mark.parametrize(
     ("adjoint", "difference", "error"),
     [
@@ -314,16 +271,8 @@ def test_gradients_add_up_over_a_shared_parameter():
         (0.0, 1e-9, 1.0),
         (0.0, 0.0, math.inf),  # vanishing in both tells nothing
         (math.nan, 1.0, math.inf),
-        (1.0, math.nan, math.inf),
         (math.inf, math.inf, math.inf),
     ],
 )
 def test_a_row_that_compares_nothing_is_an_infinite_error(adjoint, difference, error):
     assert GradientRow("", adjoint, difference).relative_error == error
-
-
-def test_a_body_without_a_clamp_has_no_row_for_it():
-    free = Simulator(Body(MESHES["hexahedron"]), DAMPED, solver=TIGHT)
-    rows = check_gradients(free, "bent", steps=1, batch=1)
-    assert [row.parameter for row in rows] == [kind for kind in KINDS if kind != "fixed_positions"]
-    assert all(row.relative_error <= 1e-6 for row in rows)

@@ -43,8 +43,9 @@ def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
     return trajectory.q[-1], trajectory.v[-1]
 
 
-@pytest.mark.parametrize("moving", [False, True], ids=["clamped", "moving clamp"])
-@pytest.mark.parametrize(("integrator", "order"), [("implicit_euler", 1), ("bdf2", 2), ("midpoint", 2)])
+@pytest.mark.parametrize(
+    ("integrator", "order", "moving"), [("implicit_euler", 1, False), ("bdf2", 2, True), ("midpoint", 2, True)]
+)
 def test_order_of_convergence(integrator, order, moving):
     """Large rotations and strains with both dampings: positions and velocities converge at the method's order."""
     results = [swing(integrator, steps, moving=moving) for steps in (32, 64, 128)]
@@ -53,16 +54,6 @@ def test_order_of_convergence(integrator, order, moving):
         coarse, middle, fine = (r[quantity][:, free] for r in results)
         observed = torch.log2((coarse - middle).abs().max() / (middle - fine).abs().max())
         assert float(observed) == pytest.approx(order, abs=0.25)
-
-
-def test_all_integrators_have_the_same_limit():
-    limits = []
-    for integrator in INTEGRATORS:
-        (coarse, _), (fine, _) = swing(integrator, 48), swing(integrator, 96)
-        order = 1 if integrator == "implicit_euler" else 2
-        limits.append(fine + (fine - coarse) / (2**order - 1))
-    torch.testing.assert_close(limits[1], limits[2], rtol=0.0, atol=4e-6)
-    torch.testing.assert_close(limits[0], limits[2], rtol=0.0, atol=1e-4)
 
 
 GROWTH = {
@@ -133,74 +124,9 @@ def test_midpoint_conserves_momenta_and_rigid_rotations_are_not_damped():
 SOFT_STIFFLY_DAMPED = replace(SOFT, mass_damping=0.0, stiffness_damping=0.05)
 
 
-def test_midpoint_keeps_the_energy_of_small_vibrations_and_the_others_lose_some():
-    remaining = {}
-    for integrator in INTEGRATORS:
-        simulator = Simulator(CLAMPED, SOFT_UNDAMPED, 0.005, WEIGHTLESS, integrator, solver=TIGHT)
-        tip = torch.as_tensor(select_vertices(MESH, x=0.04))
-        force = torch.zeros_like(simulator.rest_state().q)
-        force[:, tip, 2] = 1e-4
-        state = simulator.static_equilibrium(Inputs(force))
-        q = simulator.rollout(state, 200).q[:, 0, tip, 2].mean(-1) - float(state.q[0, tip, 2].mean())
-        centre = -(float(state.q[0, tip, 2].mean()) - float(simulator.rest_positions[tip, 2].mean()))
-        swings = (q - centre).abs()
-        remaining[integrator] = float(swings[150:].max() / swings[:50].max())
-    assert remaining["midpoint"] > 0.98
-    assert remaining["implicit_euler"] < 0.2
-    assert remaining["implicit_euler"] < remaining["bdf2"] < 0.98
-
-
-def test_stiffness_damping_matches_modal_damping_of_small_vibrations():
-    """A single mode decays as exp(-beta omega^2 t / 2)."""
-    beta, h = 2e-3, 5e-4
-    material = replace(SOFT_UNDAMPED, stiffness_damping=beta)
-    loose = SolverSettings("newton", relative_tolerance=1e-7)
-    simulator = Simulator(CLAMPED, material, h, WEIGHTLESS, "midpoint", solver=loose)
-    undamped = replace(simulator, material=SOFT_UNDAMPED, gravity=(0.0, 0.0, -1e-3))
-    undamped.static_equilibrium()  # sets the potential's stiffness
-    potential = undamped.workspace(1).potential
-    potential.positions.copy_(simulator.rest_positions)
-    potential.update_tangent()
-    free = np.setdiff1d(np.arange(potential.n_vertices), CLAMPED.fixed_vertices)
-    columns = []
-    for dof in (3 * free[:, None] + np.arange(3)).ravel():
-        unit = torch.zeros(1, potential.n_vertices * 3, dtype=torch.float64)
-        unit[0, dof] = 1.0
-        product = potential.stiffness_product(unit.view(1, -1, 3))
-        columns.append(product[0, free].reshape(-1).numpy())
-    stiffness = np.stack(columns, axis=1)
-    mass = np.repeat(simulator.prepare().mass[0, free].numpy(), 3)
-    values, vectors = np.linalg.eigh(stiffness / np.sqrt(mass[:, None] * mass))
-    omega, mode = np.sqrt(values[0]), vectors[:, 0] / np.sqrt(mass)
-    state = simulator.rest_state()
-    shape = torch.zeros_like(state.q)
-    shape[0, free] = torch.as_tensor(mode.reshape(-1, 3))
-    start = State(state.q + 1e-5 * shape / shape.abs().max(), state.v)
-    steps = round(2 * np.pi / omega / h) * 3
-    q = simulator.rollout(start, steps).q[:, 0] - simulator.rest_positions
-    amplitude = (q * shape).sum((1, 2)) / (q[0] * shape).sum()
-    time = h * np.arange(steps + 1)
-    rate = beta * omega**2 / 2
-    frequency = np.sqrt(omega**2 - rate**2)
-    expected = np.exp(-rate * time) * (np.cos(frequency * time) + rate / frequency * np.sin(frequency * time))
-    assert 0.01 < rate / omega < 0.2
-    np.testing.assert_allclose(amplitude, expected, atol=5e-3)
-
-
-def test_clamp_moves_as_told_and_takes_the_body_along():
-    for integrator in INTEGRATORS:
-        simulator = Simulator(CLAMPED, SOFT, 0.01, WEIGHTLESS, integrator, solver=TIGHT)
-        state = simulator.rest_state()
-        targets = state.q[:, simulator.fixed] + 1e-3 * torch.arange(1, 61)[:, None, None, None].clamp(max=20)
-        trajectory = simulator.rollout(state, 60, Inputs(fixed_positions=targets))
-        torch.testing.assert_close(trajectory.q[1:, :, simulator.fixed], targets, rtol=0.0, atol=1e-12)
-        shift = trajectory.q[-1, 0] - simulator.rest_positions
-        assert float((shift - 0.02).abs().max()) < 2e-3
-
-
-@pytest.mark.parametrize("mesh", [MESH, box_tetrahedra((0.04, 0.02, 0.02), (2, 1, 1), 2)], ids=["hex", "tet10"])
-def test_point_mass_weighs_and_slows(mesh):
+def test_point_mass_weighs_and_slows():
     """A body of no weight of its own with a mass on its tip face is a spring: omega^2 = k / m."""
+    mesh = box_tetrahedra((0.04, 0.02, 0.02), (2, 1, 1), 2)
     tip, grams = select_vertices(mesh, x=0.04), 0.05
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), point_masses=[PointMass(grams, tip)])
     light = Corotated(2e4, 0.3, density=1e-3)
@@ -218,15 +144,6 @@ def test_point_mass_weighs_and_slows(mesh):
     q = simulator.rollout(simulator.rest_state(), quarter).q[:, 0, tip, 2].mean(-1)
     drop = float(simulator.rest_positions[tip, 2].mean() - q[-1])
     assert drop == pytest.approx(2 * sag, rel=0.02)  # half a period after the release: twice the sag
-
-
-def test_rollout_goes_on_from_its_final_state():
-    for integrator in INTEGRATORS:
-        simulator = Simulator(CLAMPED, SOFT, 0.01, integrator=integrator, solver=TIGHT)
-        whole = simulator.rollout(simulator.rest_state(), 6)
-        first = simulator.rollout(simulator.rest_state(), 3)
-        second = simulator.rollout(first.final, 3)
-        torch.testing.assert_close(second.q[-1], whole.q[-1], rtol=0.0, atol=1e-12)
 
 
 def test_unknown_integrator_is_refused():

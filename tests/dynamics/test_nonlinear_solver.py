@@ -29,8 +29,7 @@ def simulator(name="quasi_newton", material=MATERIAL, body=BODY, device="cpu", *
     return Simulator(body, material, solver=chosen, device=device)
 
 
-@pytest.mark.parametrize("start", ["bent", "twisted"])
-@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
+@pytest.mark.parametrize(("model", "start"), [("corotated", "twisted"), ("stable_neo_hookean", "bent")])
 def test_all_solvers_find_the_same_trajectory(model, start, device):
     material = MATERIALS[model](**MATERIAL.constants)
     results = {}
@@ -53,8 +52,7 @@ def test_linear_solvers_find_the_same_step():
         torch.testing.assert_close(result, results[0], rtol=0.0, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+@pytest.mark.parametrize(("name", "poissons_ratio"), [*zip(SOLVERS, (0.499, 0.499, 0.45), strict=True)])
 def test_factors_in_single_precision_lead_to_the_same_residual(name, poissons_ratio, device):
     """And take hardly more iterations: 1e-8 is a hundredth of what float32 resolves of these forces."""
     material = replace(MATERIAL, poissons_ratio=poissons_ratio)
@@ -101,73 +99,6 @@ def test_failure_carries_the_last_positions_and_the_report(name):
     assert "take a smaller time step" in str(error)
 
 
-def test_failures_are_counted_when_asked_for_and_the_simulation_goes_on():
-    s = simulator("newton", max_iterations=1, on_failure="count")
-    trajectory = s.rollout(pose(s, "twisted", 2), 3)
-    failed = torch.stack([~r.converged for r in trajectory.reports])
-    assert failed.shape == (3, 2)
-    assert bool(failed.any())
-    assert bool(torch.isfinite(trajectory.q).all())
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-def test_batch_of_different_states_and_materials_equals_single_runs(name, device):
-    size, steps = 8, 3
-    generator = torch.Generator().manual_seed(0)
-
-    def spread(value, share):
-        return value * (1 + share * torch.rand(size, 1, generator=generator, dtype=torch.float64))
-
-    constants = {
-        "youngs_modulus": spread(1e5, 1.0),
-        "poissons_ratio": spread(0.4, 0.2),
-        "density": spread(1000.0, 0.5),
-    }
-    damping = {"mass_damping": spread(1.0, 1.0)[:, 0], "stiffness_damping": spread(1e-3, 1.0)[:, 0]}
-    s = simulator(name, relative_tolerance=1e-10, max_iterations=20000, device=device)
-    start = pose(s, "bent", size)
-    forces = s.tensor(1e-3 * torch.randn(steps, *start.q.shape, generator=generator, dtype=torch.float64))
-    together = s.rollout(start, steps, Inputs(forces), {**constants, **damping})
-    for i in range(size):
-        own = {key: float(value[i]) for key, value in (constants | damping).items()}
-        state = State(start.q[i : i + 1], start.v[i : i + 1])
-        alone = s.rollout(state, steps, Inputs(forces[:, i : i + 1]), own)
-        torch.testing.assert_close(together.q[:, i], alone.q[:, 0], rtol=0.0, atol=1e-10)
-        torch.testing.assert_close(together.v[:, i], alone.v[:, 0], rtol=0.0, atol=1e-8)
-
-
-def test_material_per_element_equals_scalar_where_constant():
-    s = simulator(relative_tolerance=1e-10)
-    elements = len(MESH.cells)
-    constants = {"youngs_modulus": 1e5, "poissons_ratio": 0.45, "density": 1000.0}
-    spread = {name: torch.full((elements,), value, dtype=torch.float64) for name, value in constants.items()}
-    state = pose(s, "bent", 1)
-    torch.testing.assert_close(s.step(state, parameters=spread)[0].q, s.step(state)[0].q, rtol=0.0, atol=1e-12)
-    stiff_half = 1e5 * torch.where(torch.arange(elements) < elements // 2, 4.0, 1.0)
-    tip = select_vertices(MESH, x=0.06)
-    sags = [
-        float(s.static_equilibrium(parameters={"youngs_modulus": e}).q[0, tip, 2].mean())
-        for e in (1e5, stiff_half, 4e5)
-    ]
-    assert sags[0] < sags[1] < sags[2]
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-def test_float32_runs_and_agrees(name, device):
-    double = simulator(name, device=device, max_iterations=5000)
-    single = Simulator(
-        BODY,
-        MATERIAL,
-        solver=SolverSettings(name, relative_tolerance=1e-3, max_iterations=500),
-        dtype=torch.float32,
-        device=device,
-    )
-    reference = double.rollout(pose(double, "bent", 2), 3).q
-    trajectory = single.rollout(pose(single, "bent", 2), 3)
-    assert trajectory.q.dtype == torch.float32
-    torch.testing.assert_close(trajectory.q.double(), reference, rtol=0.0, atol=2e-5)
-
-
 @pytest.fixture
 def pulled_beam():
     """Simulators of the README's beam by settings, nearly incompressible, and its pose under a pull."""
@@ -183,8 +114,7 @@ def pulled_beam():
     return make, exact.static_equilibrium(Inputs(load))
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-8])
-@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
+@pytest.mark.parametrize(("name", "tolerance"), [("quasi_newton", 1e-5), ("newton", 1e-8)])
 def test_float32_converges_for_a_nearly_incompressible_solid(pulled_beam, name, tolerance, device):
     """To the resolution of its positions, about 4e-9 m: the volume term leaves float32 no digit of the residual."""
     make, held = pulled_beam
@@ -222,9 +152,16 @@ def test_a_slow_solver_is_not_taken_for_one_at_rounding(pulled_beam):
     torch.testing.assert_close(state.q, exact.q, rtol=0.0, atol=2e-10)
 
 
-@pytest.mark.parametrize("linear_solver", ["banded", "tiled", "dense", "sparse", "multigrid"])
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("speed", [1e80, 1e160])
+@pytest.mark.parametrize(
+    ("name", "linear_solver", "speed"),
+    [
+        ("quasi_newton", "banded", 1e80),
+        ("newton", "tiled", 1e160),
+        ("projective_dynamics", "dense", 1e160),
+        ("newton", "sparse", 1e80),
+        ("quasi_newton", "multigrid", 1e160),
+    ],
+)
 def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_solver, speed, device):
     if device == "cuda" and linear_solver == "banded":
         pytest.skip("banded factors are the CPU's")
@@ -246,9 +183,14 @@ def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_sol
         torch.testing.assert_close(state.q[0], expected[step][0].q[0], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("offset", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("name", "dtype", "offset"),
+    [
+        ("quasi_newton", torch.float32, 1.0),
+        ("newton", torch.float64, 1.0),
+        ("projective_dynamics", torch.float32, 0.0),
+    ],
+)
 def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
     """Its residual is rounding, and so are the forces that it would be measured against."""
     s = Simulator(BODY, Corotated(264e3, 0.499, density=1070.0), gravity=(0.0, 0.0, 0.0), solver=name, dtype=dtype)
@@ -259,21 +201,8 @@ def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
     assert float(moved.abs().max()) < 200 * torch.finfo(dtype).eps * (0.06 + offset)
 
 
-def test_quasi_newton_reuses_its_factor_and_newton_does_not():
-    counts = {}
-    for name in ("quasi_newton", "newton"):
-        s = simulator(name, relative_tolerance=1e-6)
-        reports = s.rollout(pose(s, "bent", 1), 6).reports
-        counts[name] = sum(r.factorisations for r in reports)
-        iterations = sum(int(r.iterations) for r in reports)
-        if name == "newton":
-            assert counts[name] >= iterations
-    assert counts["quasi_newton"] < counts["newton"]
-
-
-@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
-def test_recovers_from_inverted_elements(name):
-    s = simulator(name, max_iterations=500)
+def test_recovers_from_inverted_elements():
+    s = simulator("newton", max_iterations=500)
     rest = s.rest_state(1)
     q = rest.q.clone()
     tip = torch.as_tensor(select_vertices(MESH, x=0.06))
@@ -283,11 +212,10 @@ def test_recovers_from_inverted_elements(name):
     assert float(spread) > 0.04
 
 
-@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
-def test_auxetic_material_runs_with_all_solvers(model):
+def test_auxetic_material_runs_with_all_solvers():
     results = []
     for name in SOLVERS:
-        s = simulator(name, MATERIALS[model](1e5, -0.3, density=1000.0), max_iterations=5000)
+        s = simulator(name, Corotated(1e5, -0.3, density=1000.0), max_iterations=5000)
         results.append(s.rollout(pose(s, "bent", 1), 3).q)
     torch.testing.assert_close(results[1], results[0], rtol=0.0, atol=1e-9)
     torch.testing.assert_close(results[2], results[0], rtol=0.0, atol=1e-9)
@@ -414,30 +342,6 @@ class OneVertex:
         return float(getattr(self.progress, name).numpy()[0])
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
-    """Also where all places are taken."""
-    one = OneVertex(memory)
-    kept = []
-    generator = torch.Generator().manual_seed(0)
-    for step in range(9):
-        moved, changed = torch.randn(2, 3, generator=generator, dtype=torch.float64)
-        changed = (moved + 0.2 * changed) * (-1.0 if step in (1, 5, 8) else 1.0)
-        one.vectors["direction"][0, 0], one.vectors["gradient"][0, 0] = moved, 1.0
-        one.vectors["residual"][0, 0] = 1.0 + changed
-        one.accept()
-        if float(moved @ changed) > 0.0:
-            kept = [*kept, (moved, changed)][-memory:]
-        pairs, count, last = one.pairs, int(one.pairs.count.numpy()[0]), int(one.pairs.last.numpy()[0])
-        places = [(last - age) % memory for age in reversed(range(count))]
-        assert count == len(kept)
-        for k, (i, (s, y)) in enumerate(zip(places, kept, strict=True)):
-            np.testing.assert_allclose(pairs.s.numpy()[0, i, 0], s, rtol=1e-14)
-            np.testing.assert_allclose(pairs.y.numpy()[0, i, 0], y, rtol=1e-12)
-            for j, (_, newer) in zip(places[k:], kept[k:], strict=True):
-                np.testing.assert_allclose(pairs.r.numpy()[0, i, j], float(s @ newer), rtol=1e-10, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("iterations", "factorisations", "clamped", "phase", "requested"),
     [
@@ -445,7 +349,6 @@ def test_a_pair_of_negative_curvature_leaves_the_others_as_they_are(memory):
         (5, 1, False, kernels.NEED_DIRECTION, kernels.CLAMPED_FACTOR),
         (5, 1, True, kernels.FAILED, 0),
         (10, 0, False, kernels.FAILED, 0),
-        (10, 1, False, kernels.FAILED, 0),
     ],
 )
 @pytest.mark.parametrize("stalls", [0, 2])

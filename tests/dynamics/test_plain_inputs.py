@@ -26,8 +26,7 @@ def pulled(dtype=torch.float64):
     return Simulator(body, Corotated(2e5, 0.45), dtype=dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize(("dtype", "batch"), [(torch.float64, 1), (torch.float32, 3)])
 def test_numbers_and_lists_are_for_every_environment(dtype, batch):
     simulator = pulled(dtype)
     start = simulator.rest_state(batch)
@@ -52,7 +51,7 @@ def test_numbers_and_lists_are_for_every_environment(dtype, batch):
     assert float((moved - simulator.step(start)[0].q)[:, -1, 2].min()) > 0.0
 
 
-@pytest.mark.parametrize("given", [0.2, [0.1, 0.3], np.array([0.1, 0.3]), torch.tensor(0.2)])
+@pytest.mark.parametrize("given", [0.2, np.array([0.1, 0.3])])
 def test_numbers_stay_numbers_in_other_inputs(given):
     """In float32, for two environments, by every method that makes other inputs of some."""
     simulator = pulled(torch.float32)
@@ -74,15 +73,6 @@ def test_numbers_stay_numbers_in_other_inputs(given):
     own = {"a": Inputs(tendon_tension=given, external_force=np.full((len(MESH.vertices), 3), 1e-3)), "b": Inputs()}
     moved = both.step(both.rest_state(2), scene.inputs(own))[0].q[:, scene.vertex_slice("a")]
     assert moved.numpy() == pytest.approx(pushed.numpy(), abs=1e-6)
-
-
-def test_a_number_has_a_gradient():
-    simulator = pulled()
-    tension = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
-    rest = simulator.static_equilibrium(Inputs(tendon_tension=tension), batch=2).q.sum()
-    (slope,) = torch.autograd.grad(rest, tension)
-    ends = (simulator.static_equilibrium(Inputs(tendon_tension=0.2 + h), batch=2).q.sum() for h in (1e-3, -1e-3))
-    assert float(slope) == pytest.approx(float(next(ends) - next(ends)) / 2e-3, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warp_resphys.dynamics import plausibility
 from warp_resphys.dynamics.plausibility import small_strain_stiffness
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.materials import ConvexMaterial, Corotated, StableNeoHookean
@@ -55,18 +54,6 @@ def test_a_nearly_flat_cell_is_named_with_its_place():
         Simulator(beam(mesh=Mesh(vertices, mesh.cells)))
     number = int(str(caught[0].message).split()[1])
     assert inner in mesh.cells[number]
-
-
-def test_slow_sizes_warn_on_the_cpu_alone(monkeypatch):
-    """The number of unknowns is that of the vertices that can move."""
-    body = beam()
-    unknowns = 3 * (body.n_vertices - len(body.fixed_vertices))
-    monkeypatch.setattr(plausibility, "MANY_UNKNOWNS", unknowns - 1)
-    with pytest.warns(ResphysWarning, match=f"has {unknowns} unknowns"):
-        Simulator(body)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        plausibility.warn_of_implausible(body, {}, (0.0, 0.0, 0.0), on_cpu=False)
 
 
 def test_the_warnings_are_silenced_by_their_class():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.linalg.threads import in_threads, shards_of
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
@@ -51,7 +51,7 @@ def rolled(motion, rows, **settings):
 
 @pytest.mark.parametrize(
     ("name", "linear_solver"),
-    [("newton", "banded"), *(("quasi_newton", linear) for linear in ("banded", "tiled", "dense", "sparse"))],
+    [("newton", "banded"), ("quasi_newton", "tiled"), ("quasi_newton", "sparse")],
 )
 def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
     """Its directions, line searches and factors are its own: nothing depends on its neighbours."""
@@ -68,7 +68,7 @@ def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
         assert made[:, i].tolist() == [int(r.factorisations) for r in alone.reports]
 
 
-@pytest.mark.parametrize(("count", "linear_solver"), [(2, "banded"), (3, "banded"), (3, "tiled"), (3, "sparse")])
+@pytest.mark.parametrize(("count", "linear_solver"), [(2, "banded"), (3, "sparse")])
 def test_threads_change_nothing(motion, monkeypatch, count, linear_solver):
     results = []
     for number in (1, count):
@@ -102,19 +102,6 @@ def test_a_failure_in_a_thread_names_the_environment_of_the_batch(motion, monkey
     assert caught.value.report.converged.tolist() == [i != 5 for i in range(SIZE)]
 
 
-def test_a_failed_adjoint_has_the_positions_of_the_batch(monkeypatch):
-    """A body held by one vertex may turn about it."""
-    threads(monkeypatch, 2)
-    body = Body(MESH, fixed=select_vertices(MESH, x=0.0)[:1])
-    sim = Simulator(body, Corotated(1e5, 0.45, density=1000.0), gravity=(0.0, 0.0, 0.0))
-    force = torch.zeros(4, body.n_vertices, 3, dtype=torch.float64, requires_grad=True)
-    x = sim.static_equilibrium(Inputs(force)).q
-    weights = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
-    with pytest.raises(ConvergenceError, match="the adjoint system is singular") as caught:
-        torch.autograd.grad((x * weights).sum(), force)
-    assert caught.value.positions.shape == x.shape
-
-
 @pytest.mark.parametrize("failing", [0, 2])
 def test_what_a_thread_raises_comes_when_all_have_ended(failing):
     ended = []
@@ -130,8 +117,7 @@ def test_what_a_thread_raises_comes_when_all_have_ended(failing):
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
 
 
-@pytest.mark.parametrize("name", ["quasi_newton", "newton", "projective_dynamics"])
-@pytest.mark.parametrize("limit", [1, 2, 3])
+@pytest.mark.parametrize(("name", "limit"), [("quasi_newton", 1), ("newton", 2), ("projective_dynamics", 3)])
 def test_no_environment_has_more_iterations_than_the_limit(name, limit):
     sim = simulator(name=name, max_iterations=limit, on_failure="count")
     rest = sim.rest_state(3)
@@ -140,12 +126,6 @@ def test_no_environment_has_more_iterations_than_the_limit(name, limit):
     q[2, tip] *= 1e6
     report = sim.step(State(q, rest.v))[1]
     assert int(report.iterations.max()) <= limit
-
-
-def test_threads_that_are_no_number(monkeypatch):
-    monkeypatch.setenv("WARP_RESPHYS_THREADS", "many")
-    with pytest.raises(InputError, match="WARP_RESPHYS_THREADS is"):
-        simulator().step(simulator().rest_state(4))
 
 
 def test_shards_cover_the_batch(monkeypatch):

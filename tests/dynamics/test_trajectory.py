@@ -11,10 +11,8 @@ from warp_resphys import (
     Body,
     Box,
     Contact,
-    HalfSpace,
     InputError,
     Inputs,
-    Scene,
     Simulator,
     Sphere,
     Tendons,
@@ -42,14 +40,6 @@ def test_a_file_has_times_and_units(trajectory, tmp_path):
         assert np.array_equal(file["q"], trajectory.q.numpy())
         assert np.array_equal(file["v"], trajectory.v.numpy())
         assert np.allclose(file["times"], [0.0, 0.01, 0.02, 0.03])
-
-
-def test_a_plot_has_the_displacement_in_millimetres(trajectory):
-    (line,) = trajectory.plot(TIP, "z").lines
-    expected = 1e3 * (trajectory.q[:, 0, TIP, 2] - SIMULATOR.rest_positions[TIP, 2]).mean(1)
-    assert np.allclose(line.get_ydata(), expected.numpy())
-    assert line.get_xdata()[-1] == pytest.approx(0.03)
-    assert line.get_ydata()[-1] < 0.0
 
 
 def test_a_series_for_paraview_has_every_step(trajectory, tmp_path):
@@ -98,21 +88,6 @@ def test_obstacles_are_in_the_series_where_they_are_at_the_end_of_every_step(tmp
             half = turn.inv().apply(points - PLATE.position - [0.0, 0.0, step * way])
             size = 0.5 * np.array(PLATE.edges) + 2e-3 * (1 - environment)
             assert np.allclose(np.abs(half), size)
-
-
-def test_obstacles_of_a_scene_have_the_names_of_their_bodies(tmp_path):
-    floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.01))})
-    bodies = {name: Body(MESH, select_vertices(MESH, x=0.0), energies=[floor]) for name in ("a", "b")}
-    moved = Simulator(Scene(bodies)).rollout(Simulator(Scene(bodies)).rest_state(), 1)
-    assert [motion.name for motion in moved.obstacles] == ["a_floor", "b_floor"]
-    moved.write_vtk(tmp_path / "two.pvd")
-    points, _ = read_triangles(tmp_path / "two_obstacles" / "two_obstacles_1.vtu", 1)
-    assert points[:, 2].max() == pytest.approx(-0.01)
-
-
-def test_a_body_without_obstacles_has_no_file_of_them(trajectory, tmp_path):
-    trajectory.write_vtk(tmp_path / "beam.pvd")
-    assert {path.name for path in tmp_path.iterdir()} == {"beam.pvd", "beam"}
 
 
 @pytest.mark.parametrize(

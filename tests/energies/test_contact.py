@@ -14,8 +14,6 @@ from warp_resphys import (
     Corotated,
     Inputs,
     Mesh,
-    Rigid,
-    Scene,
     Simulator,
     SolverSettings,
     State,
@@ -105,39 +103,10 @@ def test_areas_of_vertices_sum_to_the_surface(mesh):
     assert np.all(areas[inner] == 0.0)
 
 
-def raised(mesh, *shift):
-    return Mesh(mesh.vertices + np.array(shift), mesh.cells)
-
-
 def resting(tilt=0.0, moves=False, **options):
     """A block at rest on a floor under gravity that is tilted by an angle [degrees], and its gap [m]."""
     floor = resting_floor(WEIGHT * math.cos(math.radians(tilt)))
     return simulator(replace(floor, moves=moves), **options), -floor.position[2]
-
-
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_a_hard_block_rests_at_the_gap_that_carries_it(integrator):
-    s, gap = resting(material=Corotated(1e8, 0.3, density=DENSITY, stiffness_damping=1e-3), integrator=integrator)
-    end = s.rollout(State(s.rest_state().q + vector(0.0, 0.0, 1e-4), s.rest_state().v), 80).q[-1, 0]
-    bottom = end[torch.as_tensor(select_vertices(BLOCK, z=0.0)), 2] + gap
-    assert bottom.numpy() == pytest.approx(gap, rel=1e-3)
-
-
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_a_block_on_an_incline_sticks_and_slides(integrator, device):
-    """It creeps below arctan mu with v_s (1 - sqrt(1 - tan a / mu)), and accelerates by g (sin a - mu cos a) above."""
-    mu, slip = torch.tensor([[0.3], [0.3], [0.6], [0.6]], dtype=torch.float64), 1e-3
-    angles = [math.degrees(math.atan(m)) + more for m, more in zip(mu[:, 0], (-0.5, 0.5, -0.5, 0.5), strict=True)]
-    radians = np.radians(angles)
-    gravity = torch.as_tensor(G * np.stack([np.sin(radians), 0.0 * radians, -np.cos(radians)], 1))
-    s, _ = resting(20.0, integrator=integrator, slip_speed=slip, device=device)
-    given = {"contact_friction": mu, "gravity": gravity}
-    v = s.rollout(s.rest_state(4), 100, None, given).v.mean(2)[..., 0].cpu().numpy()
-    share = np.tan(radians) / mu[:, 0].numpy()
-    stick, slide = [0, 2], [1, 3]
-    assert v[-1, stick] == pytest.approx(slip * (1.0 - np.sqrt(1.0 - share[stick])), rel=1e-4)
-    expected = G * (np.sin(radians) - mu[:, 0].numpy() * np.cos(radians))
-    assert (v[-1] - v[50])[slide] / (50 * s.time_step) == pytest.approx(expected[slide], rel=1e-4)
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
@@ -212,75 +181,6 @@ def test_regions_of_friction_that_do_not_fit():
         vertex_factors(HALVES, {"left": 2.0, "top": 0.5})
 
 
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_block_that_is_thrown_at_a_shape_does_not_penetrate(shape, integrator, device):
-    """Three throws at 5 m/s with a spin: at a face, an edge and past the centre."""
-    obstacle = replace(SHAPES[shape], position=(0.0, 0.0, 0.0))
-    ways = np.array([[0.3, -0.2, 0.9], [0.9, 0.3, 0.4], [0.5, 0.8, 0.6]])
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    s = simulator(
-        obstacle,
-        0.4,
-        mesh=raised(BLOCK, 0.0, 0.0, 0.08),
-        integrator=integrator,
-        time_step=2e-3,
-        distance=2e-4,
-        device=device,
-    )
-    centre = s.rest_positions.mean(0)
-    beside = torch.as_tensor(0.06 * ways, device=device)[:, None]
-    q = s.rest_positions - centre + beside
-    spin = s.tensor([20.0, 30.0, -10.0])
-    v = -5.0 * s.tensor(ways)[:, None] + torch.linalg.cross(spin.expand_as(q), q - beside)
-    trajectory = s.rollout(State(q, v), 40)
-    outer = torch.as_tensor(np.flatnonzero(vertex_areas(BLOCK)), device=device)
-    gaps = distances(obstacle, trajectory.q[:, :, outer].cpu().numpy()).min(-1)
-    assert gaps.min() > 0.0
-    assert np.all(gaps.min(0) < 2e-4)  # they hit
-
-
-def total_energy(simulator, trajectory):
-    """Kinetic and potential energy (T + 1,) of the first environment [J], with that of the barrier, without damping."""
-    mass, gravity = simulator.prepare().mass[0], simulator.tensor(simulator.gravity)
-    values = []
-    for q, v in zip(trajectory.q, trajectory.v, strict=True):
-        simulator.linearise(State(q, torch.zeros_like(q))).residual(q)
-        own = mass * (0.5 * v[0].square().sum(-1) - q[0] @ gravity)
-        values.append(float(simulator.workspace(1).potential.energy + own.sum()))
-    return np.array(values)
-
-
-@pytest.mark.parametrize("mu", [0.0, 0.3])
-def test_implicit_euler_gains_no_energy(mu):
-    material = replace(SOFT, stiffness_damping=0.0)
-    s = simulator(HalfSpace(position=(0.0, 0.0, -0.004)), mu, material, time_step=1e-3, relative_tolerance=1e-11)
-    start = s.rest_state()
-    spin = torch.linalg.cross(vector(5.0, 20.0, 3.0).expand_as(start.q), start.q)
-    trajectory = s.rollout(State(start.q, spin + vector(0.4, 0.0, -1.5)), 60)
-    total = total_energy(s, trajectory)
-    assert np.diff(total).max() < 1e-9 * total[0]
-    assert total[-1] < 0.97 * total[0]
-    assert float(trajectory.v[:, 0, :, 2].mean(1).max()) > 0.1  # it rebounds
-
-
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_the_tangential_impulse_of_an_oblique_impact_is_mu_times_the_normal_one(integrator):
-    """The normal force is that of the start of a step, so that both differ by one step's change, of first order."""
-    mu, error = 0.15, []
-    for h in (5e-4, 2.5e-4):
-        s = simulator(
-            HalfSpace(position=(0.0, 0.0, -1.5e-3)), mu, gravity=(0.0, 0.0, 0.0), time_step=h, integrator=integrator
-        )
-        start = s.rest_state()
-        trajectory = s.rollout(State(start.q, start.v + vector(2.0, 0.0, -0.5)), round(0.02 / h))
-        mass = s.prepare().mass[0, :, None]
-        impulse = (mass * (trajectory.v[-1, 0] - trajectory.v[0, 0])).sum(0)
-        assert float(trajectory.q[-1, ..., 2].min()) > 0.0
-        error.append(abs(float(-impulse[0] / impulse[2]) / mu - 1.0))
-    assert max(error) < 2e-3
-
-
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_batch_is_bit_for_bit_its_environments(moves):
     """In a groove, whose two sides approach by different ways."""
@@ -302,48 +202,9 @@ def test_a_batch_is_bit_for_bit_its_environments(moves):
         assert torch.equal(alone.v[:, 0], trajectory.v[:, b])
 
 
-@pytest.mark.parametrize(
-    ("way", "distance", "time_step"),
-    [(5e-4, D, 1e-2), (2e-3, D, 1e-2), (2e-3, D, 1e-3), (2e-3, 3e-4, 1e-2), (2e-3, 3e-4, 1e-3)],
-)
-def test_a_plate_that_moves_by_about_a_gap_in_a_step_presses_a_block(way, distance, time_step):
-    plate = HalfSpace(position=(0.0, 0.0, SIDE + 0.5 * distance), axis=(0.0, 0.0, -1.0), moves=True)
-    fixed, still = select_vertices(BLOCK, z=0.0), (0.0, 0.0, 0.0)
-    s = simulator(plate, 0.5, fixed=fixed, gravity=still, distance=distance, time_step=time_step)
-    ways = -way * torch.arange(1 + round(6e-3 / way), dtype=torch.float64)[:, None, None]
-    trajectory = s.rollout(s.rest_state(), len(ways), Inputs(obstacle_move_z=ways))
-    top = trajectory.q[1:, 0, :, 2].max(1).values
-    gap = SIDE + 0.5 * distance + ways[:, 0, 0] - top
-    assert bool((gap > 0.0).all())
-    assert bool((gap < distance).all())
-
-
-@pytest.mark.parametrize("moves", [(True, False), (False, True), (True, True)])
-@pytest.mark.parametrize("rigid", [{}, {"all": Rigid()}, {"low": Rigid()}, {"core": Rigid()}])
-def test_lifts_raise_two_bodies_of_a_scene(moves, rigid):
-    """By 2 mm a step, more than their gaps; a body whose lift stays is not moved."""
-    bodies = {}
-    for k, name in enumerate("ab"):
-        lift = HalfSpace(position=(0.0, 0.0, -0.9 * D), moves=moves[k])
-        block = box_hexahedra((SIDE,) * 3, (4, 4, 4))
-        middle = block.vertices[block.cells].mean(1) / SIDE
-        parts = {"all": middle[:, 2] > 0.0, "low": middle[:, 2] < 0.4, "core": np.abs(middle - 0.5).max(1) < 0.2}
-        regions = {name: np.flatnonzero(chosen) for name, chosen in parts.items()}
-        mesh = replace(raised(block, 0.1 * k, 0.0, 0.0), regions=regions)
-        bodies[name] = Body(mesh, rigid=rigid, energies=[Contact({"lift": lift}, KAPPA, 0.0, D)])
-    s = Simulator(Scene(bodies), SOFT, 5e-3)
-    way = 2e-3 * torch.arange(4, dtype=torch.float64)[:, None, None]
-    inputs = Inputs(**{name: way for name in s.inputs if name.endswith("move_z")})
-    q = s.rollout(s.rest_state(), 4, inputs).q[1:, 0]
-    for k, z in enumerate(q[..., 2].tensor_split(2, dim=1)):
-        gap = z.min(1).values + 0.9 * D - way[:, 0, 0] * moves[k]
-        assert bool(((gap > 0.0) & (gap < 1.5 * D)).all())
-
-
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_a_floor_that_moves_carries_a_block(integrator):
+def test_a_floor_that_moves_carries_a_block():
     """A conveyor at 0.05 m/s, and a table that turns: the block follows both."""
-    s, _ = resting(moves=True, mu=0.5, integrator=integrator)
+    s, _ = resting(moves=True, mu=0.5, integrator="bdf2")
     times = s.time_step * torch.arange(1, 61, dtype=torch.float64)[:, None, None]
     speed = 0.05
     carried = s.rollout(s.rest_state(), 60, Inputs(obstacle_move_x=speed * times)).v[-1, 0]
@@ -378,8 +239,7 @@ def compare(losses, values, sizes, seed=3):
         assert error < 1e-6, f"{name}: {error:.1e}"
 
 
-@pytest.mark.parametrize("moves", [False, True])
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+@pytest.mark.parametrize(("integrator", "moves"), [("implicit_euler", False), ("bdf2", True)])
 def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, moves):
     floor = HalfSpace(position=(0.0, 0.0, -1.2e-3), axis=(0.03, -0.02, 1.0), moves=moves)
     ball = Sphere(position=(0.008, 0.012, -0.0315), radius=0.03, moves=moves)
@@ -456,15 +316,6 @@ def test_a_beam_that_leans_on_a_sphere_is_where_it_comes_to_rest():
     assert float((leant - free)[..., 2].max()) > 5e-4  # which is held up
     rest = leaning(time_step=0.02).rollout(s.rest_state(), 150).q[-1]
     assert leant.numpy() == pytest.approx(rest.numpy(), abs=1e-9)
-
-
-def test_sizes_of_an_obstacle_by_environment():
-    s, growth = leaning(), vector([0.0], [2e-4])
-    both = s.static_equilibrium(None, {"obstacle_growth": growth}, batch=2).q
-    for q, value in zip(both, growth, strict=True):
-        alone = s.static_equilibrium(None, {"obstacle_growth": value}).q[0]
-        assert q.numpy() == pytest.approx(alone.numpy(), abs=1e-12)
-    assert float((both[1] - both[0])[..., 2].max()) > 1e-4
 
 
 def test_gradients_of_a_leaning_beam_with_friction():
@@ -554,17 +405,14 @@ def test_values_by_the_name_of_an_obstacle():
         (lambda: Contact({"a": HalfSpace()}, friction=-0.1), "contact_friction.* -0.1"),
         (lambda: Contact({"a": HalfSpace()}, stiffness=0.0), "contact_stiffness.* 0"),
         (lambda: Contact({"a": HalfSpace()}, friction=[0.1, 0.2]), "contact_friction has 2 values for 1 obstacle"),
-        (lambda: Contact(TWO, stiffness=np.ones((4, 3))), "contact_stiffness has 3 values for 2 obstacles"),
         (
             lambda: Contact(TWO, friction={"a": 0.1, "c": 0.2}),
             "friction has values for 'a', 'c', but the obstacles are",
         ),
-        (lambda: Contact(TWO, friction={"a": 0.1, "b": -0.2}), "contact_friction is -0.2"),
         (lambda: Contact({"a": HalfSpace()}, distance=0.0), "contact.distance is 0: it must be positive"),
         (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
         (lambda: Contact({"a": HalfSpace()}, friction_factors={"foot": -1.0}), "friction_factors.foot is -1"),
         (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be positive"),
-        (lambda: Capsule(radius=0.1, length=0.0), "Capsule.length is 0.0"),
         (lambda: Cylinder(radius=math.inf, length=0.1), "Cylinder.radius is inf"),
         (lambda: Box(edges=(0.1, 0.0, 0.1)), "Box.edges is"),
         (lambda: HalfSpace(axis=(0.0, 0.0, 0.0)), "HalfSpace.axis is .* must have a length"),
@@ -576,13 +424,13 @@ def test_values_out_of_range(make, message):
         make()
 
 
-@pytest.mark.parametrize("thickness", [0.002, 0.008])
-def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused(thickness):
+def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
+    thickness = 0.002
     plate = Box(position=(0.01, 0.01, SIDE + 0.01), edges=(0.05, 0.05, thickness), moves=True)
     simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
     still = torch.zeros(1, 1, dtype=torch.float64)
     state, _ = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
-    for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 30):
+    for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 6):
         with pytest.raises(InputError, match="'plate' pass through one another"):
             simulator.step(state, Inputs(obstacle_move_z=still - way))
     simulator.step(state, Inputs(obstacle_move_z=still - 0.0105 + 0.5 * thickness))
@@ -602,10 +450,3 @@ def test_a_clamp_that_moves_through_an_obstacle_is_refused():
         with pytest.raises(InputError, match="'plate'"):
             simulator.static_equilibrium(inputs)
     simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015])))
-
-
-def test_bodies_and_inputs_that_contact_refuses():
-    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
-    simulator = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
-    with pytest.raises(InputError, match="without moves=True"):
-        simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))

@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from warp_resphys import Body, Inputs, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
-from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.gradient_check import POSES, check_gradients
+from warp_resphys.studies.gradient_check import check_gradients
 
 BEAM = box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2))
 BODY = Body(BEAM, fixed=select_vertices(BEAM, x=0.0))
@@ -43,7 +42,7 @@ def compared(pose, **terms):
     return {row.parameter: row for row in check_gradients(small, pose) if abs(row.adjoint) > 1e-6}
 
 
-@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("pose", [pytest.param("bent", marks=pytest.mark.slow), "twisted"])
 def test_gradients_by_every_coefficient(pose):
     elastic = {"c20": 20e3, "c30": 10e3, "c01": C01, "c02": 5e3, "dilation": 10e3, "bulk_2": 1e9}
     viscous = {"shear_viscosity": 40.0, "bulk_viscosity": 900.0, "mass_damping": 0.5}
@@ -54,15 +53,15 @@ def test_gradients_by_every_coefficient(pose):
     assert pose != "twisted" or {f"{name}, each environment" for name in viscous} <= rows.keys()
 
 
-@pytest.mark.parametrize("pose", POSES)
-def test_gradients_by_directions_and_constants_of_fibres(pose):
+@pytest.mark.slow
+def test_gradients_by_directions_and_constants_of_fibres():
     """Differences do not see jumps of the tangent's slope, nor of the modulus at the end of compression."""
-    rows = compared(pose, fibres=FIBRES)
+    rows = compared("twisted", fibres=FIBRES)
     wrong = {
         name: row.relative_error for name, row in rows.items() if "fibre" in name and not row.relative_error < 1e-3
     }
     assert wrong == {}
-    assert pose != "twisted" or {"fibre_azimuth_1", "fibre_tension_2", "fibre_slack_2", "fibre_toe_1"} <= rows.keys()
+    assert {"fibre_azimuth_1", "fibre_tension_2", "fibre_slack_2", "fibre_toe_1"} <= rows.keys()
 
 
 def test_fibres_stiffen_a_beam_along_their_direction_only():
@@ -129,10 +128,6 @@ class TestByName:
         assert "stiffness_damping" not in made.constants
         assert ConvexMaterial.from_constants(made.constants).constants == made.constants
 
-    def test_families_and_branches_are_numbered_from_one(self):
-        branches = {"prony_modulus_2": 1e3, "prony_time_1": 0.5, "prony_modulus_1": 2e3, "prony_time_2": 2.0}
-        assert make_material("law", **branches).prony == [(2e3, 0.5), (1e3, 2.0)]
-
     @pytest.mark.parametrize(
         ("constants", "message"),
         [
@@ -142,8 +137,6 @@ class TestByName:
             ({"prony_modulus_1": 1e3}, "prony has prony_modulus_1: give each branch, numbered from 1"),
             ({"fibre_tension_1": 1e3}, "fibres has fibre_tension_1: give each family, numbered from 1"),
             ({"ogden_2": 1e3}, "exponent 2: give whole numbers from 3 up"),
-            ({"ogden_m2": 1e3}, "exponent -2"),
-            ({"ogden_m3": -1.0}, "ogden_m3 is -1"),
             ({"ogden_x": 1e3}, "no constant 'ogden_x'"),
             ({"c10": "soft"}, "c10"),
         ],
@@ -151,9 +144,3 @@ class TestByName:
     def test_what_is_no_law_is_refused(self, constants, message):
         with pytest.raises(InputError, match=message):
             make_material("law", **constants)
-
-
-def test_vibration_modes_do_not_depend_on_viscosity():
-    viscous = {"shear_viscosity": 40.0, "bulk_viscosity": 900.0}
-    quiet, damped = (vibration_modes(simulator(ConvexMaterial(C10, bulk_1=1e6, **v)), 3) for v in ({}, viscous))
-    torch.testing.assert_close(damped, quiet, rtol=0.0, atol=1e-8)

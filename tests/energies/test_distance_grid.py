@@ -21,7 +21,6 @@ from warp_resphys import (
 )
 from warp_resphys.energies.obstacles import ObstacleSet, Pose
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.report.obstacles import ObstacleSurface
 
 RADIUS = 0.02  # m
 RING, TUBE = 0.02, 0.008  # m, radii of a torus and of its section
@@ -125,12 +124,7 @@ def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
             DistanceGrid.of_surface(1e-3 * box.vertices, faces, 1e-3)
 
 
-def test_distances_may_be_a_list():
-    grid = exact(4e-3)
-    same = DistanceGrid(distances=grid.distances.tolist(), spacing=grid.spacing, low=grid.low)
-    np.testing.assert_array_equal(same.coefficients, grid.coefficients)
-
-
+@pytest.mark.slow
 def test_a_body_that_is_thrown_through_a_ring_does_not_penetrate():
     """The distance of a ring is not convex: the whole block passes through its hole or rests on it."""
     height = -0.015
@@ -184,16 +178,6 @@ def test_gradients_of_a_block_that_slides_over_a_ring():
             near = [float(loss({**values, name: value + k * change})) for k in (-2.0, -1.0, 1.0, 2.0)]
         difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
         assert float((leaves[name].grad * change).sum()) == pytest.approx(difference, rel=1e-6), name
-
-
-def test_its_picture_is_its_surface():
-    pytest.importorskip("pyvista")
-    mesh = box_hexahedra((0.03, 0.03, 0.01), (1, 1, 1))
-    body = Body(mesh, energies=[Contact({"ball": exact(position=(0.0, 0.0, -0.05))})])
-    surface = ObstacleSurface.of(body)
-    away = np.linalg.norm(surface.points - [0.0, 0.0, -0.05], axis=1)
-    np.testing.assert_allclose(away, RADIUS, atol=2e-4)
-    assert trimesh.Trimesh(surface.points, surface.triangles).volume == pytest.approx(4.19e-6 * 8.0, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -165,15 +165,6 @@ def dense_tangent(potential, positive=None):
     return torch.stack(columns, dim=-1).numpy()
 
 
-def test_each_environment_is_clamped_on_its_own():
-    potential = unit_potential(np.stack([np.diag([0.3, 0.4, 0.5])] * 2))
-    exact = dense_tangent(potential)[1]
-    mixed = dense_tangent(potential, torch.tensor([True, False]))
-    assert np.linalg.eigvalsh(mixed[0]).min() > -1e-9
-    np.testing.assert_allclose(mixed[1], exact, atol=1e-12)
-    assert np.linalg.eigvalsh(exact).min() < -0.1
-
-
 def test_clamped_viscous_tangent_is_positive_semidefinite():
     reference = np.tile(0.5 * np.eye(3), (len(GRADIENTS), 1, 1))  # compression rate: a negative geometric part
     potential = unit_potential(GRADIENTS, viscosity=(5.0, 5.0), reference=reference)

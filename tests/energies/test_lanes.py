@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import scipy.linalg
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -84,7 +83,7 @@ def check_equal(whole, single):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("viscosity", [(0.0, 0.0), (2.0, 0.5), (2.0, 0.0), (0.0, 0.5)], ids=str)
+@pytest.mark.parametrize("viscosity", [(0.0, 0.0), (2.0, 0.5)], ids=str)
 @pytest.mark.parametrize("mesh", MESHES)
 def test_cells_as_a_whole_equal_their_points(mesh, viscosity, monkeypatch):
     q = positions(MESHES[mesh])
@@ -97,7 +96,7 @@ def test_cells_as_a_whole_equal_their_points(mesh, viscosity, monkeypatch):
     check_equal(whole, evaluated(MESHES[mesh], viscosity, q))
 
 
-@pytest.mark.parametrize("flattest", [0.1, 0.19, 0.21, 0.3])
+@pytest.mark.parametrize("flattest", [0.19, 0.21])
 def test_a_flat_point_leaves_the_others_of_its_cell_as_they_are(flattest, monkeypatch):
     """One corner of a cell of 27 nodes is pushed in until the flattest point has a given J: some groups are taken."""
     mesh = box_hexahedra(SIZE, (1, 1, 1), nodes=27)
@@ -126,15 +125,6 @@ def test_cells_that_are_stretched_beyond_the_limit_of_invariants_equal_their_poi
     whole = evaluated(mesh, (2.0, 0.5), q)
     monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
     check_equal(whole, evaluated(mesh, (2.0, 0.5), q))
-
-
-def test_the_energy_of_a_point_is_the_distance_from_its_rotation():
-    q = positions(MESHES["8 nodes"])[:-1]
-    p = evaluated(MESHES["8 nodes"], (0.0, 0.0), q, bulk=0.0)
-    f = gradients_of(p, q).reshape(len(q), -1, 3, 3)
-    distance = [[np.square(m - scipy.linalg.polar(m)[0]).sum() for m in own] for own in f]
-    expected = p.own_values[0]["stiffness"][..., 0].numpy() * distance
-    np.testing.assert_allclose(p._point_energy, expected, rtol=1e-8, atol=1e-28)
 
 
 def test_an_environment_that_is_done_keeps_its_sums_and_its_tangent():

@@ -15,7 +15,6 @@ from warp_resphys import (
     PointMass,
     Simulator,
     SolverSettings,
-    State,
     box_hexahedra,
     select_vertices,
 )
@@ -56,6 +55,7 @@ def swing(sim, angle, steps, mass=0.05, length=0.2):
     return torch.stack(offsets)
 
 
+@pytest.mark.slow
 def test_a_weight_on_a_rigid_body_is_a_pendulum():
     """A quarter of the period 2 pi sqrt(L / g) (1 + a^2 / 16) after it is let go, it is below, on a taut string."""
     length, angle, step = 0.2, 0.4, 0.001
@@ -67,6 +67,7 @@ def test_a_weight_on_a_rigid_body_is_a_pendulum():
     assert float(motion[-1, 0]) == pytest.approx(-length * math.sin(angle), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_compliant_string_bounces():
     """Below what it is tied to the weight oscillates with the period 2 pi sqrt(m c)."""
     mass, compliance, step = 0.05, 0.01, 5e-4
@@ -76,10 +77,9 @@ def test_a_compliant_string_bounces():
     torch.testing.assert_close(bounce, expected, rtol=0.0, atol=0.02 * mass * G * compliance)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_body_that_falls_faster_than_its_weight_leaves_it_behind(integrator):
+def test_a_body_that_falls_faster_than_its_weight_leaves_it_behind():
     """The tip of a beam that is let go straight does: the weight falls freely, and the beam knows nothing of it."""
-    sim, steps = simulator(integrator=integrator), 4
+    sim, steps = simulator(integrator="bdf2"), 4
     loaded, bare = (sim.rollout(sim.rest_state(), steps, weight(mass)) for mass in (0.05, 0.0))
     torch.testing.assert_close(loaded.q, bare.q, rtol=0.0, atol=1e-5)
     fallen = float(sim.rest_positions[TIP, 2].mean()) - 0.2 - float(loaded.final.memory["payload_position"][0, 0, 2])
@@ -87,19 +87,7 @@ def test_a_body_that_falls_faster_than_its_weight_leaves_it_behind(integrator):
     assert float(bare.q[-1, 0, TIP, 2].mean()) < 0.03 - 0.5 * G * (steps * sim.time_step) ** 2
 
 
-def test_a_taut_string_moves_its_weight_with_the_body():
-    """As a weight that is part of the body does, while it swings up and down slower than it would fall."""
-    sim, mass = simulator(0.5, 1e-4, integrator="bdf2"), 0.05
-    start = sim.static_equilibrium(weight(1.3 * mass))
-    glued = replace(sim, body=Body(BEAM, fixed=CLAMP, point_masses=[PointMass(mass, TIP)]))
-    q, expected = sim.rollout(start, 120, weight(mass)).q, glued.rollout(State(start.q, start.v), 120).q
-    moved = (expected - expected[0])[:, 0, TIP, 2].mean(1)
-    assert float(moved.max()) > 3e-3  # It does swing.
-    torch.testing.assert_close((q - expected)[:, 0, TIP, 2].mean(1), torch.zeros_like(moved), rtol=0.0, atol=2e-4)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("compliance", [0.0, 0.01])
+@pytest.mark.parametrize(("integrator", "compliance"), [("implicit_euler", 0.01), ("bdf2", 0.0), ("midpoint", 0.01)])
 def test_an_equilibrium_stays(integrator, compliance):
     """That of a weight that is part of the body, and steps do not leave it."""
     sim = simulator(compliance=compliance, integrator=integrator)
@@ -132,16 +120,6 @@ def test_gradients(integrator, start, device):
     }
     assert wrong == {}
     assert own["payload"].relative_error < 1e-5
-
-
-def test_states_travel():
-    sim = simulator()
-    final = sim.rollout(sim.rest_state(), 3, weight(0.05)).final
-    again = State.from_tensors(final.tensors())
-    assert torch.equal(again.memory["payload_position"], final.memory["payload_position"])
-    first, second = (simulator().step(state, weight(0.05))[0] for state in (final, again))
-    assert torch.equal(first.q, second.q)
-    assert torch.equal(first.memory["payload_velocity"], second.memory["payload_velocity"])
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,10 +10,8 @@ import warp as wp
 
 from warp_resphys import (
     Body,
-    Contact,
     Corotated,
     FrictionPair,
-    HalfSpace,
     Inputs,
     Mesh,
     Rigid,
@@ -29,7 +26,6 @@ from warp_resphys import (
 )
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
-from warp_resphys.energies.surface_term import Sliding
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
 from warp_resphys.mesh.mesh import join, select_cells
@@ -157,87 +153,6 @@ def test_pairs_are_those_of_ipctk(kind):
             assert own == pytest.approx(peer, rel=1e-12, abs=1e-12 * float(np.abs(peer).max()))
 
 
-@pytest.mark.parametrize("kind", [0, 1])
-def test_friction_is_that_of_ipctk(kind):
-    """Energy, gradient and Hessian of random slides, of which half stick, by its tangents and its smoothed friction."""
-    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
-    random, count, slip = np.random.default_rng(kind), 200, 0.5
-    of = "edge_edge" if kind else "point_triangle"
-    x = random.normal(size=(count, 4, 3))
-    moved = x + random.normal(size=x.shape) * np.where(np.arange(count) % 2, 1.0, 0.05)[:, None, None]
-    shares = np.stack([getattr(ipctk, f"{of}_closest_point")(*y) for y in x])
-    if kind:
-        weights = np.stack([1 - shares[:, 0], shares[:, 0], shares[:, 1] - 1, -shares[:, 1]], 1)
-    else:
-        weights = np.column_stack([np.ones(count), shares.sum(1) - 1, -shares])
-    bases = np.stack([getattr(ipctk, f"{of}_tangent_basis")(*y) for y in x])
-    load, launcher = random.uniform(0.5, 2.0, count), Launcher(1, CPU)
-    tensor = partial(torch.tensor, dtype=torch.float64)
-    sliding = Sliding(
-        torch.zeros(count, dtype=torch.int64),
-        torch.arange(4 * count).view(-1, 4),
-        tensor(weights),
-        torch.linalg.cross(*tensor(bases).unbind(2)),
-        tensor(load),
-        torch.zeros(count, dtype=torch.int64),
-    )
-    grips, mu = kernels.FrictionPairs(), 0.7
-    grips.environment = launcher.upload(np.zeros(count, np.int32), int)
-    grips.regions = launcher.upload(np.zeros(count, np.int32), int)
-    grips.nodes = launcher.upload(np.arange(4 * count, dtype=np.int32).reshape(-1, 4), wp.vec4i)
-    grips.weights, grips.load = launcher.upload(weights, wp.vec4d), launcher.upload(load, wp.float64)
-    grips.normal = launcher.upload(sliding.normal.numpy(), wp.vec3d)
-    given = [tensor([[mu]]), tensor([[slip]]), tensor(x).view(1, -1, 3), tensor(moved).view(1, -1, 3)]
-    views = [warp_view(v, kind_) for v, kind_ in zip(given, (wp.float64,) * 2 + (wp.vec3d,) * 2, strict=True)]
-    force, energy, hessian = (torch.zeros(count, *s, dtype=torch.float64) for s in ((4, 3), (), (12, 12)))
-    out = [warp_view(force, kernels.Corners), warp_view(energy, wp.float64)]
-    active = warp_view(launcher.active, wp.int32)
-    launcher.launch(launcher.record(kernels.grip_forces, (count,), [active, grips, *views], out))
-    launcher.launch(launcher.record(kernels.grip_tangents, (count,), [grips, *views], [warp_view(hessian, wp.float64)]))
-    push = sliding.force(given[3], given[2], given[0], given[1])
-    for c in range(count):
-        basis = np.kron(weights[c][:, None], bases[c])  # (12, 2)
-        u = basis.T @ (moved[c] - x[c]).ravel()
-        y, most = float(np.linalg.norm(u)), mu * load[c]
-        slope = ipctk.smooth_friction_f1_over_x(y, slip)
-        curved = ipctk.smooth_friction_f2_x_minus_f1_over_x3(y, slip)
-        expected = (
-            most * (ipctk.smooth_friction_f0(y, slip) - ipctk.smooth_friction_f0(0.0, slip)),
-            most * slope * basis @ u,
-            most * basis @ (slope * np.eye(2) + curved * np.outer(u, u)) @ basis.T,
-        )
-        for own, peer in zip((energy[c], force[c].ravel(), hessian[c]), expected, strict=True):
-            assert own.numpy() == pytest.approx(peer, rel=1e-12, abs=1e-12 * float(np.abs(peer).max()))
-        along = -most * slope * bases[c] @ u
-        assert push[c].numpy() == pytest.approx(along, abs=1e-12 * float(np.abs(along).max()))
-
-
-def test_listed_pairs_are_those_of_ipctk():
-    ipctk = pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
-    mesh, x = joined()
-    surface, reach = Surface.of(mesh), 3e-3
-    pairs = PairList(Launcher(3, CPU), surface, reach)
-    pairs.find(x, torch.zeros_like(x))
-    within = pairs.distances(x) < reach
-    peer = ipctk.CollisionMesh(mesh.vertices, surface.edges, surface.triangles)
-    for b in range(3):
-        q, candidates = x[b].numpy(), ipctk.Candidates()
-        candidates.build(peer, q, reach)
-        expected = {
-            (0, k.vertex_id, *surface.triangles[k.face_id])
-            for k in candidates.fv_candidates
-            if ipctk.point_triangle_distance(q[k.vertex_id], *q[surface.triangles[k.face_id]]) < reach**2
-        } | {
-            (1, *(edge for e in sorted((k.edge0_id, k.edge1_id)) for edge in surface.edges[e]))
-            for k in candidates.ee_candidates
-            if ipctk.edge_edge_distance(*q[surface.edges[k.edge0_id]], *q[surface.edges[k.edge1_id]]) < reach**2
-        }
-        own = within & (pairs.environment == b)
-        listed = zip(pairs.kind[own].tolist(), pairs.nodes[own].tolist(), strict=True)
-        assert {(kind, *nodes) for kind, nodes in listed} == expected
-        assert not ipctk.has_intersections(peer, q)
-
-
 def joined():
     """Two blocks, one above the other, with some disorder in three environments."""
     upper = replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])
@@ -286,19 +201,6 @@ def test_pairs_are_all_pairs_within_reach():
     assert pairs.covers(x + 1.0)  # Motion of all together changes no distance.
 
 
-def test_crossings_are_seen(device):
-    mesh, x = joined()
-    x = x.to(device)
-    pairs = PairList(Launcher(3, x.device), Surface.of(mesh), 1e-3)
-    assert pairs.crossings(x)[0].tolist() == [0, 0, 0]
-    x[1, len(PLATE.vertices) :, 2] -= 0.004
-    count = pairs.crossings(x)[0].tolist()
-    assert count[0] == count[2] == 0 < count[1]
-
-
-some_or_many = pytest.mark.parametrize("count", [4, pytest.param(16, marks=pytest.mark.slow)])
-
-
 def landing(friction=0.5, integrator="implicit_euler", kappa=KAPPA, rigid="", **options):
     """A cube, of which a `rigid` layer or the whole is rigid, above a plate that is held below."""
     low = CUBE.vertices[CUBE.cells].mean(1)[:, 2] < 0.01
@@ -322,27 +224,24 @@ def thrown(simulator, velocity, spin, batch=1):
     return State(rest.q, v)
 
 
-@some_or_many
-@pytest.mark.parametrize(
-    ("integrator", "rigid"), [("implicit_euler", ""), ("bdf2", ""), ("implicit_euler", "layer"), ("bdf2", "whole")]
-)
-def test_gradients_of_an_oblique_impact(integrator, rigid, count, device):
+@pytest.mark.parametrize(("integrator", "rigid"), [("implicit_euler", "layer"), ("bdf2", "")])
+def test_gradients_of_an_oblique_impact(integrator, rigid, device):
     """Throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
     simulator = landing(integrator=integrator, rigid=rigid, device=device)
     random = np.random.default_rng(0)
-    velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (count, 3)))
-    weights = simulator.tensor(random.normal(size=(2, count, simulator.body.n_vertices, 3)))
+    velocity = simulator.tensor(random.uniform([-0.6, -0.6, -1.4], [0.6, 0.6, -0.8], (4, 3)))
+    weights = simulator.tensor(random.normal(size=(2, 4, simulator.body.n_vertices, 3)))
     values = {
         "velocity": velocity,
-        "spin": simulator.tensor(np.linspace(-5.0, 5.0, count)),
-        "surface_friction": simulator.tensor(np.linspace(0.1, 0.9, count)[:, None]),
-        "surface_stiffness": simulator.tensor(np.full((count, 1), KAPPA)),
-        "plate_youngs_modulus": simulator.tensor(np.full((count, 1), 2.5e5)),
+        "spin": simulator.tensor(np.linspace(-5.0, 5.0, 4)),
+        "surface_friction": simulator.tensor(np.linspace(0.1, 0.9, 4)[:, None]),
+        "surface_stiffness": simulator.tensor(np.full((4, 1), KAPPA)),
+        "plate_youngs_modulus": simulator.tensor(np.full((4, 1), 2.5e5)),
     }
 
     def loss(given):
         parameters = {name: given[name] for name in given if name not in ("velocity", "spin")}
-        start = thrown(simulator, given["velocity"], given["spin"], count)
+        start = thrown(simulator, given["velocity"], given["spin"], 4)
         path = simulator.rollout(start, 7, parameters=parameters)
         return (1e2 * path.q[-1] * weights[0]).sum((1, 2)) + (path.v[-1] * weights[1]).sum((1, 2))
 
@@ -353,8 +252,8 @@ def test_gradients_of_an_oblique_impact(integrator, rigid, count, device):
         size = {"surface_stiffness": 1e-4, "spin": 1e-5, "plate_youngs_modulus": 1e-5}.get(name, 1e-6) * float(
             value.abs().max()
         )
-        way = simulator.tensor([0.6, -0.5, 0.6]).expand(count, 3) if name == "velocity" else torch.ones_like(value)
-        ways[name], parts[name] = size * way, (slopes[name] * size * way).reshape(count, -1).sum(1)
+        way = simulator.tensor([0.6, -0.5, 0.6]).expand(4, 3) if name == "velocity" else torch.ones_like(value)
+        ways[name], parts[name] = size * way, (slopes[name] * size * way).reshape(4, -1).sum(1)
     least = min(float(part.abs().max()) for part in parts.values())
     factors = random.uniform(0.5, 1.0, len(parts))  # all contribute about the same, and errors do not cancel
     shares = {
@@ -380,45 +279,6 @@ def directional(loss, values, sizes):
             expected = float(loss({**values, name: value + way}) - loss({**values, name: value - way})) / 2.0
         assert abs(expected) > 0.0
         assert float((slopes[name] * way).sum()) == pytest.approx(expected, rel=1e-6), name
-
-
-@pytest.mark.slow
-def test_gradients_of_a_ball_that_rolls():
-    """A ball that is thrown along a plate without spin: it slides, and rolls after some steps."""
-    ball = thing_mesh("ball", 0.01, 2)
-    ball = replace(ball, vertices=ball.vertices + [0.012, 0.0203, 0.0207])
-    mesh = box_hexahedra((0.04, 0.04, 0.01), (4, 4, 1))
-    plate = Body(mesh, fixed=select_vertices(mesh, z=0.0))
-    scene = Scene({"plate": plate, "ball": Body(ball)}, SurfaceContact(KAPPA, 0.5, slip_speed=1e-2))
-    simulator = Simulator(scene, SOFT, time_step=0.004, solver=FINE)
-    own, rest = scene.vertex_slice("ball"), simulator.rest_state()
-    weights = simulator.tensor(np.random.default_rng(3).normal(size=(own.stop - own.start, 3)))
-
-    def rolled(given):
-        v = torch.zeros_like(rest.v)
-        v[:, own] = given["velocity"]
-        parameters = {"surface_friction": given["surface_friction"]}
-        return simulator.rollout(State(rest.q, v), 14, parameters=parameters)
-
-    values = {
-        "velocity": torch.tensor([0.15, 0.01, -0.1], dtype=torch.float64),
-        "surface_friction": torch.tensor([[0.5]], dtype=torch.float64),
-    }
-    with torch.no_grad():
-        last = rolled(values)
-    arm = (last.q[-1] - last.q[-1][:, own].mean(1, keepdim=True))[0, own]
-    spin = torch.linalg.lstsq(  # v - mean(v) = omega x arm
-        torch.cat([torch.linalg.cross(axis.expand_as(arm), arm)[..., None] for axis in torch.eye(3).double()], 2).view(
-            -1, 3
-        ),
-        (last.v[-1] - last.v[-1][:, own].mean(1, keepdim=True))[0, own].reshape(-1, 1),
-    ).solution
-    assert float(spin[1]) > 0.3 * float(last.v[-1][0, own, 0].mean()) / 0.01  # It turns about y.
-    directional(
-        lambda given: 1e2 * (rolled(given).q[-1][0, own] * weights).sum(),
-        values,
-        {"velocity": 1e-6, "surface_friction": 1e-6},
-    )
 
 
 @pytest.mark.slow
@@ -498,13 +358,12 @@ def test_regions_have_their_own_friction():
         simulator.prepare({"surface_friction": torch.full((1, 3), 0.1, dtype=torch.float64)})
 
 
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_momentum_is_conserved(integrator):
+def test_momentum_is_conserved():
     """Two free bodies collide with friction: the sum of momenta stays what it was."""
     cube, other = turned(CUBE, (0.3, 0.2), (0.0, 0.0, 0.0)), turned(CUBE, (0.9, -0.4), (0.004, 0.003, 0.036))
     scene = Scene({"one": Body(cube), "two": Body(other)}, SurfaceContact(KAPPA, 0.6))
     solver = SolverSettings(relative_tolerance=1e-13, absolute_tolerance=1e-15)
-    simulator = Simulator(scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0), integrator=integrator, solver=solver)
+    simulator = Simulator(scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0), integrator="bdf2", solver=solver)
     rest = simulator.rest_state()
     v = torch.zeros_like(rest.v)
     v[:, scene.vertex_slice("two")] = torch.tensor([0.2, -0.1, -2.5], dtype=torch.float64)
@@ -514,29 +373,6 @@ def test_momentum_is_conserved(integrator):
     momenta = (mass[..., None] * torch.cat([v[None], path.v])).sum(2)
     assert float((momenta - momenta[0]).abs().max()) < 1e-11 * float(momenta[0].norm())
     assert float(path.v[-1][:, scene.vertex_slice("one"), 2].mean()) < -0.5  # It has been hit.
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_throws_never_cross(dtype, device):
-    """Three bodies thrown at one another at 5 m/s, with D of 0.2 mm: no surface ever crosses another."""
-    random = np.random.default_rng(3)
-    places = ((0.0, 0.0, 0.0), (0.003, 0.001, 0.034), (0.002, 0.036, 0.002))
-    bodies = {f"body{k}": Body(turned(CUBE, random.uniform(-1, 1, 2), place)) for k, place in enumerate(places)}
-    scene = Scene(bodies, SurfaceContact(KAPPA, 0.4, distance=2e-4))
-    options = {"gravity": (0.0, 0.0, 0.0), "dtype": dtype, "device": device, "relative_tolerance": 1e-5}
-    simulator = Simulator(scene, SOFT, time_step=0.004, **options)
-    rest = simulator.rest_state()
-    v = torch.zeros_like(rest.v)
-    v[:, scene.vertex_slice("body1"), 2], v[:, scene.vertex_slice("body2"), 1] = -5.0, -5.0
-    path = simulator.rollout(State(rest.q, v), 25)
-    pairs = PairList(Launcher(1, rest.q.device), Surface.of(scene.mesh), 2e-4)
-    gaps = []
-    for q in path.q.double():
-        assert int(pairs.crossings(q)[0]) == 0
-        pairs.find(q, torch.zeros_like(q))
-        gaps += [float(pairs.distances(q).min())] if pairs.count else []
-    assert 0.0 < min(gaps) < 2e-4
-    assert float((path.v[-1] - v)[:, scene.vertex_slice("body0")].norm()) > 1.0
 
 
 def clip():
@@ -573,53 +409,23 @@ def test_a_body_touches_itself(device):
         assert float(forces.normal.norm()) > 0.01
 
 
-@some_or_many
-@pytest.mark.parametrize("rigid", ["", "layer", "whole"])
-def test_batch_is_what_its_environments_are_alone(rigid, count, device):
-    """Environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
+@pytest.mark.parametrize("rigid", ["", "layer"])
+def test_batch_is_what_its_environments_are_alone(rigid, device):
+    """Four environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)
-    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (count, 3)))
-    spin = torch.linspace(-4.0, 4.0, count, dtype=torch.float64)
+    velocity = torch.tensor(random.uniform([-0.6, -0.6, -2.0], [0.6, 0.6, 1.0], (4, 3)))
+    spin = torch.linspace(-4.0, 4.0, 4, dtype=torch.float64)
     settings = SolverSettings(linear_solver="banded" if device == "cpu" else "tiled")
     together, alone = (landing(rigid=rigid, solver=settings, device=device) for _ in range(2))
-    path = together.rollout(thrown(together, velocity, spin, count), 12)
-    for b in range(count):
+    path = together.rollout(thrown(together, velocity, spin, 4), 12)
+    for b in range(4):
         own = alone.rollout(thrown(alone, velocity[b : b + 1], spin[b : b + 1]), 12)
         if device == "cpu":
             assert torch.equal(own.q[:, 0], path.q[:, b])
         torch.testing.assert_close(own.q[:, 0], path.q[:, b], rtol=0.0, atol=1e-8)
 
 
-def leaning():
-    """Two upright strips, the second of which is held slanted over the first."""
-    strip = box_hexahedra((0.006, 0.01, 0.05), (1, 2, 8))
-    other = replace(strip, vertices=strip.vertices + [0.0085, 0.0, 0.0])
-    bodies = {n: Body(m, fixed=select_vertices(m, z=0.0)) for n, m in (("first", strip), ("second", other))}
-    return Simulator(Scene(bodies, SurfaceContact(KAPPA, 0.0)), SOFT, gravity=(0.0, 0.0, 0.0), solver=FINE)
-
-
-def test_equilibrium_of_bodies_that_lean_on_one_another():
-    """A force pushes a strip against another one: both bend, and the derivative by the force is the difference."""
-    simulator = leaning()
-    force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
-    top = simulator.rest_positions[:, 2] > 0.049
-    top[: simulator.body.vertex_slice("second").start] = False
-    force[0, top, 0] = -0.15 / int(top.sum())
-
-    def first(scale):
-        q = simulator.static_equilibrium(Inputs(external_force=scale * force)).q
-        return q[0, simulator.body.vertex_slice("first"), 0].mean()
-
-    scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(first(scale), scale)
-    with torch.no_grad():
-        expected = (first(1.0 + 1e-5) - first(1.0 - 1e-5)) / 2e-5
-        moved = first(1.0) - simulator.rest_positions[simulator.body.vertex_slice("first"), 0].mean()
-    assert float(moved) < -1e-3  # The first strip is bent by the second.
-    assert float(slope) == pytest.approx(float(expected), rel=1e-6)
-
-
-@pytest.mark.parametrize("rigid", ["", "layer", "whole"])
+@pytest.mark.parametrize("rigid", ["layer", "whole"])
 def test_the_matrix_of_a_step_has_its_pairs(rigid):
     """H of a step in contact, as a matrix, is the difference of the residual."""
     simulator = landing(rigid=rigid)
@@ -635,31 +441,6 @@ def test_the_matrix_of_a_step_has_its_pairs(rigid):
     assert step.product(ways)[:, step.free].numpy() == close
     assert (matrix @ way.numpy().ravel()).reshape(expected.shape) == close
     assert float(simulator.contacts(state, State(x, state.v))["surfaces"].normal.norm()) > 0.0
-
-
-@pytest.mark.parametrize("own", ["scene", "bodies", "with an obstacle"])
-def test_driven_vertices_push_and_never_pass(own):
-    """A plate that is driven by 0.6 mm a step towards a cube, which comes to meet it."""
-    cube = replace(CUBE, vertices=CUBE.vertices + [0.0101, 0.0097, 0.0109])
-    far = [Contact({"far": HalfSpace(position=(0.0, 0.0, -0.5))})] if own == "with an obstacle" else []
-    meshes = {"plate": (PLATE, select_vertices(PLATE, z=0.0)), "cube": (cube, ())}
-    if own == "bodies":  # of one body
-        cells = np.concatenate([PLATE.cells, cube.cells + len(PLATE.vertices)])
-        both = Mesh(np.concatenate([PLATE.vertices, cube.vertices]), cells)
-        body = Body(both, fixed=meshes["plate"][1], energies=[SurfaceContact(KAPPA, 0.3)])
-        scene = Scene({"all": body})
-    else:
-        bodies = {name: Body(mesh, fixed=fixed, energies=far) for name, (mesh, fixed) in meshes.items()}
-        scene = Scene(bodies, SurfaceContact(KAPPA, 0.3))
-    simulator = Simulator(scene, SOFT, time_step=0.002, gravity=(0.0, 0.0, 0.0))
-    state = simulator.rest_state()
-    state.v[:, len(PLATE.vertices) :, 2] = -0.4
-    pairs, place = PairList(Launcher(1, CPU), Surface.of(scene.mesh), D), simulator.rest_positions[simulator.fixed]
-    for step in range(6):
-        driven = place + torch.tensor([0.0, 0.0, 6e-4 * (step + 1)], dtype=torch.float64)
-        state, _ = simulator.step(state, Inputs(fixed_positions=driven[None]))
-        assert int(pairs.crossings(state.q)[0]) == 0
-    assert float(state.v[0, len(PLATE.vertices) :, 2].mean()) > 0.1
 
 
 @pytest.mark.parametrize("rise", [2e-3, 0.03])
@@ -693,37 +474,6 @@ def test_driven_vertices_push_in_one_step(rise, device):
     with torch.no_grad():
         expected = (height(1e-6) - height(-1e-6)) / 2e-6
     assert float(slope) == pytest.approx(float(expected), rel=1e-5)
-
-
-def test_a_state_that_crosses_is_refused_also_after_steps():
-    """The pairs of the last step may cover it; and clamps of an equilibrium do not pass through what has moved."""
-    simulator = landing()
-    velocity = torch.tensor([[0.0, 0.0, -0.5]], dtype=torch.float64)
-    state, _ = simulator.step(thrown(simulator, velocity, velocity[:, 0]))
-    cube = simulator.body.vertex_slice("cube")
-    depth = float(state.q[0, cube, 2].min()) - 0.01
-    q = state.q.clone()
-    q[:, cube, 2] -= depth + 1e-4
-    with pytest.raises(InputError, match="cross at the start of a step"):
-        simulator.step(State(q, state.v))
-    strips = leaning()
-    away = strips.rest_positions.clone()
-    away[strips.body.vertex_slice("second"), 0] += 0.02
-    back = strips.rest_positions[strips.fixed].clone()
-    back[len(back) // 2 :, 0] -= 0.02
-    with pytest.raises(InputError, match="one after another"):  # beyond the other strip
-        strips.static_equilibrium(Inputs(fixed_positions=back[None]), after=strips.state(away))
-
-
-def test_a_lone_body_flies_as_if_without_contact():
-    free, own = (
-        Simulator(Body(CUBE, energies=energies), SOFT, time_step=0.01) for energies in ([], [SurfaceContact(KAPPA)])
-    )
-    start = free.rest_state()
-    start.v[..., 0] = 5.0
-    (a, one), (b, other) = (simulator.step(start) for simulator in (free, own))
-    assert a.q.numpy() == pytest.approx(b.q.numpy(), abs=1e-12)
-    assert int(other.iterations) <= int(one.iterations) + 1
 
 
 def test_refusals():
@@ -761,24 +511,6 @@ def test_refusals():
         simulator.step(simulator.state(crossing))
 
 
-@pytest.mark.parametrize("name", ["quasi_newton", "newton"])
-@pytest.mark.parametrize("shift", [0.0, 1e-5])
-def test_edges_in_line_take_few_iterations(name, shift):
-    """Two boxes, one above the other, whose faces at the gap are fixed: free ends of edges move them out of line."""
-    box = box_hexahedra((0.01, 0.01, 0.01), (1, 1, 1))
-    above = replace(box, vertices=box.vertices + [shift, 0.7 * shift, 0.0102])
-    aside = replace(box, vertices=box.vertices + [0.5, 0.0, 0.0])
-    bodies = {
-        "below": Body(box, fixed=select_vertices(box, z=0.01)),
-        "above": Body(above, fixed=select_vertices(above, z=0.0102)),
-        "falling": Body(aside),  # whose motion does not wait for theirs
-    }
-    scene = Scene(bodies, SurfaceContact(5e4, 0.5, distance=5e-4, slip_speed=5e-3))
-    simulator = Simulator(scene, SOFT, time_step=0.01, solver=SolverSettings(name, relative_tolerance=1e-8))
-    path = simulator.rollout(simulator.rest_state(), 5)
-    assert max(int(report.iterations.max()) for report in path.reports) <= 4
-
-
 def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
     """A shell with a ball in its hollow; the ball in the solid of a cube is seen, in its environment alone."""
     shell = box_hexahedra((0.03, 0.03, 0.03), (3, 3, 3))
@@ -794,12 +526,3 @@ def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
     (inside, outer), other = pairs["solid"][0].enclosed(pairs["solid"][1]).tolist()
     assert inside >= len(shell.vertices) > outer >= 0
     assert other == [-1, -1]
-
-
-def test_a_pin_in_a_cube_is_as_deep_as_it_is():
-    """A pin of 5 mm, 10 mm deep in the middle of a cube of 40 mm: nearest to its end is the face above."""
-    cube = box_hexahedra((0.04, 0.04, 0.04), (4, 4, 4))
-    pin = box_hexahedra((0.005, 0.005, 0.012), (1, 1, 1))
-    pin = replace(pin, vertices=pin.vertices + [0.0173, 0.0169, 0.03])
-    with pytest.raises(InputError, match=r"deepest is vertex \d+ in 'pin', by 10 mm"):
-        Simulator(Scene({"cube": Body(cube), "pin": Body(pin)}, SurfaceContact(distance=1e-4)))

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import cumulative_trapezoid
 
 from warp_resphys import (
     Body,
@@ -17,12 +16,10 @@ from warp_resphys import (
     Tendons,
     box_hexahedra,
     box_tetrahedra,
-    rod,
     select_vertices,
 )
-from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 SIZE, DIVISIONS = (0.12, 0.02, 0.02), (6, 2, 2)
@@ -63,50 +60,9 @@ def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
         np.testing.assert_allclose(q[vertex], expected, atol=0.02 * abs(expected[2] - 0.005))
 
 
-def hanging_cosserat_rod(pull, offsets, end, length, radius, modulus, density, count=1001):
-    """(2,) tip, and the angle there, of an extensible rod in a plane that a tendon and its weight bend.
-
-    Forces and moments on what lies beyond a section: the weight, and the tension of the tendon that is cut there
-    (Rucker and Webster, IEEE Transactions on Robotics 27(6), 2011, without shear), iterated to their equilibrium.
-    """
-    s, h = np.linspace(0.0, length, count, retstep=True)
-    area, second = np.pi * radius**2, np.pi * radius**4 / 4
-    offset = (offsets[0] + (offsets[1] - offsets[0]) * s / end)[:, None]
-    angle, stretch = np.zeros(count), np.ones(count)
-    below = -9.81 * density * area * (length - s)  # N
-    for _ in range(200):
-        tangent, normal = (
-            np.stack(components, 1) for components in ([np.sin(angle), -np.cos(angle)], [np.cos(angle), np.sin(angle)])
-        )
-        place = cumulative_trapezoid(stretch[:, None] * tangent, dx=h, axis=0, initial=0.0)
-        path = np.gradient(place + offset * normal, h, axis=0)
-        tension = -pull * (s <= end)[:, None] * path / np.linalg.norm(path, axis=1, keepdims=True)
-        beyond = cumulative_trapezoid(place[::-1, 0], dx=h, initial=0.0)[::-1]
-        arm = offset * normal
-        moment = arm[:, 0] * tension[:, 1] - arm[:, 1] * tension[:, 0]
-        moment += -9.81 * density * area * (beyond - place[:, 0] * (length - s))
-        along = (tension * tangent).sum(1) + below * tangent[:, 1]
-        angle += 0.3 * (cumulative_trapezoid(moment / (modulus * second), dx=h, initial=0.0) - angle)
-        stretch += 0.3 * (1.0 + along / (modulus * area) - stretch)
-    return place[-1], angle[-1]
-
-
-def test_a_tapering_tendon_curls_a_hanging_rod_as_the_theory_of_rods_has_it():
-    shape = {"length": 0.2, "radius": 0.008, "modulus": 264e3, "density": 1070.0}
-    offsets, end = (0.006, 0.003), 0.16  # m; the tendon ends before the rod does
-    expected, angle = hanging_cosserat_rod(3.0, offsets, end, **shape)
-    assert angle > 0.9
-    mesh = rod([[0, 0, 0], [0, 0, -0.2]], [[0.0, 0.008], [0.2, 0.008]], layers=10)
-    tendons = Tendons([np.linspace([offsets[0], 0.0, 0.0], [offsets[1], 0.0, -end], 41)])
-    body = Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=(tendons,))
-    sim = Simulator(body, Corotated(264e3, 0.0, density=1070.0), gravity=(0.0, 0.0, -9.81), solver=TIGHT)
-    tip = sim.static_equilibrium(tension(3.0)).q[0].numpy()[select_vertices(mesh, z=-0.2)].mean(axis=0)
-    np.testing.assert_allclose(tip[[0, 2]], expected, atol=0.005 * 0.2)
-    assert abs(tip[1]) < 1e-9
-
-
-@pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])
-@pytest.mark.parametrize("linear", ["banded", "dense", "sparse"])
+@pytest.mark.parametrize(
+    ("solver", "linear"), [("newton", "dense"), ("quasi_newton", "banded"), ("projective_dynamics", "sparse")]
+)
 def test_a_winch_shortens_a_stiff_tendon_by_what_it_takes_in(solver, linear):
     settings = SolverSettings(solver, relative_tolerance=1e-9, linear_solver=linear)
     sim = simulator(route(0.018), stiffness=2e4, solver=settings)
@@ -126,23 +82,6 @@ def tendon_length(sim, q):
     return float(np.linalg.norm(pieces, axis=1).sum())
 
 
-def test_a_length_that_is_commanded_needs_the_tension_that_leads_there():
-    sim = simulator(route(0.018), stiffness=3e3)
-    by_length = sim.static_equilibrium(Inputs(tendon_contraction=torch.tensor([[3e-3]], dtype=torch.float64)))
-    stretched = tendon_length(sim, by_length.q) - SIZE[0] + 3e-3
-    force = 3e3 * (stretched - 0.5e-4)  # past the toe of 0.1 mm
-    by_tension = simulator(route(0.018)).static_equilibrium(tension(force))
-    torch.testing.assert_close(by_length.q, by_tension.q, rtol=0.0, atol=1e-9)
-
-
-def test_opposite_tendons_only_compress():
-    sim = simulator(route(0.018), route(0.002))
-    q = sim.static_equilibrium(tension(1.0, 1.0)).q[0]
-    moved = (q - sim.rest_positions)[TIP].mean(0)
-    assert float(moved[0]) < -1e-3
-    assert float(moved[1:].abs().max()) < 1e-9
-
-
 @pytest.mark.parametrize("kind", [box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, (4, 1, 1), order=2)])
 def test_guides_are_where_they_were_put(kind):
     """Also between the vertices, and where the body's surface bounds them."""
@@ -155,9 +94,8 @@ def test_guides_are_where_they_were_put(kind):
 ACROSS = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # a beam's tendons
 
 
-@pytest.mark.parametrize("start", POSES)
-def test_gradients_by_where_tendons_run(start):
-    """With a winch and a commanded tension at once, at rest, bent and turned."""
+def test_gradients_by_where_tendons_run():
+    """With a winch and a commanded tension at once."""
     solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
     turning = np.linspace([0.0, 1.0, 0.2], [0.0, -0.5, 1.0], 7)
     directions = [ACROSS, [turning, [0.3, 0.0, 1.0]]]
@@ -166,14 +104,13 @@ def test_gradients_by_where_tendons_run(start):
         *(route(0.014), route(0.006, depth=0.006)), stiffness=stiffness, directions=directions, solver=solver
     )
     sim = replace(sim, material=replace(SOFT, poissons_ratio=0.499, stiffness_damping=1e-3), integrator="bdf2")
-    rows = [row for row in check_gradients(sim, start) if row.parameter.startswith("tendon")]
+    rows = [row for row in check_gradients(sim, "twisted") if row.parameter.startswith("tendon")]
     names = {row.parameter for row in rows}
     assert {"tendon_offset_1, each tendon", "tendon_offset_2, each tendon", "tendon_offset_1"} <= names
     assert {row.parameter: row.relative_error for row in rows if not row.relative_error < 1e-6} == {}
 
 
-@pytest.mark.parametrize("solver", ["newton", "quasi_newton", "projective_dynamics"])
-@pytest.mark.parametrize("offset", [(5e-3, 0.0), (0.0, 5e-3)])
+@pytest.mark.parametrize(("solver", "offset"), [("quasi_newton", (5e-3, 0.0)), ("projective_dynamics", (0.0, 5e-3))])
 def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
     """In a beam's cells shape functions are linear along each axis: an offset along one is exact."""
     settings = SolverSettings(solver, relative_tolerance=1e-10)
@@ -192,8 +129,7 @@ def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
     assert float((sims[0].step(sims[0].rest_state(), drive)[0].q - expected).abs().max()) > 1e-4
 
 
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
-@pytest.mark.parametrize("start", POSES)
+@pytest.mark.parametrize(("integrator", "start"), [*zip(INTEGRATORS, POSES, strict=True)])
 def test_gradients(start, integrator):
     solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
     sim = simulator(route(0.018), route(0.006, depth=0.004), stiffness=np.array([400.0, 900.0]), solver=solver)
@@ -229,28 +165,6 @@ def test_the_hessian_has_what_couples_the_pieces_of_a_tendon(offset):
     right = direction + scale * product
     shifted = lines.shifted(scale).solve(right[:, free].reshape(1, -1, 1))
     torch.testing.assert_close(shifted.view(-1, 3), direction[0, free], rtol=1e-8, atol=1e-8)
-
-
-def test_a_taut_tendon_makes_a_beam_stiffer():
-    bare, held = (simulator(route(0.018), stiffness=k, toe=1e-9) for k in (0.0, 1e6))
-    pulled = Inputs(tendon_contraction=torch.tensor([[1e-6]], dtype=torch.float64))
-    assert vibration_modes(bare, 2).shape == vibration_modes(held, 2).shape
-    force = torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
-    force[:, TIP, 2] = -1e-3 / len(TIP)
-    ends = [s.static_equilibrium(pulled.plus(force)).q[0] - s.rest_positions for s in (bare, held)]
-    sags = [float(positions[TIP, 2].mean()) for positions in ends]
-    assert 0.0 < sags[1] / sags[0] < 0.8
-
-
-def test_forces_are_reconstructed_beside_a_tendon():
-    sim = simulator(route(0.018), stiffness=1e3, solver=SolverSettings(relative_tolerance=1e-10))
-    acting = Inputs(tendon_contraction=torch.tensor([[1e-3]], dtype=torch.float64))
-    force = torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
-    force[:, TIP, 1] = 2e-3
-    state = sim.rest_state()
-    there, _ = sim.step(state, acting.plus(force))
-    step = make_reconstructor(sim, "gauss_newton", 0.0, 1e-9, 30).step(state, there.q, acting)
-    torch.testing.assert_close(step.force, force, rtol=0.0, atol=1e-6)
 
 
 def test_a_tendon_has_no_energy_by_its_tension_alone():

@@ -16,6 +16,7 @@ def robot(folder):
     return warp_resphys.load(folder)
 
 
+@pytest.mark.slow
 def test_a_trial_commands_its_inputs(robot):
     live = LiveRobot(robot)
     live.play_trial(warp_resphys.trial_names(robot)[-1])
@@ -33,6 +34,7 @@ def test_a_trial_commands_its_inputs(robot):
             np.testing.assert_allclose(live.measured, live.trial.markers[frame], rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_measured_markers_are_interpolated_linearly_between_frames(robot):
     live = LiveRobot(robot)
     live.play_trial(warp_resphys.trial_names(robot)[0])
@@ -41,6 +43,7 @@ def test_measured_markers_are_interpolated_linearly_between_frames(robot):
     np.testing.assert_allclose(live.measured, 0.75 * seen[3] + 0.25 * seen[4], rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_markers_observed_in_their_own_frame_are_shown_on_the_body(robot):
     description = robot.description
     own = Robot(replace(description, markers=description.markers.changed(frame="own")))

@@ -30,6 +30,7 @@ def played(environment, steps=6, seed=3):
     return np.stack(observations), np.stack(rewards), np.stack(ends)
 
 
+@pytest.mark.slow
 class TestGymnasium:
     @pytest.mark.usefixtures("can_draw")
     @pytest.mark.parametrize("task", [task for task in TASKS if task != "grasp"])  # by two fingers: test_grasps.py
@@ -68,6 +69,7 @@ class TestGymnasium:
         np.testing.assert_allclose(few.step(action[:2])[0], many.step(action)[0][:2], atol=1e-4)
 
 
+@pytest.mark.slow
 class TestResets:
     def test_the_next_step_begins_anew(self, folder):
         environment = make_vector("reach", folder, 2, **QUICK)
@@ -104,6 +106,7 @@ class TestResets:
 
 
 class TestWorlds:
+    @pytest.mark.slow
     def test_parameters_are_those_of_the_identification(self, folder):
         environment = make_vector("reach", folder, 4, spread=1.0, noise=0.0, **QUICK)
         environment.reset(seed=0)
@@ -117,6 +120,7 @@ class TestWorlds:
         seen = played(same, 2)[0]
         np.testing.assert_allclose(seen[0][:, :9], 0.0, atol=1e-6)
 
+    @pytest.mark.slow
     def test_commands_change_no_faster_than_they_can(self, folder):
         environment = make_vector("reach", folder, 1, action_time=0.01, seconds=0.2)
         environment.reset(seed=0)
@@ -166,16 +170,9 @@ class TestFailures:
         assert rewards[3][0] == 0.0  # The next step resets it.
         np.testing.assert_allclose(infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0]))
 
-    def test_the_reach_of_another_environment_is_used(self, folder):
-        first = make_vector("reach", folder, 1, "sysid", **QUICK)
-        second = make_vector("reach", folder, 1, "resphys", reach=first.task.reach, **QUICK)
-        assert second.task.size == first.task.size
-        for environment in (first, second):
-            environment.reset(seed=6)
-        np.testing.assert_array_equal(first.task.goals, second.task.goals)
-
 
 class TestPictures:
+    @pytest.mark.slow
     @pytest.mark.usefixtures("can_draw")
     @pytest.mark.parametrize("world", ["simulator", "laboratory"])
     def test_they_show_body_markers_and_goal_where_these_are(self, folder, world):
@@ -212,20 +209,14 @@ class TestPictures:
             heights.append(red[:, 0].mean() / len(pixels))
         assert heights[0] < 0.3 < 0.7 < heights[1]  # The goal is above the marker, or below it.
 
-    def test_nothing_is_drawn_without_a_render_mode(self, folder):
-        environment = make_vector("reach", folder, 1, **QUICK)
-        environment.reset(seed=0)
-        assert environment.render() is None
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"task": "dance"}, "'dance'"),
-        ({"world": "mars"}, "'mars'"),
         ({"action_time": 0.015}, "action_time"),
         ({"tracked": ["Nose"]}, "tracked"),
-        ({"render_mode": "human"}, "render_mode"),
         ({"task": "swing_up", "world": "laboratory"}, "swing_up"),
     ],
 )
@@ -234,6 +225,7 @@ def test_invalid_arguments_are_refused(folder, change, said):
         make_vector(**{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change})
 
 
+@pytest.mark.slow
 def test_steps_need_a_reset_and_actions_their_shape(folder):
     environment = make_vector("reach", folder, 2, **QUICK)
     with pytest.raises(InputError, match="not reset"):

@@ -29,6 +29,7 @@ def fingers(tmp_path_factory):
     return run_without_report(tmp_path_factory.mktemp("grasps"), *RUN)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("can_draw")
 def test_gymnasiums_checker_passes(fingers):
     environment = gym.make(
@@ -38,6 +39,7 @@ def test_gymnasiums_checker_passes(fingers):
     environment.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["simulator", "laboratory"])
 def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
     grippers = make_vector("grasp", fingers, 2, "sysid", world, seconds=1.0)
@@ -52,6 +54,7 @@ def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
     assert loose > 18.0
 
 
+@pytest.mark.slow
 def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
     together, alone = (make_vector("grasp", fingers, n, "resphys", seconds=0.3, noise=0.0) for n in (3, 1))
     actions = np.array([[[-0.5, -1.0], [0.4, 0.0], [1.0, 1.0]]] * 4, dtype=np.float32)
@@ -64,6 +67,7 @@ def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
     np.testing.assert_array_equal(together.reset(seed=0)[0], first)
 
 
+@pytest.mark.slow
 def test_what_cannot_grasp_is_refused(fingers, folder):
     with pytest.raises(InputError, match="contact, which reduced models lack"):
         make_vector("grasp", fingers, 1, world="reduced")

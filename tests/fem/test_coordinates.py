@@ -46,13 +46,6 @@ def test_glue_to_a_vertex_that_is_glued_is_resolved():
         Coordinates.of(2, {0: (np.array([1]), one), 1: (np.array([0]), one)})
 
 
-def test_a_body_without_parts_keeps_its_points():
-    body = Body(beam())
-    points = body.discretisation.point_sets[0]
-    assert not body.coordinates
-    assert body.coordinates.compose(points) is points
-
-
 MESH, ENDS = two_boxes()
 FAR, FAR_ENDS = two_boxes(gap=0.002)
 FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np.arange(72, 81)})

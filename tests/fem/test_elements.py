@@ -42,14 +42,10 @@ def meshes():
     return {
         "hexahedra": hexahedra,
         "distorted hexahedra": distorted(hexahedra),
-        "tetrahedra": tetrahedra,
         "distorted tetrahedra": distorted(tetrahedra),
-        "10-node tetrahedra": quadratic(tetrahedra),
         "distorted 10-node tetrahedra": quadratic(distorted(tetrahedra)),
         "curved 10-node tetrahedra": distorted(quadratic(tetrahedra), 0.03),
-        "20-node hexahedra": box_hexahedra(SIZE, DIVISIONS, nodes=20),
         "distorted 20-node hexahedra": quadratic(distorted(hexahedra), "hexahedron20"),
-        "27-node hexahedra": box_hexahedra(SIZE, DIVISIONS, nodes=27),
         "distorted 27-node hexahedra": quadratic(distorted(hexahedra)),
         "curved 27-node hexahedra": distorted(quadratic(hexahedra), 0.03),
     }
@@ -87,13 +83,6 @@ def test_shape_gradients_equal_differences(kind):
         np.testing.assert_allclose(shape(points)[1][..., axis], difference, atol=1e-9)
 
 
-def test_gauss_rule_of_the_hexahedron_is_exact_to_degree_three():
-    points, weights = gauss_box(2)
-    for powers in np.ndindex(4, 4, 4):
-        exact = math.prod((1 - (-1) ** (p + 1)) / (p + 1) for p in powers)
-        np.testing.assert_allclose(weights @ (points**powers).prod(axis=1), exact, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("rule", "degree"), [(degree_two_tetrahedron(), 2), (conical_simplex(4), 5)], ids=["4 points", "64 points"]
 )
@@ -125,21 +114,6 @@ def test_volumes_and_masses_sum_to_the_total(name, integration):
     for operator in (d.load_volume, d.lumped_volume):
         np.testing.assert_allclose(operator.sum(axis=0), d.element_volumes, rtol=1e-12)
     assert d.lumped_volume.data.min() > 0.0
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_consistent_loads_have_the_right_centre_of_gravity(name):
-    mesh = MESHES[name]
-    d = discretise(mesh)
-    moment = d.load_volume.sum(axis=1) @ mesh.vertices
-    rule = gauss_box(4) if "hexahedra" in name else conical_simplex(4)
-    values, gradients = mesh.element.shape(rule[0])
-    _, determinants = physical_gradients(mesh.vertices, mesh.cells, gradients)
-    centres = np.einsum("qk,cki->cqi", values, mesh.vertices[mesh.cells])
-    exact = np.einsum("cq,q,cqi->i", determinants, rule[1], centres)
-    # The rules integrate straight-sided elements exactly, but for the linear hexahedron that is distorted.
-    loose = "curved" in name or name == "distorted hexahedra"
-    np.testing.assert_allclose(moment, exact, rtol=1e-3 if loose else 1e-12)
 
 
 @pytest.mark.parametrize("integration", ["centre", "full"])
@@ -186,8 +160,7 @@ def test_faces_look_outwards_and_lie_on_the_cell(element):
     assert BY_NODES[element.nodes] is element
 
 
-@pytest.mark.parametrize("integration", ["centre", "full"])
-@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
+@pytest.mark.parametrize(("model", "integration"), [("corotated", "centre"), ("stable_neo_hookean", "full")])
 @pytest.mark.parametrize("name", PATCH_MESHES)
 def test_patch(name, model, integration):
     """A linear displacement of the boundary extends linearly to the interior."""
@@ -204,11 +177,10 @@ def test_patch(name, model, integration):
     assert float((q - expected).abs().max()) <= 1e-10
 
 
-@pytest.mark.parametrize("model", ["corotated", "stable_neo_hookean"])
 @pytest.mark.parametrize("name", MESHES)
-def test_rigid_motions_give_no_force(name, model, device):
+def test_rigid_motions_give_no_force(name, device):
     mesh = MESHES[name]
-    material = MATERIALS[model](1e5, 0.45, density=1000.0)
+    material = MATERIALS["corotated"](1e5, 0.45, density=1000.0)
     simulator = Simulator(Body(mesh), material, gravity=(0.0, 0.0, 0.0), device=device)
     potential = simulator.workspace(1).potential
     rotation = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()

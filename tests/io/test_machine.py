@@ -12,6 +12,7 @@ from warp_resphys.io.machine import commit, hardware
 REPOSITORY = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
 def test_cores_are_those_that_the_process_may_use():
     core = min(os.sched_getaffinity(0))

@@ -74,11 +74,11 @@ class TestTypes:
         assert world.shape.size == (1.0, 2.0, 3.0)
         assert world.shape.divisions == (4, 5)
 
-    @pytest.mark.parametrize("value", [True, "0.5", None, float("nan"), float("inf"), [0.5], 0.0, 1.5])
+    @pytest.mark.parametrize("value", [True, "0.5", None, float("nan"), [0.5], 0.0])
     def test_an_invalid_share_is_refused(self, value):
         assert refused(share=value).startswith(f"share is {shown(value)}: it must be a number above 0")
 
-    @pytest.mark.parametrize("value", [2.0, True, "2", -1])
+    @pytest.mark.parametrize("value", [2.0, True, -1])
     def test_an_invalid_count_is_refused(self, value):
         assert refused(count=value) == f"count is {shown(value)}: it must be a whole number, zero or more."
 

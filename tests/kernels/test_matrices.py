@@ -5,7 +5,6 @@ import scipy.linalg
 import warp as wp
 
 from warp_resphys.kernels.matrices import cofactor, polar_rotation, signed_svd, symmetric_eigen
-from warp_resphys.kernels.spectral import spectral_blocks
 from warp_resphys.kernels.unimodular import unimodular_offset
 
 wp.set_module_options({"enable_backward": False})
@@ -122,43 +121,3 @@ def test_the_nearest_unimodular_matrix_is_continuous_where_its_algorithm_changes
     np.testing.assert_allclose(offset, share[:, None, None] * inverse, atol=1e-12)
     one, other = nearest.reshape(-1, 2, 3, 3).swapaxes(0, 1)
     assert np.abs(other - one).max() < 1e-6
-
-
-@wp.kernel
-def quartic_blocks(f: wp.array[wp.mat33d], shift: wp.float64, clamp: bool, blocks_out: wp.array2d[wp.mat33d]):
-    """The tangent of ||F F^T||^2 / 4 + shift / 2 ||F||^2, whose principal stresses are s^3 + shift s."""
-    n = wp.tid()
-    u, s, v = signed_svd(f[n])
-    flip, twist = wp.vec3d(), wp.vec3d()
-    normal = wp.mat33d()
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        squares = s[i] * s[i] + s[j] * s[j]
-        normal[k, k] = wp.float64(3.0) * s[k] * s[k] + shift
-        flip[k] = squares + s[i] * s[j] + shift
-        twist[k] = squares - s[i] * s[j] + shift
-    spectral_blocks(u, v, normal, flip, twist, clamp, blocks_out[n])
-
-
-def dense(f, shift, clamp):
-    """(B, 9, 9) from the six blocks; column n, row i of F is number 3 n + i."""
-    blocks = wp.zeros((len(f), 6), dtype=wp.mat33d, device="cpu")
-    wp.launch(quartic_blocks, len(f), [wp.array(f, dtype=wp.mat33d, device="cpu"), shift, clamp, blocks], device="cpu")
-    result = np.zeros((len(f), 9, 9))
-    for number, (k, n) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):
-        result[:, 3 * k : 3 * k + 3, 3 * n : 3 * n + 3] = blocks.numpy()[:, number]
-        result[:, 3 * n : 3 * n + 3, 3 * k : 3 * k + 3] = blocks.numpy()[:, number].transpose(0, 2, 1)
-    return result
-
-
-def test_spectral_blocks_are_the_tangent():
-    expected = np.zeros((len(MATRICES), 9, 9))
-    for column, direction in enumerate(np.eye(9).reshape(9, 3, 3).transpose(0, 2, 1)):
-        f, t = MATRICES, MATRICES.transpose(0, 2, 1)
-        change = direction @ t @ f + f @ direction.T @ f + f @ t @ direction - 2.0 * direction
-        expected[:, :, column] = change.transpose(0, 2, 1).reshape(-1, 9)
-    np.testing.assert_allclose(dense(MATRICES, -2.0, False), expected, atol=1e-11)
-    values, vectors = np.linalg.eigh(expected)
-    assert (values < -0.1).any()
-    clamped = np.einsum("nij,nj,nkj->nik", vectors, values.clip(0.0), vectors)
-    np.testing.assert_allclose(dense(MATRICES, -2.0, True), clamped, atol=1e-11)

@@ -17,6 +17,7 @@ simulator.rollout(simulator.rest_state(), 2)
 """
 
 
+@pytest.mark.slow
 def test_a_script_whose_kernels_are_compiled_prints_nothing():
     for _ in range(2):
         run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)

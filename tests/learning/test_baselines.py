@@ -101,54 +101,8 @@ def test_a_linear_model_predicts_a_linear_system_from_its_inputs():
     assert error("linear", trials, asked) < 0.1 * error("regression", trials, asked)
 
 
-def test_a_linear_model_begins_where_the_body_was_held():
-    """A released oscillator; the trials differ by where they begin and by nothing else."""
-    decay = (np.exp(-TIMES) * np.cos(9.0 * TIMES))[:, None] * np.array([1.0, 0.4])
-
-    def released(starts):
-        starts = np.asarray(starts)[:, None, None]
-        values = 0.2 + starts * decay
-        return motions(values, first=values[:, 0], origin=np.full((len(starts), 2), 0.2))
-
-    trials, asked = released([1.0, 1.5]), released([-2.0])
-    predicted = predictions(trials, asked)
-    np.testing.assert_allclose(predicted["linear"].values[:, 0], asked.values[:, 0], atol=1e-12)
-    assert error("linear", trials, asked) < 0.4  # It takes the body to start without velocity.
-    assert error("rest", trials, asked) > 1.9
-
-
-def test_gaps_and_ends_of_trials_do_not_disturb_a_linear_model():
-    trials, asked = driven(1), driven(2)
-    trials.values[0, 150:] = np.nan
-    trials.values[2, 40:43, 1] = np.nan
-    assert error("linear", trials, asked) < 0.05 * np.abs(asked.values).max()
-
-
 def test_poses_and_trials_that_nothing_distinguishes_have_fewer_baselines():
     pose = motions(np.ones((4, 1, 3)), np.arange(4.0).reshape(4, 1, 1))
     assert [*predictions(pose, pose)] == ["rest", "interpolation", "regression"]
     alike = motions(np.random.default_rng(0).normal(size=(2, 9, 3)))
     assert [*predictions(alike, alike)] == ["rest", "linear"]
-
-
-def test_a_coordinate_that_a_trial_lacks_is_left_out_of_the_linear_model():
-    trials, asked = driven(1), driven(2)
-    trials.values[1, :, 0] = np.nan
-    predicted = predictions(trials, asked)["linear"].values
-    assert np.isnan(predicted[..., 0]).all()
-    np.testing.assert_allclose(predicted[..., 1:], asked.values[..., 1:], atol=0.05 * np.abs(asked.values).max())
-
-
-def test_many_coordinates_do_not_bound_a_linear_model():
-    trials, asked = driven(1), driven(2)
-    trials, asked = (motions(np.tile(own.values, 500), own.inputs) for own in (trials, asked))
-    far = motions(40.0 * asked.values, 40.0 * asked.inputs)
-    assert error("linear", trials, far) < 0.05 * np.abs(far.values).max()
-
-
-def test_repeated_trials_are_averaged():
-    random = np.random.default_rng(0)
-    levels = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
-    clean = steps(levels, lambda x: 0.7 * x)
-    noisy = motions(clean.values + 1e-3 * random.normal(size=clean.values.shape), clean.inputs)
-    assert error("interpolation", noisy, steps([1.0, 2.0], lambda x: 0.7 * x)) < 4e-3

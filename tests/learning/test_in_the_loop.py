@@ -89,15 +89,6 @@ class TestAtSteps:
         np.testing.assert_allclose(result[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
         assert np.isnan(result[:, 1]).all()  # three sights with that at the release: too few for a cubic
 
-    def test_a_motion_that_ends_early_is_not_seen_from_there(self):
-        short = self.TIMES.clone()
-        short[12:] = short[11]
-        markers = self.path(torch.stack([self.TIMES, short]))
-        markers[1, 12:] = torch.nan
-        result = at_steps(motions_of(torch.stack([self.TIMES, short]), markers), STEP)
-        assert np.isfinite(result[0]).all()
-        np.testing.assert_array_equal(np.isnan(result[1]).all((1, 2)), np.arange(20) > 11)
-
     def test_a_late_release_is_time_zero(self):
         result = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
         np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
@@ -114,24 +105,6 @@ def test_errors_are_means_over_the_markers_that_were_seen():
     simulated[1] = np.nan
     simulated[1, 1] = 0.0
     np.testing.assert_allclose(marker_errors(simulated, observed)[:2], [2.0, 0.0])
-
-
-def test_markers_at_frames_follow_the_steps_and_are_lost_with_them():
-    sim = simulator()
-    velocity = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
-    t = STEP * torch.arange(12, dtype=torch.float64)
-    q = (sim.rest_positions + t[:, None, None] * velocity).repeat(2, 1, 1, 1)
-    q[1, 7:] = torch.nan
-    times = (0.004 + STEP * torch.arange(10, dtype=torch.float64)).repeat(2, 1)
-    motions = motions_of(times, torch.as_tensor(POINTS).repeat(2, 10, 1, 1))
-    release = Start(State(q[:, 0], torch.zeros_like(q[:, 0])), torch.tensor([0.0, 0.006], dtype=torch.float64))
-    seen = torch.stack([MARKERS(positions) for positions in q])
-    result = Replay(sim, MARKERS, motions).at_frames(seen, release)
-    since = (times - release.delay[:, None]).clamp_min(0.0)
-    expected = torch.as_tensor(POINTS) + since[..., None, None] * velocity
-    torch.testing.assert_close(result[0], expected[0], rtol=0.0, atol=1e-9)
-    torch.testing.assert_close(result[1, :6], expected[1, :6], rtol=0.0, atol=1e-9)
-    assert bool(result[1, 7:].isnan().all())  # from 0.068 s on, the step before the first that is lost
 
 
 def observed_motions(frames=8):
@@ -168,7 +141,7 @@ def finish(trainer):
 
 
 class TestInTheLoop:
-    @pytest.mark.parametrize("changes", [{}, {"layers": 1, "blocks": 2}, {"kind": "nodal"}])
+    @pytest.mark.parametrize("changes", [{}, {"kind": "nodal", "layers": 1}])
     def test_training_starts_at_zero_force(self, loss, changes):
         model = network(**changes)
         assert float(loss(model).detach()) != pytest.approx(float(loss(None)), rel=1e-6)
@@ -223,34 +196,12 @@ class TestInTheLoop:
         one, other = (trainer.use_best().state_dict() for trainer in (whole, again))
         assert all(torch.equal(one[key], other[key]) for key in one)
 
-    def test_the_line_search_steps_back_from_a_failed_simulation(self, loss, monkeypatch):
-        calls = []
-        call = MotionLoss.__call__
-
-        def fragile(self, model):
-            calls.append(torch.is_grad_enabled())
-            if sum(calls) == 2:  # the first weights that the first line search tries
-                raise ConvergenceError("no", torch.zeros(1), None)
-            return call(self, model)
-
-        monkeypatch.setattr(MotionLoss, "__call__", fragile)
-        trainer = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=2)))
-        losses = [record["train_loss"] for record in trainer.state.history]
-        assert losses[2] < losses[0]
-        assert all(torch.isfinite(w).all() for w in trainer.model.network.parameters())
-
     def test_a_failed_validation_has_an_infinite_loss(self, loss, monkeypatch):
         def failing(*_, **__):
             raise ConvergenceError("no", torch.zeros(1), None)
 
         monkeypatch.setattr(Replay, "__call__", failing)
         assert loss.error_mm(None) == float("inf")
-
-    def test_no_constant_force_is_learned(self, loss):
-        model = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=2))).model
-        rest = simulator().rest_state(2)
-        assert model(rest.q + 1e-3, rest.v, 0.0 * LOADS).any()
-        assert not model(rest.q, rest.v, 0.0 * LOADS).any()
 
     def test_cross_validation_selects_the_number_of_epochs(self, loss):
         """Here the held-out motions are those of training, there such as the simulator makes without a force."""
@@ -279,20 +230,6 @@ class TestInTheLoop:
         trainer.begin()
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
-
-    def test_groups_are_weighted_by_their_number_of_trials(self, loss):
-        """Motions split into groups have the loss and error of one group."""
-        motions, release = observed_motions()
-        sim, model = simulator(), network()
-        watched = [
-            TrialGroup(Replay(sim, MARKERS, motions.select([row])), release.select([row]), LOADS[[row]])
-            for row in (1, 0)
-        ]
-        apart = MotionLoss(watched, {})
-        for force in (None, model):
-            assert float(apart(force).detach()) == pytest.approx(float(loss(force).detach()), rel=1e-9)
-            assert apart.error_mm(force) == pytest.approx(loss.error_mm(force), rel=1e-9)
-        assert [len(markers) for markers in apart.markers(None)] == [1, 1]
 
     def test_a_trained_force_is_the_first_candidate(self, loss, tmp_path):
         """Whatever the scale of its loss, which is that of markers at micrometres here."""
@@ -338,37 +275,13 @@ class TestWindows:
         start = Start(State(q[:, 0], v[:, 0]), torch.zeros(2, dtype=torch.float64))
         return real, trials, start, Windows(q, v, self.WINDOW)
 
-    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+    @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
     def test_windows_of_the_true_motion_are_the_true_motion(self, integrator):
         """With creep, whose memory goes on from window to window."""
         creeping = replace(MATERIAL, prony=[(0.5, 0.05)])
         real, trials, start, windows = self.released(integrator, creeping)
         again = Replay(real, WHOLE_STATE, trials)(start, windows=windows)[0]
         torch.testing.assert_close(again, trials.observed, rtol=0.0, atol=1e-9)
-
-    @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-    def test_each_begins_at_the_known_state(self, integrator):
-        """Of a simulator of another stiffness, they are as its steps from there; an unknown state begins none."""
-        _, trials, start, windows = self.released(integrator)
-        windows.q[1, 2 * self.WINDOW] = torch.nan
-        wrong = Simulator(
-            Body(MESH, select_vertices(MESH, x=0.0)),
-            replace(MATERIAL, youngs_modulus=120e3),
-            time_step=STEP,
-            integrator=integrator,
-            relative_tolerance=1e-12,
-        )
-        points = Replay(wrong, WHOLE_STATE, trials)(start, windows=windows)[0]
-        for row in range(2):
-            for first in (0, self.WINDOW, 2 * self.WINDOW):
-                if row == 1 and first == 2 * self.WINDOW:
-                    continue
-                before = None if first == 0 else (windows.q[row, None, first - 1], windows.v[row, None, first - 1])
-                state = State(windows.q[row, None, first], windows.v[row, None, first])
-                state = replace(state, previous=before if integrator == "bdf2" else None)
-                steps = min(self.WINDOW if row == 0 or first == 0 else self.STEPS, self.STEPS - first)
-                own = wrong.rollout(state, steps).q[1:, 0]
-                torch.testing.assert_close(points[row, first + 1 : first + 1 + steps], own, rtol=0.0, atol=1e-9)
 
     def test_the_loss_has_the_gradient_of_separate_windows(self):
         """No gradient passes the beginning of a window."""

@@ -102,31 +102,6 @@ def test_a_model_that_diverges_has_no_intervals():
     assert Intervals.calibrated(made, REST) is None
 
 
-def test_a_marker_that_was_never_seen_has_the_widest_interval():
-    made = [
-        Predicted(*(series[:, [0, 1, 1]].copy() for series in (trial.simulated, trial.observed)), trial.since)
-        for trial in trials(4, 2, constant)
-    ]
-    for trial in made:
-        trial.observed[:, 1] += 0.004
-        trial.observed[:, 2] = np.nan
-    result = Intervals.calibrated(made, REST[[0, 1, 1]])
-    assert result.factor[2] == result.factor[1] > 1.5 * result.factor[0]
-    for trial in made:
-        trial.observed[:] = np.nan
-    assert Intervals.calibrated(made, REST[[0, 1, 1]]) is None
-
-
-def test_a_body_that_never_moves_has_intervals_too():
-    """As the baseline at rest does: its errors are constant then."""
-    made = [
-        Predicted(np.broadcast_to(REST, t.observed.shape).copy(), t.observed, t.since) for t in trials(5, 4, constant)
-    ]
-    intervals = Intervals.calibrated(made, REST)
-    assert intervals.variance[1:4] == (0.0, 0.0, 0.0)
-    assert covered(intervals, made)["coverage"] >= 0.9
-
-
 def test_the_time_since_a_change_is_not_reset_by_noise():
     times = np.broadcast_to(0.1 * np.arange(8.0)[:, None], (8, 2))
     valve = np.zeros((8, 2, 1))
@@ -138,15 +113,6 @@ def test_the_time_since_a_change_is_not_reset_by_noise():
     np.testing.assert_allclose(since[:, 1], 0.0)
     np.testing.assert_allclose(time_since_change(times, []), times)
     assert np.isinf(time_since_change(times[:1], [valve[:1]])).all()
-
-
-def test_coverage_by_amplitude_gives_trials_equal_weight():
-    made = trials(6, 5, constant)
-    intervals = Intervals.calibrated(made, REST)
-    own = [intervals.covered(trial, REST) for trial in made]
-    result = coverage(own)
-    assert result["coverage"] == pytest.approx(np.mean([trial.inside.mean() for trial in own]))
-    assert np.mean(result["by_amplitude"]) == pytest.approx(result["coverage"], abs=1e-3)
 
 
 def test_intervals_grow_with_the_uncertainty_of_the_parameters():
@@ -167,16 +133,3 @@ def test_intervals_grow_with_the_uncertainty_of_the_parameters():
     known, new = ([replace(t, spread=None) for t in spread_out(*which)] for which in ((20, 6, 1e-3), (200, 7, 0.1)))
     assert covered(Intervals.calibrated(known, REST), new)["coverage"] < 0.1
     assert 1.0 <= intervals.variance[-1] < 2.0
-
-
-@pytest.mark.parametrize("noise", [constant, growing])
-def test_the_quarters_of_a_single_motion_count_as_trials(noise):
-    """With slowly varying errors one motion tells less than many: the coverage is close to that wanted."""
-    results = []
-    for seed in range(30):
-        (motion,) = trials(1, seed, noise, frames=240)
-        results.append(covered(Intervals.calibrated([motion], REST), trials(10, 1000 + seed, noise))["coverage"])
-    assert 0.82 < np.mean(results) < 0.96
-    pose = Predicted(*(series[:1] for series in (motion.simulated, motion.observed, motion.since)))
-    alone = Intervals.calibrated([pose], REST)
-    assert (np.abs(pose.errors[0]).max(-1) <= 1.000001 * alone.half_widths(pose.simulated[0], REST, 0.0)).all()

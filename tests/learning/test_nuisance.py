@@ -60,7 +60,7 @@ def askew():
     return Placement(offsets, double([1e-3, 0.0, -1e-3]), double([0.0, 0.0, 0.0]), double([0.0, 0.0, 0.0]))
 
 
-@pytest.mark.parametrize("placed", [False, True])
+@pytest.mark.parametrize("placed", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
     trials, start = motions(PlacedMarkers.of(bound(), askew()) if placed else bound())
     more = {"accuracy": ACCURACY, "labels": LABELS} if placed else {}
@@ -89,13 +89,3 @@ def test_derivatives_are_those_of_the_loss_with_the_best_delays(accuracy):
         ends = [misfit.linearise(unit + sign * step, derivatives=False).loss for sign in (1.0, -1.0)]
         assert linear.gradient[column] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-3), column
     assert misfit.losses_or_infinite(unit[None])[0] == pytest.approx(linear.loss, rel=1e-9)
-
-
-def test_a_motion_that_is_released_keeps_the_delay_of_its_start():
-    trials, start = motions(bound())
-    released = replace(start, at_rest=False)
-    pair = (Replay(SIM, bound(), trials), released)
-    late, on_time = (
-        Misfit([pair], RANGES, delay=delay).losses_or_infinite(np.array([[0.4, 0.25]])) for delay in (0.02, 0.0)
-    )
-    assert late[0] == on_time[0]

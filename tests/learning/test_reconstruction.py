@@ -8,7 +8,6 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import make_reconstructor
-from warp_resphys.learning.reconstruction_problems import FullStateProblem, Step
 from warp_resphys.learning.rollout import Rollout, closed_loop
 from warp_resphys.stepping.inputs import Inputs
 
@@ -133,7 +132,7 @@ class TestGaussNewton:
         np.testing.assert_allclose(result.state.v.cpu(), (observed[1] - observed[0]) / H, rtol=0, atol=1e-12)
         np.testing.assert_allclose(result.force[0].cpu(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
-    @pytest.mark.parametrize("regularisation", [1e-8, 1e-6, 1e-4, 1e-2])
+    @pytest.mark.parametrize("regularisation", [1e-6, 1e-2])
     def test_dense_solve(self, regularisation):
         observed, start = observation()
         q, force = reconstruct("gauss_newton", simulator(), start, observed, regularisation)
@@ -156,19 +155,6 @@ class TestGaussNewton:
         missing = dense.residual(expected, start)
         np.testing.assert_allclose(force[0, 0], missing, rtol=0, atol=1e-4 * np.abs(missing).max())
 
-    def test_a_step_solves_its_normal_equations(self):
-        observed, start = observation()
-        sim, weight, x = simulator(), 1e-4, start.q[0].numpy()
-        problem = FullStateProblem(Step(sim, sim.prepare(), start, Inputs(), observed[1], weight))
-        dense = DenseBeam(215e3, 0.45)
-        h, g = dense.jacobian(x, start), dense.residual(x, start)[FREE].ravel()
-        off = (observed[1, 0].numpy() - x)[FREE].ravel()
-        expected = np.linalg.solve(np.eye(len(h)) + weight * h @ h, off - weight * h @ g)
-        move = problem.linearise(problem.evaluate(start.q))
-        for damping in (0.0, 3.0):
-            taken = (move(torch.tensor([damping]).double()) - start.q)[0, FREE].flatten()
-            np.testing.assert_allclose(taken, expected / (1.0 + damping), atol=1e-4 * np.abs(expected).max())
-
     def test_stationary_where_the_hessian_is_indefinite(self):
         _, start = observation()
         observed = start.q * torch.tensor([0.6, 1.0, 1.0], dtype=torch.float64)
@@ -181,36 +167,6 @@ class TestGaussNewton:
         missed = (q[0] - observed)[0, FREE].numpy().ravel()
         np.testing.assert_allclose(missed, -regularisation * slope, rtol=0, atol=1e-5 * np.abs(missed).max())
 
-    def test_regularisation_trades_misfit_for_force(self):
-        observed, start = observation()
-        runs = [reconstruct("gauss_newton", simulator(), start, observed, 10.0**k) for k in range(-12, 1)]
-        misfits = [float((q - observed[1:]).norm()) for q, _ in runs]
-        forces = [float(force.norm()) for _, force in runs]
-        assert misfits == sorted(misfits)
-        assert forces == sorted(forces, reverse=True)
-        assert misfits[0] < 1e-8
-        assert forces[-1] < 1e-2 * forces[0]
-
-    def test_environments_are_independent(self):
-        weights = (0.02, 0.1, 0.3)
-        observed, start = observation(2, weights)
-        sim = simulator()
-        solver = make_reconstructor(sim, "gauss_newton", 1e-6, **SETTINGS)
-        together = solver.step(start, observed[1])
-        for b in range(len(weights)):
-            alone = solver.step(State(start.q[b : b + 1], start.v[b : b + 1]), observed[1, b : b + 1])
-            np.testing.assert_allclose(alone.state.q[0], together.state.q[b], rtol=0, atol=1e-11)
-
-    def test_arguments_are_unchanged_and_fixed_vertices_have_no_force(self):
-        observed, start = observation()
-        moved = observed[1] + 1e-3
-        kept, q = moved.clone(), start.q.clone()
-        result = make_reconstructor(simulator(), "gauss_newton", 1e-6, **SETTINGS).step(start, moved)
-        assert torch.equal(moved, kept)
-        assert torch.equal(start.q, q)
-        assert torch.equal(result.state.q[:, BODY.fixed_vertices], start.q[:, BODY.fixed_vertices])
-        assert not result.force[:, BODY.fixed_vertices].any()
-
     def test_too_few_iterations(self):
         observed, start = observation()
         solver = make_reconstructor(simulator(), "gauss_newton", 1e-4, tolerance=1e-12, max_iterations=1)
@@ -219,8 +175,7 @@ class TestGaussNewton:
 
 
 class TestMethodsAgree:
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
-    @pytest.mark.parametrize("stiffness_damping", [0.0, 2e-3])
+    @pytest.mark.parametrize(("integrator", "stiffness_damping"), [*zip(INTEGRATORS, (2e-3, 0.0, 2e-3), strict=True)])
     def test_minimum(self, integrator, stiffness_damping):
         regularisation = 1e-4
         observed, start = observation(2, integrator=integrator)
@@ -235,25 +190,9 @@ class TestMethodsAgree:
         np.testing.assert_allclose(force, force_other, rtol=0, atol=2e-3 * float(force.abs().max()))
         np.testing.assert_allclose(q, q_other, rtol=0, atol=2e-3 * float((q - observed[1:]).abs().max()))
 
-    def test_lbfgsb_takes_a_first_guess(self):
-        observed, start = observation()
-        solver = make_reconstructor(simulator(), "lbfgsb", 1e-4, tolerance=1e-12, max_iterations=500)
-        cold = solver.step(start, observed[1])
-        warm = solver.step(start, observed[1], first_guess=cold.force)
-        again = solver.step(start, observed[1])
-        assert warm.iterations < cold.iterations / 2
-        assert torch.equal(again.force, cold.force)
-
-    def test_lbfgsb_with_too_few_iterations(self):
-        observed, start = observation()
-        solver = make_reconstructor(simulator(), "lbfgsb", 1e-8, tolerance=1e-12, max_iterations=3)
-        with pytest.raises(ConvergenceError, match="no minimum in 3 iterations"):
-            solver.step(start, observed[1])
-
 
 class TestTrajectory:
-    @pytest.mark.parametrize("method", ["gauss_newton", "lbfgsb"])
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    @pytest.mark.parametrize(("method", "integrator"), [("gauss_newton", "bdf2"), ("lbfgsb", "midpoint")])
     def test_forces_reproduce_it_in_open_loop(self, method, integrator):
         observed, start = observation(6, (0.05, 0.2), integrator=integrator)
         sim = simulator(integrator=integrator)
@@ -263,7 +202,7 @@ class TestTrajectory:
         np.testing.assert_allclose(replayed, q, rtol=0, atol=1e-9)
         assert float((q - observed[1:]).abs().max()) < 0.2 * float((uncorrected - observed[1:]).abs().max())
 
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
     def test_errors_of_the_steps_do_not_add_up(self, integrator):
         damping = 1e-3 if integrator == "midpoint" else 0.0  # undamped, it rings
         observed, start = observation(40, damping=damping, integrator=integrator)
@@ -274,13 +213,6 @@ class TestTrajectory:
 
 
 class TestClosedLoop:
-    def test_exact_forces_reproduce_the_target(self):
-        observed, start = observation(5, (0.05, 0.2))
-        sim = simulator()
-        _, force = reconstruct("gauss_newton", sim, start, observed, 0.0)
-        positions = closed_loop(Rollout(sim, lambda state, step: force[step]), start, 5)
-        np.testing.assert_allclose(positions, observed.transpose(0, 1), rtol=0, atol=1e-9)
-
     def test_a_diverged_motion_is_marked_and_does_not_affect_others(self):
         _, start = observation(1, (0.05, 0.2, 0.1))
         few = SolverSettings(on_failure="count", max_iterations=15)

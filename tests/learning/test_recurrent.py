@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.networks import ResidualForce, build_model, restore
+from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.learning.training import Samples, SequenceTrainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
@@ -107,12 +107,6 @@ def test_a_hidden_state_of_another_size_is_refused(model):
     for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
         with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
             model[0].standardised(inputs, wrong)
-
-
-def test_a_range_is_restored_from_its_description(model):
-    learned, samples = model
-    again = restore(ResidualForce, learned.state_dict(), learned.description())
-    torch.testing.assert_close(rolled_out(again, samples)[0], rolled_out(learned, samples)[0])
 
 
 def test_an_interrupted_training_goes_on_with_the_same_losses():

@@ -12,7 +12,7 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.parameters import configured_parameters, tilted_gravity
+from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import (
     ReleaseSettings,
     begin_inputs,
@@ -20,7 +20,7 @@ from warp_resphys.learning.release import (
     hold,
     sideways_shapes,
 )
-from warp_resphys.learning.replay import Replay, Start, later, sample
+from warp_resphys.learning.replay import Replay, Start, sample
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
@@ -82,15 +82,6 @@ def test_sampling_is_of_third_order_and_differentiable():
     assert torch.autograd.gradcheck(lambda s, t: sample(s, t, 0.1), (series, times))
 
 
-def test_a_delayed_series_holds_its_first_value_and_ends_with_the_record():
-    h, t = 0.1, 0.1 * torch.arange(6, dtype=torch.float64)
-    shown = later((t**2).expand(3, -1)[..., None], double([0.0, 0.13, -0.2]), h)[..., 0]
-    torch.testing.assert_close(shown[0], t**2, rtol=0.0, atol=1e-14)
-    torch.testing.assert_close(shown[1, :4], (t[:4] + 0.13) ** 2, rtol=0.0, atol=1e-14)
-    assert bool(shown[1, 4:].isnan().all())
-    torch.testing.assert_close(shown[2], (t - 0.2).clamp_min(0.0) ** 2, rtol=0.0, atol=1e-14)
-
-
 def test_gravity_turns_by_its_components_and_keeps_its_strength():
     sim = simulator(gravity=(0.0, -9.8, 0.0))
     turned = tilted_gravity(sim, double([0.0, 0.1, 0.0]), double([0.0, 0.0, -0.2]))
@@ -101,18 +92,6 @@ def test_gravity_turns_by_its_components_and_keeps_its_strength():
     assert tilted_gravity(sim, None, None).tolist() == [[0.0, -9.8, 0.0]]
     with pytest.raises(InputError, match="without gravity"):
         tilted_gravity(simulator(gravity=(0.0, 0.0, 0.0)), double([0.1]), None)
-
-
-def test_environments_with_other_weights_and_gravities_are_those_of_separate_simulators():
-    sim, motions = simulator(), blank()
-    tilts = {"gravity_tilt_1": double([0.0, 0.2]), "attached_mass_factor": double([1.0, 1.5])}
-    together = Replay(sim, MARKERS, motions)(at_rest(sim, 2), tilts)
-    for e in range(2):
-        gravity = tuple(tilted_gravity(sim, tilts["gravity_tilt_1"][e : e + 1], None)[0].tolist())
-        for r, mass in enumerate(MASSES):
-            alone = simulator(masses=(mass * float(tilts["attached_mass_factor"][e]),), gravity=gravity)
-            q = alone.rollout(alone.rest_state(), 11).q[:, 0]
-            torch.testing.assert_close(together[e, r], MARKERS(q), rtol=0.0, atol=1e-8)
 
 
 def test_sets_of_parameters_at_once_are_those_one_by_one():
@@ -155,30 +134,7 @@ def test_parts_have_their_own_parameters():
         torch.testing.assert_close(result, double(wanted).repeat_interleave(2, 0))
 
 
-def test_configured_parameters_are_those_of_the_simulator():
-    """A part has its own value; a name like that of an input's response need not be one."""
-    mesh = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
-    routes = {name: [(0.0, y, 0.015), (0.1, y, 0.015)] for name, y in (("low", 0.01), ("rise", 0.02))}
-    tendons = Tendons([*routes.values()], stiffness=[300.0, 400.0], labels=[*routes])
-    sim = Simulator(Body(mesh, fixed=[0, 1, 2, 3], energies=(tendons,)), Corotated(2e5, 0.45))
-    wanted = {
-        **{"youngs_modulus": 2e5, "tendon_stiffness_low": 300.0, "tendon_stiffness_rise": 400.0},
-        **{"tendon_contraction_factor": 1.0, "tendon_contraction_rise": 0.0, "attached_mass_factor": 1.0},
-        **{"gravity_tilt_1": 0.0},
-    }
-    assert configured_parameters(sim, wanted) == wanted
-
-
-def test_before_its_release_a_body_holds_still_and_frames_lie_between_steps():
-    sim = simulator()
-    slow = Replay(sim, MARKERS, blank(frames=24, rate=200.0))
-    on_time, late = slow(at_rest(sim, 2))[0], slow(at_rest(sim, 2, delay=0.03))[0]
-    torch.testing.assert_close(late[:, 6:], on_time[:, :-6], rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(late[:, :6], torch.as_tensor(POINTS).expand(2, 6, -1, -1), rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("nu", [0.45, 0.499])
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
+@pytest.mark.parametrize(("integrator", "nu"), [("implicit_euler", 0.45), ("bdf2", 0.499), ("midpoint", 0.499)])
 def test_gradients_of_every_parameter_agree_with_central_differences(integrator, nu):
     sim = simulator(integrator=integrator, relative_tolerance=1e-11)
     motions = blank(frames=8)
@@ -235,24 +191,6 @@ def test_markers_that_were_not_seen_have_no_influence():
         replace(motions, observed=torch.where(double([[[[0.0]]], [[[1.0]]]]) > 0, torch.nan, motions.observed))
 
 
-def test_trials_can_be_cut_and_selected():
-    motions = blank(frames=12)
-    motions.times[1, 8:] = 0.07
-    motions.observed[1, 8:] = torch.nan
-    first = motions.first(0.045)
-    assert first.times.shape == (2, 5)
-    assert first.observed.shape == (2, 5, 3, 3)
-    assert bool(motions.first(0.09).seen[1, 8:].any()) is False
-    assert bool(motions.first(9.0).times.equal(motions.times))
-    torch.testing.assert_close(motions.amplitude, torch.full((2,), 1e-3 * np.sqrt(3.0), dtype=torch.float64))
-    chosen = motions.select([1])
-    assert chosen.names == ("m1",)
-    assert chosen.times.shape == (1, 12)
-    torch.testing.assert_close(chosen.inputs.attached_mass[0], motions.inputs.attached_mass[1])
-    with pytest.raises(InputError, match="do not belong"):
-        replace(motions, times=motions.times[:, :4])
-
-
 def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
     sim = simulator()
     replay = Replay(sim, MARKERS, blank())
@@ -277,9 +215,9 @@ def test_without_hold_modes_a_body_rests_under_gravity_and_its_weight():
     assert float((still - still[:, :1]).abs().max()) < 1e-7
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.6, 1.5])
-def test_the_delay_of_a_release_is_recovered_in_any_basis(angle, monkeypatch):
+def test_the_delay_of_a_release_is_recovered_in_any_basis(monkeypatch):
     """The beam is square: any rotation of its first two vibrations is as good a basis."""
+    angle = 0.6
 
     def rotated(sim, count):
         basis = vibration_modes(sim, count)
@@ -303,12 +241,11 @@ def test_the_delay_of_a_release_is_recovered_in_any_basis(angle, monkeypatch):
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_releases_within_twice_what_is_expected_are_recovered(seed):
+def test_releases_within_twice_what_is_expected_are_recovered():
     """Delays between any two frames: each frame that sees the body at rest or moving is a minimum of its own."""
     sim, count = simulator(), 8
     motions = blank(frames=12, masses=(0.0,) * count)
-    values = 4.0 * torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 2.0
+    values = 4.0 * torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
     q = hold(Replay(sim, MARKERS, motions), 6)
     release = Start(State(q, torch.zeros_like(q)), 0.01 * values)
     seen = Replay(sim, MARKERS, motions)(release)[0]
@@ -352,41 +289,6 @@ def test_a_sideways_held_body_is_identified_from_its_initial_motion():
     straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings.changed(sideways=0.0))
     assert straight.shift is None
     assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
-
-
-@pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.8), (1.2, 0.1, -9.7)])
-def test_bodies_bend_sideways_across_gravity(gravity):
-    shapes = sideways_shapes(simulator(gravity=gravity))
-    assert shapes.shape[0] == 1  # The beam is stiff along itself, and where it is not level that would bend it down.
-    assert float(shapes[0].norm(dim=1).max()) == pytest.approx(1.0)
-    assert float(shapes[0, TIP, 1].abs().min()) > 0.95
-    assert float(shapes[0, :, 2].abs().max()) < 0.02
-    loaded = sideways_shapes(simulator(masses=(0.3,), gravity=gravity))
-    torch.testing.assert_close(loaded.abs(), shapes.abs(), rtol=0.0, atol=1e-6)
-    hanging = sideways_shapes(simulator(gravity=(9.8, 0.0, 0.0)))
-    assert hanging.shape[0] == 2
-    across = hanging[:, TIP, 1:].mean(1)
-    torch.testing.assert_close((across @ across.mT).diagonal(), torch.ones(2).double(), rtol=0.1, atol=0.0)
-    assert abs(float(across[0] @ across[1])) < 0.05
-
-
-def test_bending_shapes_in_single_precision_and_of_stiff_bodies():
-    exact = sideways_shapes(simulator())
-    for modulus in (215e3, 1e9):
-        sim = simulator(material=Corotated(modulus, 0.45), dtype=torch.float32, relative_tolerance=1e-4)
-        rough = sideways_shapes(sim).double()
-        assert len(rough) == 1
-        sign = torch.sign((rough * exact).sum())
-        torch.testing.assert_close(sign * rough, exact, rtol=0.0, atol=0.03)
-
-
-def test_a_body_that_cannot_be_held_is_an_error():
-    class Failing(Simulator):
-        def static_equilibrium(self, *_, **__):
-            raise ConvergenceError("no equilibrium", None, None)
-
-    with pytest.raises(ConvergenceError):
-        hold(Replay(simulator(kind=Failing), MARKERS, blank()), 3)
 
 
 @pytest.mark.parametrize(

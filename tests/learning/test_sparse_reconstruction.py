@@ -5,7 +5,7 @@ import pytest
 import scipy.optimize
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
@@ -74,31 +74,8 @@ class TestMarkerMap:
             MarkerMap(torch.zeros(shape, dtype=torch.int64), torch.ones(shape))
 
 
-@pytest.mark.parametrize(
-    ("method", "options"),
-    [("gauss_newton", {}), ("gauss_newton", {"modes": 6}), ("levenberg_marquardt", {}), ("full", {})],
-)
-def test_in_single_precision(method, options):
-    """Two steps in a row of a nearly incompressible beam, so that states keep their type."""
-    observed, start = observation(2)
-    result = []
-    for dtype in (torch.float64, torch.float32):
-        sim = simulator(poissons_ratio=0.499, dtype=dtype, relative_tolerance=1e-8)
-        first = State(start.q.to(dtype), start.v.to(dtype))
-        if method == "full":
-            solver = make_reconstructor(sim, "gauss_newton", 1e-6, 1e-7, 40)
-        else:
-            solver = make_sparse_reconstructor(sim, markers_at([5, 10]), method, 1e-6, 1e-6, 60, **options)
-        q, force = reconstruct(solver, first, observed.to(dtype))
-        assert q.dtype == force.dtype == dtype
-        result.append((q.double(), force.double()))
-    torch.testing.assert_close(result[1][0], result[0][0], rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(result[1][1], result[0][1], rtol=0.0, atol=1e-2 * float(result[0][1].abs().max()))
-
-
 class TestGaussNewton:
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
-    @pytest.mark.parametrize("regularisation", [1e-4, 1e-6])
+    @pytest.mark.parametrize(("integrator", "regularisation"), [("bdf2", 1e-4), ("implicit_euler", 1e-6)])
     def test_the_published_method_finds_the_same_minimum(self, integrator, regularisation):
         observed, start = observation(2, integrator=integrator)
         sim, markers = simulator(integrator=integrator), markers_at([5, 10])
@@ -133,8 +110,7 @@ class TestGaussNewton:
         expected = (basis @ torch.as_tensor(best.x)).view(1, 12, 3)
         np.testing.assert_allclose(result.force, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
-    @pytest.mark.parametrize("modes", [None, 6])
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    @pytest.mark.parametrize(("integrator", "modes"), [("bdf2", 6), ("midpoint", None)])
     def test_forces_reproduce_it_in_open_loop(self, integrator, modes):
         observed, start = observation(6, (0.05, 0.2), integrator=integrator)
         sim = simulator(integrator=integrator)
@@ -147,27 +123,7 @@ class TestGaussNewton:
         np.testing.assert_allclose(replayed, q, rtol=0, atol=1e-9)
         assert float((q - observed[1:]).norm()) < 0.3 * float((uncorrected - observed[1:]).norm())
 
-    def test_environments_are_independent(self):
-        observed, start = observation(1, (0.02, 0.3))
-        both = gauss_newton(simulator(), markers_at([5, 8], [9, 10]), 1e-6, **TIGHT)
-        together = both.step(start, both.observation(observed[1]))
-        for b, row in enumerate(([5, 8], [9, 10])):
-            one = gauss_newton(simulator(), markers_at(row), 1e-6, **TIGHT)
-            alone = one.step(State(start.q[b : b + 1], start.v[b : b + 1]), one.observation(observed[1, b : b + 1]))
-            np.testing.assert_allclose(alone.state.q[0], together.state.q[b], rtol=0, atol=1e-11)
-
-    def test_clamped_and_absent_markers_add_nothing(self):
-        observed, start = observation()
-        sim = simulator()
-        padded = MarkerMap(torch.tensor([[[8], [0], [3]]]), torch.tensor([[[1.0], [1.0], [0.0]]], dtype=torch.float64))
-        forces = []
-        for markers in (markers_at([8]), padded):
-            solver = gauss_newton(sim, markers, 1e-6, **TIGHT)
-            forces.append(solver.step(start, markers(observed[1])).force)
-        np.testing.assert_allclose(forces[1], forces[0], rtol=0, atol=1e-10)
-
-    @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    @pytest.mark.parametrize(("kind", "integrator"), [*zip(KINDS, INTEGRATORS, strict=False)])
     def test_markers_on_stems_against_the_published_method(self, kind, integrator):
         """Stems that turn make the map nonlinear: both ways to the minimum need its derivative where the body is."""
         stems = [[0.06, 0.012, 0.045], [0.03, -0.015, 0.013], [0.075, 0.02, 0.01]]
@@ -191,8 +147,7 @@ class TestGaussNewton:
 
 
 class TestLevenbergMarquardt:
-    @pytest.mark.parametrize("modes", [None, 4])
-    @pytest.mark.parametrize("integrator", INTEGRATORS)
+    @pytest.mark.parametrize(("integrator", "modes"), [("bdf2", None), ("midpoint", 4)])
     def test_gauss_newton_finds_the_same_minimum(self, integrator, modes):
         """With stems that turn, and with a marker that one of the environments did not see."""
         observed, start = observation(3, (0.1, 0.5), integrator=integrator)
@@ -226,59 +181,8 @@ class TestLevenbergMarquardt:
         free = [i for i in range(12) if i not in BODY.fixed_vertices]
         assert float(gradient[:, free].abs().max()) < 1e-4 * 2e-5 * float(result.force.abs().max())
 
-    def test_damped_steps_follow_full_steps_that_do_not_converge(self, caplog):
-        _, start = observation(1, (0.1, 0.1))
-        sim, markers = simulator(), markers_at([6, 11], [6, 11])
-        target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
-        damped = levenberg_marquardt(sim, markers, 1e-5, 1e-10, 200).step(start, target)
-        with caplog.at_level("INFO"):
-            result = gauss_newton(sim, markers, 1e-5, 1e-10, 200).step(start, target)
-        assert "damped ones follow" in caplog.text
-        np.testing.assert_array_equal(result.force, damped.force)
-
-    def test_a_first_guess_that_fails_is_dropped(self):
-        observed, start = observation()
-        markers = markers_at([8])
-
-        class Fragile(Simulator):
-            def step(self, state, inputs=None, parameters=None):
-                if float(inputs.external_force.abs().max()) > 50.0:
-                    raise ConvergenceError("too much", state.q, None)
-                return super().step(state, inputs, parameters)
-
-        solver = levenberg_marquardt(simulator(kind=Fragile), markers, 1e-6, **TIGHT)
-        expected = solver.step(start, markers(observed[1]))
-        result = solver.step(start, markers(observed[1]), first_guess=torch.full_like(start.q, 100.0))
-        np.testing.assert_allclose(result.force, expected.force, rtol=0, atol=1e-9)
-
-    def test_an_unreachable_target_is_an_error(self):
-        observed, start = observation()
-
-        class Failing(Simulator):
-            def step(self, *_):
-                raise ConvergenceError("no", start.q, None)
-
-        solver = levenberg_marquardt(simulator(kind=Failing), markers_at([8]), 1e-6, 1e-6, 5)
-        with pytest.raises(ConvergenceError, match=r"reconstruction\.regularisation"):
-            solver.step(start, solver.observation(observed[1]))
-
-
-def test_the_published_method_leaves_out_markers_that_were_not_seen():
-    observed, start = observation(1, (0.1, 0.3))
-    sim, markers = simulator(), markers_at([6, 11], [5, 10])
-    seen = markers(observed[1])
-    seen[0, 1] = torch.nan
-    published = make_sparse_reconstructor(sim, markers, "lbfgsb", 1e-5, 1e-15, 3000).step(start, seen)
-    ours = gauss_newton(sim, markers, 1e-5, **TIGHT).step(start, seen)
-    np.testing.assert_allclose(published.force, ours.force, rtol=0, atol=2e-3 * float(ours.force.abs().max()))
-
 
 class TestModes:
-    def test_they_are_orthonormal_and_vanish_at_the_clamp(self):
-        basis = vibration_modes(simulator(), 5)
-        np.testing.assert_allclose(basis.mT @ basis, np.eye(5), rtol=0, atol=1e-12)
-        assert not basis.view(12, 3, 5)[BODY.fixed_vertices].any()
-
     def test_the_slowest_two_bend_and_all_of_them_span_every_force(self):
         sim = simulator()
         slowest = vibration_modes(sim, 2).view(12, 3, 2)
@@ -292,11 +196,8 @@ class TestModes:
     ("settings", "sentence"),
     [
         ({"regularisation": 0.0}, "reconstruction.regularisation"),
-        ({"method": "adam"}, "reconstruction.method"),
         ({"method": "lbfgsb", "modes": 3}, "reconstruction.method"),
-        ({"modes": 0}, "0 vibration modes were asked for, but the body has 1 to 24."),
-        ({"modes": 25}, "25 vibration modes were asked for"),
-        ({"markers": markers_at([12])}, "a marker is on a vertex that the body does not have"),
+        ({"modes": 25}, "25 vibration modes were asked for, but the body has 1 to 24."),
         ({"markers": markers_at([-1])}, "a marker is on a vertex that the body does not have"),
     ],
 )

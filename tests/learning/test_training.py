@@ -1,4 +1,3 @@
-import json
 import math
 from dataclasses import replace
 
@@ -62,8 +61,9 @@ def same(a, b):
 
 
 class TestResume:
-    @pytest.mark.parametrize("after", [1, 2, 3, 5])
-    @pytest.mark.parametrize("settings", [{}, {"schedule": "step", "selection": "validation_loss"}])
+    @pytest.mark.parametrize(
+        ("after", "settings"), [(3, {}), (2, {"schedule": "step", "selection": "validation_loss"})]
+    )
     def test_a_snapshot_goes_on_exactly(self, after, settings, tmp_path):
         whole = finish(trainer(**settings))
         first = trainer(**settings)
@@ -81,23 +81,11 @@ class TestResume:
         assert second.best_error == whole.best_error
         assert same(second.state.best, whole.state.best)
 
-    def test_all_roll_outs_diverge(self, tmp_path):
-        first = trainer(error=lambda model: math.inf)
-        for _ in range(3):
-            first.run_epoch()
-        path = tmp_path / "training.safetensors"
-        write_checkpoint(path, "training", *first.snapshot())
-        second = trainer(error=lambda model: 1.0)
-        second.resume(*read_checkpoint(path, "training"))
-        assert (second.best_error, same(second.state.best, first.state.best)) == (math.inf, True)
-        finish(second)
-        assert second.best_error == 1.0
-
 
 class TestSelection:
     @pytest.mark.parametrize(
         ("errors", "best"),
-        [([3.0, 1.0, 2.0], 1), ([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
+        [([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
     )
     def test_the_smallest_roll_out_error_is_selected(self, errors, best):
         queue, weights = list(errors), []
@@ -113,11 +101,6 @@ class TestSelection:
         assert not same(weights[0], weights[2])
         assert same(dict(run.use_best().network.state_dict()), weights[best])
         assert not run.model.training
-
-    def test_diverged_alone_still_give_a_model(self):
-        run = finish(trainer(error=lambda model: math.inf))
-        assert run.best_error == math.inf
-        assert all(torch.isfinite(t).all() for t in run.use_best().state_dict().values())
 
     @pytest.mark.parametrize("measured", [3.0, math.inf])
     def test_the_smallest_validation_loss_is_selected(self, monkeypatch, measured):
@@ -141,12 +124,6 @@ class TestSelection:
         assert len(asked) == 4
         assert not run.model.training
 
-    def test_roll_outs_at_the_configured_epochs_and_at_the_end(self):
-        run = finish(trainer(epochs=7, rollout_every=3))
-        assert [r["epoch"] for r in run.state.history] == [1, 2, 3, 4, 5, 6, 7]
-        assert [r["epoch"] for r in run.state.history if "rollout_error_mm" in r] == [3, 6, 7]
-        json.dumps(run.state.history, allow_nan=False)
-
 
 class TestRepeatability:
     def test_the_seed_decides(self):
@@ -154,13 +131,6 @@ class TestRepeatability:
         assert a.state.history == b.state.history
         assert same(a.model.state_dict(), b.model.state_dict())
         assert not same(a.model.state_dict(), other.model.state_dict())
-
-    def test_the_roll_out_draws_no_random_numbers_of_the_training(self):
-        def drawing(model):
-            torch.rand(7)
-            return rollout_error(model)
-
-        assert same(finish(trainer(error=drawing)).model.state_dict(), finish(trainer()).model.state_dict())
 
 
 class TestLearning:
@@ -177,11 +147,6 @@ class TestLearning:
             result = run.model.coders[0].encode(run.model(VALIDATION.q, VALIDATION.v))
         expected = float((result - wanted).square().mean())
         assert run.state.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
-
-    def test_without_linear_part(self):
-        run = trainer(linear_noise=None)
-        assert not run.model.linear.any()
-        assert float(run.model.remainder) == 1.0
 
     def test_cosine_schedule(self):
         rates = [r["learning_rate"] for r in finish(trainer(epochs=5)).state.history]

@@ -62,14 +62,6 @@ def test_terms_that_the_law_does_not_have_get_no_coefficient(balance):
     assert without.residual > 1e4 * found.residual
 
 
-def test_forces_are_linear_in_coefficients_and_add_up(balance):
-    columns = balance.columns(CANDIDATES)
-    twice = balance.columns([{name: 2.0 * unit} for name, unit in UNIT.items()])
-    together = balance.columns([UNIT])
-    np.testing.assert_allclose(twice, 2.0 * columns, atol=1e-9 * np.abs(columns).max())
-    np.testing.assert_allclose(together[:, 0], columns.sum(1), atol=1e-9 * np.abs(columns).max())
-
-
 def test_a_branch_remembers_the_steps_between_two_rows():
     """Rows of a larger stride are among those of every step."""
     sim = simulator(TRUE)
@@ -78,17 +70,6 @@ def test_a_branch_remembers_the_steps_between_two_rows():
     rows = fine.reshape(12, -1, len(UNIT))[::4].reshape(-1, len(UNIT))
     np.testing.assert_allclose(coarse, rows, rtol=0.0, atol=1e-12 * np.abs(rows).max())
     assert np.abs(fine[:, 5]).max() > 0.0
-
-
-def test_motions_and_candidates_are_computed_alike_in_any_batch(monkeypatch):
-    sim = simulator(TRUE, "bdf2")
-    motions = [released(sim, [pull]) for pull in PULLS]
-    apart = WeakForm(unknown("bdf2"), motions, SHAPE, STIFF)
-    monkeypatch.setattr("warp_resphys.learning.weak_form._AT_ONCE", 4)
-    together = WeakForm(unknown("bdf2"), [released(sim, PULLS)], SHAPE, STIFF)
-    steps = together.columns(CANDIDATES).reshape(3, 2, -1, len(UNIT))
-    rows = apart.columns(CANDIDATES).reshape(2, 3, -1, len(UNIT)).swapaxes(0, 1)
-    np.testing.assert_allclose(steps, rows, atol=1e-8 * np.abs(rows).max())
 
 
 def test_loads_during_the_motion_are_part_of_the_balance():
@@ -113,13 +94,6 @@ def test_a_fit_has_no_negative_coefficient():
     least = np.linalg.lstsq(columns[:, [0, 2]], columns @ true, rcond=None)[0]
     np.testing.assert_allclose(found.coefficients[[0, 2]], least, rtol=1e-6)
     assert found.residual == pytest.approx(residual_of(columns @ found.coefficients, columns @ true))
-
-
-def test_equal_columns_share_their_coefficient():
-    column = np.random.default_rng(1).normal(size=(50, 1))
-    found = fit(np.concatenate([column, column], 1), 3.0 * column[:, 0])
-    assert found.coefficients.sum() == pytest.approx(3.0, rel=1e-6)
-    assert found.residual < 1e-6
 
 
 @pytest.mark.parametrize(("motions", "stride"), [(0, 5), (1, 0)])

@@ -12,7 +12,6 @@ from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.fem.body import Body
 from warp_resphys.linalg import multigrid
-from warp_resphys.linalg.conjugate_gradients import conjugate_gradients
 from warp_resphys.linalg.multigrid import MultigridSolver
 from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs
@@ -54,8 +53,7 @@ def dense(solver, values):
     return solver.matrix(solver.mirrored(values)[0]).toarray()
 
 
-@pytest.mark.parametrize("quadratic", [False, True], ids=["hexahedra", "tetrahedra"])
-@pytest.mark.parametrize("poissons_ratio", [0.45, 0.499])
+@pytest.mark.parametrize(("quadratic", "poissons_ratio"), [(False, 0.499), (True, 0.45)])
 def test_solutions_and_directions(quadratic, poissons_ratio):
     solver, values = system(beam(1, quadratic, poissons_ratio), 1.02)
     matrix = dense(solver, values)
@@ -70,18 +68,6 @@ def test_solutions_and_directions(quadratic, poissons_ratio):
     error, exact = direction[0].numpy() - expected[0, :, 0], expected[0, :, 0]
     assert error @ matrix @ error < 0.03**2 * (exact @ matrix @ exact)
     assert direction[0].numpy() @ right[0, :, 0] > 0.0
-
-
-def test_iterations_hardly_grow_with_the_mesh():
-    counts = []
-    for refinement in (1, 2):
-        solver, values = system(beam(refinement))
-        cycle = solver.factor(values).factors[0].cycle
-        matrix = torch.as_tensor(dense(solver, values))
-        right = torch.as_tensor(np.random.default_rng(1).normal(size=(1, solver.n)))
-        counts.append(conjugate_gradients(lambda x, a=matrix: x @ a, cycle.apply, right, 1e-8).iterations)
-    assert counts[1] <= 1.6 * counts[0]
-    assert counts[1] <= 25
 
 
 def test_the_cycle_is_symmetric_and_positive_definite():
@@ -105,16 +91,6 @@ def test_no_eigenvalue_exceeds_what_the_smoother_is_made_for():
         root = torch.block_diag(*torch.linalg.cholesky(level.inverse)).numpy()
         largest = np.linalg.eigvalsh(root.T @ level.matrix.to_dense().numpy() @ root)[-1]
         assert 0.8 * level.largest < largest < level.largest
-
-
-def test_a_free_body_has_the_rigid_motions_as_its_near_null_space():
-    simulator = beam(fixed=False, gravity=(0.0, 0.0, 0.0))
-    solver, values = system(simulator)
-    inertia = np.repeat(simulator.workspace(1).gather().inertia[0].numpy(), 3)
-    motions = solver._near_null
-    assert np.linalg.matrix_rank(motions) == 6
-    stiffness = dense(solver, values) - np.diag(inertia)
-    assert np.abs(stiffness @ motions).max() < 1e-9 * np.abs(stiffness).max()
 
 
 def test_an_indefinite_matrix_is_reported_or_solved_all_the_same():
@@ -156,7 +132,7 @@ def test_a_cycle_serves_later_matrices_until_it_is_stale():
     assert solver.factor(stiffer).factors[0].cycle is not first.factors[0].cycle
 
 
-@pytest.mark.parametrize("name", ["quasi_newton", "newton", "projective_dynamics"])
+@pytest.mark.parametrize("name", ["quasi_newton", pytest.param("projective_dynamics", marks=pytest.mark.slow)])
 def test_steps_and_gradients_are_those_of_a_direct_solver(name):
     ends = []
     for linear_solver in ("banded", "multigrid"):

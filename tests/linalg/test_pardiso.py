@@ -59,33 +59,6 @@ def test_a_matrix_that_single_precision_makes_indefinite_has_a_direction(solver)
     np.testing.assert_allclose(direction.numpy() @ dense, right, atol=1e-9)
 
 
-def test_a_factor_is_kept_where_low_rank_columns_vanish(solver):
-    (first, values), (second, others) = matrix(0), matrix(1)
-    both, right = torch.cat([values, others]), RIGHT[:, :, 0].repeat(2, 1)
-    before = solver.direction_factor(both, columns=torch.ones(2, NODES, 1, dtype=torch.float64))
-    factor = solver.direction_factor(both, idle=torch.tensor([True, False]), before=before)
-    directions = right.clone()
-    factor.solve_in_place(directions)
-    expected = [np.linalg.solve(dense, RIGHT[0, :, 0].numpy()) for dense in (first, second)]
-    np.testing.assert_allclose(directions.numpy(), expected, rtol=0.0, atol=1e-5 * np.abs(expected).max())
-
-
-def test_an_indefinite_matrix_has_a_solution_but_no_direction(solver):
-    dense, values = matrix(2, shift=0.0)
-    assert solver.direction_factor(values).failed.all()
-    assert solver.factor(values).failed.all()
-    np.testing.assert_allclose(
-        solutions(solver.factor(values, definite=False)), np.linalg.solve(dense, RIGHT[0]), rtol=1e-8, atol=1e-10
-    )
-
-
-def test_an_earlier_factor_still_solves_after_a_later_one(solver):
-    earlier, later = matrix(0), matrix(1)
-    factors = [solver.factor(values) for _, values in (earlier, later)]
-    for factor, (dense, _) in [*zip(factors, (earlier, later), strict=True), (factors[0], earlier)]:
-        np.testing.assert_allclose(solutions(factor), np.linalg.solve(dense, RIGHT[0]), rtol=1e-9, atol=1e-12)
-
-
 def test_low_rank_terms_keep_double_precision(solver):
     dense, values = matrix(0)
     columns = 1e3 * torch.as_tensor(np.random.default_rng(6).normal(size=(1, NODES, 2)))
@@ -117,6 +90,7 @@ def test_memory_is_given_back_with_the_solver(monkeypatch):
     assert phases == [-1]
 
 
+@pytest.mark.slow
 def test_torch_may_change_its_number_of_threads():
     n, width = 1200, 400
     rows, cols = (index[np.subtract(*np.tril_indices(n)) <= width] for index in np.tril_indices(n))

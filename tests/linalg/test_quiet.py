@@ -1,13 +1,11 @@
 """CHOLMOD's warnings of matrices that are not positive definite do not reach the user."""
 
 import os
-from threading import Barrier, Thread
 
 import numpy as np
 import pytest
 import torch
 
-from warp_resphys.linalg.quiet import without_warnings_of_cholmod
 from warp_resphys.linalg.sparse import SparseSolver
 
 
@@ -22,24 +20,3 @@ def test_an_indefinite_matrix_prints_nothing(capfd):
     print("after", flush=True)
     assert capfd.readouterr().out == "before\nafter\n"
     assert factor.failed.all()
-
-
-def test_output_is_restored_after_threads_that_overlap(capfd):
-    """Two threads begin before either ends; lines of others come at the end."""
-    both = Barrier(2)
-
-    def work(name: bytes) -> None:
-        with without_warnings_of_cholmod():
-            both.wait()
-            os.write(1, b"CHOLMOD warning: not positive definite\n" + name)
-            both.wait()
-
-    threads = [Thread(target=work, args=(name,)) for name in (b"one\n", b"two\n")]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    print("three", flush=True)
-    lines = capfd.readouterr().out.splitlines()
-    assert sorted(lines[:2]) == ["one", "two"]
-    assert lines[2:] == ["three"]

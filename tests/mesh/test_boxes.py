@@ -5,12 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from warp_resphys.experiment.build import build_mesh, finer
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.boxes import boxes_hexahedra
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, check_mesh
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.settings.mesh import BoxesMesh
 
 PLATE, SIDES, FIN = (
     ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),
@@ -24,8 +22,7 @@ def area(mesh):
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
 
 
-@pytest.mark.parametrize("nodes", [8, 20, 27])
-@pytest.mark.parametrize("size", [0.015, 0.007])
+@pytest.mark.parametrize(("size", "nodes"), [(0.007, 8), (0.015, 20), (0.015, 27)])
 def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
     mesh = boxes_hexahedra([PLATE, SIDES, FIN], size, nodes)
     check_mesh(mesh)
@@ -42,12 +39,6 @@ def test_one_box_is_a_box():
     mesh, box = boxes_hexahedra([((0, 0, 0), (0.1, 0.03, 0.03))], 0.01), box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
     np.testing.assert_allclose(mesh.vertices, box.vertices, atol=1e-15)
     np.testing.assert_array_equal(mesh.cells, box.cells)
-
-
-def test_of_a_configuration():
-    config = BoxesMesh(kind="boxes", boxes=[[[0, 0, 0], [0.1, 0.03, 0.03]]], size=0.01)
-    assert len(build_mesh(config).cells) == 90
-    assert len(build_mesh(finer(config, 2.0)).cells) == 720
 
 
 @pytest.mark.parametrize(

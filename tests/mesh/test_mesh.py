@@ -1,10 +1,8 @@
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
-from importlib import resources
 from pathlib import Path
 
 import meshio
@@ -15,7 +13,6 @@ from hypothesis import strategies as st
 
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh import readers
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.mesh import (
     IntArray,
@@ -100,49 +97,12 @@ def test_beam_has_the_vertex_order_of_the_reference_files() -> None:
     assert len(boundary_faces(mesh)) == 2 * (10 * 3 + 10 * 3 + 3 * 3)
 
 
-def test_brick_has_the_node_order_of_vtk() -> None:
-    mesh = box_hexahedra((1, 1, 1), (1, 1, 1))
-    expected = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-    assert mesh.vertices[mesh.cells[0]].tolist() == expected
-
-
-def test_tetrahedra_are_positive_fill_the_box_and_conform() -> None:
-    mesh = box_tetrahedra((0.1, 0.02, 0.03), (4, 2, 3))
-    x = mesh.vertices[mesh.cells]
-    volumes = np.linalg.det(x[:, 1:] - x[:, :1]) / 6
-    np.testing.assert_allclose(volumes, 0.1 * 0.02 * 0.03 / (6 * 4 * 2 * 3), rtol=1e-12)
-    faces = np.sort(mesh.cells[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    faces, counts = np.unique(faces, axis=0, return_counts=True)
-    assert set(counts.tolist()) == {1, 2}
-    outside = {tuple(face) for face in faces[counts == 1].tolist()}
-    assert outside == {tuple(face) for face in np.sort(boundary_faces(mesh), axis=1).tolist()}
-    assert len(outside) == 2 * 2 * (4 * 2 + 2 * 3 + 3 * 4)
-
-
-def test_quadratic_tetrahedra_share_edge_midpoints() -> None:
-    linear = box_tetrahedra(divisions=(5, 2, 2))
-    mesh = quadratic(linear)
-    assert mesh.kind == "tetrahedron10"
-    assert len(mesh.vertices) == 11 * 5 * 5  # midpoints of all bricks' edges, faces and diagonals, each once
-    assert np.array_equal(mesh.vertices[mesh.cells[:, :4]], linear.vertices[linear.cells])
-    for node, ends in zip(range(4, 10), ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)), strict=True):
-        middle = mesh.vertices[mesh.cells[:, ends]].mean(axis=1)
-        np.testing.assert_allclose(mesh.vertices[mesh.cells[:, node]], middle, atol=1e-17)
-    assert np.array_equal(box_tetrahedra(divisions=(5, 2, 2), order=2).cells, mesh.cells)
-
-
-def test_quadratic_faces_hold_the_midpoint_between_consecutive_corners() -> None:
-    mesh = box_tetrahedra(divisions=(2, 1, 2), order=2)
-    x = mesh.vertices[boundary_faces(mesh)]
-    np.testing.assert_allclose(x[:, 3:], (x[:, :3] + x[:, [1, 2, 0]]) / 2, atol=1e-17)
-
-
 @given(
     kind=st.sampled_from(sorted(BOXES)),
     size=st.tuples(*[st.floats(1e-3, 10.0)] * 3),
     divisions=st.tuples(*[st.integers(1, 4)] * 3),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_any_box_is_valid_closed_and_outward(
     kind: str, size: tuple[float, float, float], divisions: tuple[int, int, int]
 ) -> None:
@@ -175,13 +135,13 @@ def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity() -> None
     assert enclosed_volume(mesh) == pytest.approx(cell_volume(mesh), rel=1e-12)
 
 
-@pytest.mark.parametrize("size", [(0.1, 0, 1), (1, -1, 1), (1, np.nan, 1), (1, np.inf, 1), (1, 1), 0.1])
+@pytest.mark.parametrize("size", [(0.1, 0, 1), (1, np.nan, 1), (1, 1), 0.1])
 def test_bad_sizes_are_refused(size: tuple[float, ...]) -> None:
     with pytest.raises(MeshError, match="size of a box must be three positive lengths"):
         box_hexahedra(size)
 
 
-@pytest.mark.parametrize("divisions", [(1, 0, 1), (1, -2, 1), (1, 2.0, 1), (1, 1), 3, (True, True, True)])
+@pytest.mark.parametrize("divisions", [(1, 0, 1), (1, 2.0, 1), (1, 1), (True, True, True)])
 def test_bad_divisions_are_refused(divisions: tuple[int, ...]) -> None:
     with pytest.raises(MeshError, match="divisions of a box must be three positive integers"):
         box_tetrahedra(divisions=divisions)
@@ -241,12 +201,9 @@ TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
     ("broken", "match"),
     [
         (lambda m: Mesh(m.vertices, m.cells[:0]), "empty"),
-        (lambda m: Mesh(m.vertices[:0], m.cells), "empty"),
         (lambda m: with_vertex(m, 5, [0, np.nan, 0]), r"^1 of 176 vertices \(5; .* NaN or infinite"),
-        (lambda m: with_vertex(m, 7, [0, 0, np.inf]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
         (lambda m: with_vertex(m, 7, [0, 0, 1e300]), r"^1 of 176 vertices \(7; .* NaN or infinite"),
         (lambda m: with_cell(m, 3, 1, 176), r"^1 of 90 cells \(3; .* outside 0 to 175"),
-        (lambda m: with_cell(m, 4, 1, -1), r"^1 of 90 cells \(4; .* outside 0 to 175"),
         (lambda m: Mesh(np.vstack([m.vertices, [[1, 1, 1]]]), m.cells), r"^1 of 177 .* \(176; .* no cell"),
         (lambda m: with_cell(m, 8, TURNED, m.cells[8]), r"^1 of 90 cells \(8; .* inverted"),
         (lambda m: Mesh(m.vertices, m.cells[:, TURNED]), r"^90 .* \(0, 1, 2, 3, 4, \.\.\.; .* inverted"),
@@ -257,12 +214,6 @@ def test_broken_meshes_are_refused_by_name(broken: Callable[[Mesh], Mesh], match
     check_mesh(mesh)
     with pytest.raises(MeshError, match=match):
         check_mesh(broken(mesh))
-
-
-def test_inverted_tetrahedron_is_refused() -> None:
-    mesh = box_tetrahedra()
-    with pytest.raises(MeshError, match=r"^1 of 540 cells \(17; .* inverted"):
-        check_mesh(with_cell(mesh, 17, [1, 0, 2, 3], mesh.cells[17]))
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
@@ -300,10 +251,15 @@ def test_crack_between_coincident_vertices_is_refused(gap: float, cracked: bool)
         check_mesh(mesh)
 
 
-@pytest.mark.parametrize("units", ["m", "cm", "mm"])
 @pytest.mark.parametrize(
-    ("kind", "extension"),
-    [(k, e) for k in sorted(BOXES) for e in ("vtk", "vtu", "msh", "inp") if (k, e) != ("hexahedron27", "inp")],
+    ("kind", "extension", "units"),
+    [
+        ("hexahedron", "vtk", "m"),
+        ("tetrahedron", "vtu", "cm"),
+        ("tetrahedron10", "msh", "mm"),
+        ("hexahedron20", "inp", "m"),
+        ("hexahedron27", "msh", "m"),
+    ],
 )
 def test_files_come_back_in_metres(tmp_path: Path, kind: str, extension: str, units: str) -> None:
     mesh = BOXES[kind]((0.1, 0.03, 0.02), (2, 1, 1))
@@ -323,15 +279,6 @@ def test_reading_ignores_surface_cells_joins_blocks_and_keeps_quiet(
     capfd.readouterr()
     assert np.array_equal(read_mesh(path).cells, mesh.cells)
     assert capfd.readouterr() == ("", "")
-
-
-def test_order_two_adds_midpoints_to_linear_files_only(tmp_path: Path) -> None:
-    linear, curved = box_tetrahedra(), box_tetrahedra(order=2)
-    assert np.array_equal(read_mesh(write(tmp_path / "1.vtk", linear), order=2).cells, curved.cells)
-    for order in (1, 2):
-        assert np.array_equal(read_mesh(write(tmp_path / "2.vtk", curved), order=order).cells, curved.cells)
-    bricks = read_mesh(write(tmp_path / "3.vtk", box_hexahedra()), order=2)
-    assert np.array_equal(bricks.cells, box_hexahedra(nodes=27).cells)
 
 
 def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path: Path) -> None:
@@ -368,14 +315,7 @@ def test_files_without_usable_cells_are_refused(tmp_path: Path) -> None:
         read_mesh(surface)
 
 
-def test_file_with_indices_out_of_range_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "box.vtk", Mesh(box_tetrahedra().vertices, box_tetrahedra().cells + 3))
-    for drop in (False, True):
-        with pytest.raises(MeshError, match="outside 0 to 175"):
-            read_mesh(path, drop_unreferenced=drop)
-
-
-BAD_FILES = ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.vtk", "cut.msh", "cut.vtu"]
+BAD_FILES = ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"]
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
@@ -406,6 +346,7 @@ def test_format_that_needs_another_package_names_it(tmp_path: Path, monkeypatch:
         read_mesh(path)
 
 
+@pytest.mark.slow
 def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -420,24 +361,6 @@ def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sent
         read_mesh(path)
 
 
-def test_only_the_meshes_of_the_package_are_read_in_this_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shipped = Path(str(resources.files("warp_resphys"))) / "meshes" / "arm_hexahedra_500.msh"
-    read = []
-    monkeypatch.setattr(readers, "decode", lambda library, path: read.append(path) or decoding.decode(library, path))
-    copied = Path(shutil.copy(shipped, tmp_path))
-    assert np.array_equal(read_mesh(shipped).vertices, read_mesh(copied).vertices)
-    assert read == [copied]
-    mesh = read_mesh(copied)  # not decoded again,
-    assert read == [copied]
-    mesh.vertices[:] = mesh.cells[:] = 0  # whatever is done to what was read,
-    assert np.array_equal(read_mesh(copied).cells, read_mesh(shipped).cells)
-    write(copied, box_tetrahedra())  # until it changes
-    assert len(read_mesh(copied).vertices) == 176
-    assert read == [copied, copied]
-
-
 def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:
     path = write(tmp_path / "box.vtk", box_tetrahedra())
     with pytest.raises(MeshError, match="m, cm, mm, not inch"):
@@ -446,19 +369,7 @@ def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:
         read_mesh(path, order=3)
 
 
-def test_published_arm(shared_data: Path) -> None:
-    """The file of 494 vertices numbers 30 that only its surface cells and points use."""
-    path = shared_data / "sopra_mesh" / "sopra_494.vtk"
-    with pytest.raises(MeshError, match="30 of 494 vertices"):
-        read_mesh(path)
-    mesh = read_mesh(path, drop_unreferenced=True)
-    assert mesh.vertices.shape == (464, 3)
-    assert mesh.cells.shape == (1605, 4)
-    assert is_closed(boundary_triangles(mesh))
-    assert enclosed_volume(mesh) == pytest.approx(cell_volume(mesh), rel=1e-12)
-    assert mesh.vertices[:, 2].min() == pytest.approx(-0.276)
-
-
+@pytest.mark.slow
 def test_importing_the_mesh_modules_leaves_meshio_alone() -> None:
     code = "import sys, warp_resphys.mesh, warp_resphys.mesh.readers; sys.exit('meshio' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

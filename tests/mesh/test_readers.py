@@ -1,6 +1,5 @@
 """Regions of meshes in files."""
 
-import meshio
 import numpy as np
 import pytest
 
@@ -23,13 +22,6 @@ def test_gmsh_files_keep_regions_beside_surfaces(tmp_path, mesh):
     for name, cells in mesh.regions.items():
         np.testing.assert_array_equal(again.region(name), cells)
     assert list(read_surfaces(tmp_path / "two.msh")) == ["end"]
-
-
-def test_cell_sets_are_regions_and_stay_through_refinement_by_midpoints(tmp_path):
-    mesh = box_tetrahedra(divisions=(2, 1, 1))
-    sets = {"tip": [np.array([8, 11])]}
-    meshio.write(tmp_path / "sets.inp", meshio.Mesh(mesh.vertices, [("tetra", mesh.cells)], cell_sets=sets))
-    assert read_mesh(tmp_path / "sets.inp", order=2).region("tip").tolist() == [8, 11]
 
 
 def test_regions_that_cannot_be_are_refused(tmp_path):

@@ -36,14 +36,6 @@ def test_outline_of_a_disc():
         assert (gradient * outwards).sum(1).min() > 0.9
 
 
-def test_distance_grows_beyond_the_picture():
-    outline = Outline.of_mask(disc())
-    points = np.array([[101.2, -300.0], [500.0, 79.6]])
-    distance, gradient = outline.signed(points)
-    assert distance == pytest.approx([300.0 + 79.6 - RADIUS, 500.0 - 101.2 - RADIUS], abs=1.0)
-    assert gradient == pytest.approx(np.array([[0.0, -1.0], [1.0, 0.0]]), abs=0.05)
-
-
 def test_borders_of_the_picture_are_no_outline():
     cut = Outline.of_mask(disc(middle=np.array([101.2, 5.0])))
     assert cut.points[:, 1].min() > 1.0

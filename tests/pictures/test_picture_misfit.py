@@ -92,30 +92,6 @@ def test_parameters_come_back(seen, kind):
         assert difference.outline_px == pytest.approx(difference.outline_mm * 0.7 / 0.31, rel=0.1)
 
 
-def test_deviations_are_those_of_repeated_pictures():
-    """Of outlines with a pixel of noise, whose two directions see the same noise."""
-    seen, _ = pose()
-    region = seen.surface.region(CAMERA.pixels(seen.shape(TRUTH), PlacedCamera.corrections(TRUTH)).numpy())
-    ranges = {"youngs_modulus": RANGES["youngs_modulus"], "camera_shift_1": Bounds(-0.02, 0.02)}
-    known = {name: value for name, value in TRUTH.items() if name not in ranges}
-    first, found, said = {name: TRUTH[name] for name in ranges}, [], []
-    for seed in range(16):
-        mask = noisy_mask(region, SIZE[::-1], 1.0, np.random.default_rng(seed))
-        own = replace(seen, photos=(replace(seen.photos[0], outline=Outline.of_mask(mask)),))
-        result = ParameterSearch(PictureMisfit([own], ranges, known)).run([first], 8)
-        found.append(np.log(result.parameters["youngs_modulus"]))
-        said.append(result.uncertainty.deviation["youngs_modulus"] / result.parameters["youngs_modulus"])
-    assert 0.5 < np.std(found, ddof=1) / np.mean(said) < 1.4
-    assert abs(np.mean(found) - np.log(TRUTH["youngs_modulus"])) < 0.02
-    # Copies of a picture, or others of the body at rest by the same camera, say no more than one.
-    thrice = replace(own, photos=3 * own.photos)
-    again = ParameterSearch(PictureMisfit([thrice], ranges, known)).run([first], 8)
-    assert again.parameters["youngs_modulus"] == pytest.approx(result.parameters["youngs_modulus"], rel=1e-6)
-    assert again.uncertainty.deviation["youngs_modulus"] == pytest.approx(
-        result.uncertainty.deviation["youngs_modulus"], rel=0.02
-    )
-
-
 def test_a_body_beside_the_picture_is_named():
     seen, _ = pose()
     with pytest.raises(InputError, match="0 does not show the simulated body where it is drawn"):
@@ -132,15 +108,6 @@ def test_a_step_that_moves_the_body_out_of_the_picture_has_failed(seen):
     again = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
     points = np.stack([again.to_unit({"camera_shift_1": shift}) for shift in (0.5, 0.003)])
     assert np.isfinite(again.losses_or_infinite(points)).tolist() == [False, True]
-
-
-def test_an_obstacle_before_the_body_hardly_matters():
-    """A rod that hides a part of the beam, as wide as the beam is thick."""
-    seen, mask = pose()
-    mask[60:200, 200:222] = False
-    photo = replace(seen.photos[0], outline=Outline.of_mask(mask))
-    result = ParameterSearch(PictureMisfit([replace(seen, photos=(photo,))], RANGES)).run([FIRST], 30)
-    assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.15)
 
 
 def test_values_belong_to_all_to_a_material_or_to_a_pose(seen):
@@ -174,14 +141,33 @@ def test_a_turned_clamp_twists_the_body():
     assert torch.allclose(again, q, atol=1e-7)
 
 
-def test_a_picture_shows_something(seen):
-    empty = replace(seen, photos=(Photo("0", CAMERA),))
-    with pytest.raises(InputError, match="has neither an outline, tracked points nor a cloud"):
-        PictureMisfit([empty], RANGES)
-
-
 def test_a_pose_has_pictures_and_places_of_its_points(seen):
     with pytest.raises(InputError, match="has no picture"):
         replace(seen, photos=())
     with pytest.raises(InputError, match="places on the body are not known"):
         replace(seen, points=None)
+
+
+@pytest.mark.slow
+def test_deviations_are_those_of_repeated_pictures():
+    """Of outlines with a pixel of noise, whose two directions see the same noise."""
+    seen, _ = pose()
+    region = seen.surface.region(CAMERA.pixels(seen.shape(TRUTH), PlacedCamera.corrections(TRUTH)).numpy())
+    ranges = {"youngs_modulus": RANGES["youngs_modulus"], "camera_shift_1": Bounds(-0.02, 0.02)}
+    known = {name: value for name, value in TRUTH.items() if name not in ranges}
+    first, found, said = {name: TRUTH[name] for name in ranges}, [], []
+    for seed in range(12):
+        mask = noisy_mask(region, SIZE[::-1], 1.0, np.random.default_rng(seed))
+        own = replace(seen, photos=(replace(seen.photos[0], outline=Outline.of_mask(mask)),))
+        result = ParameterSearch(PictureMisfit([own], ranges, known)).run([first], 8)
+        found.append(np.log(result.parameters["youngs_modulus"]))
+        said.append(result.uncertainty.deviation["youngs_modulus"] / result.parameters["youngs_modulus"])
+    assert 0.5 < np.std(found, ddof=1) / np.mean(said) < 1.4
+    assert abs(np.mean(found) - np.log(TRUTH["youngs_modulus"])) < 0.02
+    # Copies of a picture, or others of the body at rest by the same camera, say no more than one.
+    thrice = replace(own, photos=3 * own.photos)
+    again = ParameterSearch(PictureMisfit([thrice], ranges, known)).run([first], 8)
+    assert again.parameters["youngs_modulus"] == pytest.approx(result.parameters["youngs_modulus"], rel=1e-6)
+    assert again.uncertainty.deviation["youngs_modulus"] == pytest.approx(
+        result.uncertainty.deviation["youngs_modulus"], rel=0.02
+    )

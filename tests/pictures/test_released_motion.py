@@ -105,32 +105,6 @@ def test_rows_are_exposed_at_their_own_times():
     assert not still.any()
 
 
-def test_rows_below_twice_the_principal_point_have_their_own_times():
-    """A point that moves down the picture, in closed form: y = y0 + w t at t = begin + r y; and the end of a motion."""
-    matrix = torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 100.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    camera, row_time, step = replace(CAMERA, lens=Lens(matrix)), 1e-4, 0.005
-    z = 0.01 - 0.3 / 700.0 * (700.0 + 2000.0 * step * torch.arange(60.0, dtype=torch.float64))  # row 800 + 2000 t
-    series = torch.stack([torch.full_like(z, 0.05), 0.0 * z, z], -1)[None, :, None]
-
-    def pixels(points):
-        return camera.pixels(points, PlacedCamera.corrections({}))
-
-    assert float(pixels(series[0])[0, 0, 1]) == pytest.approx(800.0 - 0.01 * 700.0 / 0.3)
-    places, velocities = at_own_times(series, 0.01, row_time, step, pixels)
-    exact = (800.0 - 0.01 * 700.0 / 0.3 + 2000.0 * 0.01) / (1.0 - 2000.0 * row_time)
-    assert float(pixels(places[0])[0, 1]) == pytest.approx(exact, abs=1e-6)
-    assert float(velocities[0, 2]) == pytest.approx(-2000.0 * 0.3 / 700.0)
-    photo = Photo("0", camera, time=0.1, row_time=row_time)
-    assert photo.last == pytest.approx(0.12)
-    seen = (
-        {"rows": 1080.0},
-        {"tracked": np.array([[5.0, 1080.0], [np.nan, np.nan]])},
-        {"outline": Outline.of_mask(np.pad(np.ones((40, 20), bool), ((1000, 40), (9, 9))))},
-        {"cloud": Cloud(np.array([[5.0, 1080.0, 0.3]]))},
-    )
-    assert [replace(photo, **own).last for own in seen] == pytest.approx([0.208] * 4)
-
-
 def with_depths(pose):
     """The pose seen by a depth camera alone: points of its side, 2 mm before it."""
     shape, corrections, photos = pose.shape(TRUTH), PlacedCamera.corrections(TRUTH), []
@@ -177,23 +151,6 @@ def test_stiffness_density_damping_and_release_come_back(seen):
     at_once = search(replace(seen, photos=tuple(replace(photo, row_time=0.0) for photo in seen.photos)), ranges)
     assert at_once.loss > 10.0 * result.loss
     assert TRUTH["release_delay"] - at_once.parameters["release_delay"] == pytest.approx(9e-3, abs=2e-3)
-
-
-def test_a_force_that_is_not_known_comes_back(seen):
-    """With a known density: what the body weighs is seen beside what holds it."""
-    ranges = {name: RANGES[name] for name in ("youngs_modulus", "release_force_3", "release_delay")}
-    result = search(seen, ranges)
-    assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.01)
-    assert result.parameters["release_force_3"] == pytest.approx(TRUTH["release_force_3"], abs=1e-3)
-
-
-def test_tracked_points_of_a_motion_are_one_series(seen):
-    """As correlated errors of successive frames count: one set of residuals with a row for each frame."""
-    misfit = PictureMisfit([seen], RANGES)
-    ((rows, jacobian, count),) = misfit.linearise(misfit.to_unit(FIRST)).trials
-    assert rows.shape == (len(seen.photos), 6)
-    assert jacobian.shape == (rows.size, len(RANGES))
-    assert count == rows.size
 
 
 def test_what_cannot_be_released_is_named(seen):

@@ -30,7 +30,7 @@ def picture(camera):
     return draw_tag(np.full((500, 660, 3), 60, dtype=np.uint8), camera, MATRIX, PLACE, RIGHT, UP, SIZE, 7)
 
 
-@pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1), (-0.3, -0.7, 0.0)])
+@pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1)])
 def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
     camera = pose(turn)
     tag = Tag("4x4_50", 7, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))

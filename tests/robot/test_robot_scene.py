@@ -7,7 +7,6 @@ import torch
 import warp_resphys
 from support.configured import settings
 from warp_resphys import Body, Corotated, RobotScene, SurfaceContact, box_hexahedra
-from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
@@ -99,30 +98,6 @@ def test_gradient_of_a_push_through_contact():
     assert float(slope) == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_base_moves_beside_an_object_that_is_fixed():
-    robot, block = beam(), box_hexahedra((0.02, 0.02, 0.02), (1, 1, 1))
-    moved = warp_resphys.Mesh(block.vertices + [0.0, 0.5, 0.0], block.cells)
-    scene = RobotScene({"one": (robot, AWAY)}, {"block": (Body(moved, fixed=[0, 1, 2, 3]), Corotated(2e5, 0.4))})
-    state = scene.step(scene.begin(), {"one": {"base": [1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]}})
-    way = (state.body.q[0] - scene.simulator.rest_positions).abs()
-    fixed = scene.simulator.fixed
-    assert float(way[fixed[: len(robot.simulator.fixed)]].amax(0)[0]) == pytest.approx(1e-3)
-    assert float(way[fixed[len(robot.simulator.fixed) :]].max()) < 1e-12
-
-
-def test_a_lost_environment_stands_at_rest():
-    """A force for which a solve has too few iterations, in one of two environments whose robots count failures."""
-    robot = Robot(beam("solver.max_iterations=6").description, on_failure="count")
-    scene, rest = RobotScene({"one": (robot, AWAY)}), robot.simulator.rest_positions
-    force = torch.stack([0.0 * rest, tip_force(robot, 0.0, 0.0, 300.0)])
-    state = scene.begin(2)
-    for _ in range(3):
-        state = scene.step(state, {"one": {"external_force": force}})
-    assert state.lost.tolist() == state.robots["one"].lost.tolist() == [False, True]
-    assert torch.equal(state.body.q[1], rest)
-    assert float((state.body.q[0] - rest).abs().max()) > 1e-5
-
-
 def test_what_does_not_fit_is_refused(finished):
     robot = beam()
     with pytest.raises(InputError, match="gravity of one is"):
@@ -146,21 +121,3 @@ def test_what_does_not_fit_is_refused(finished):
         scene.begin(inputs={"hand": {}})
     with pytest.raises(InputError, match=r"surfaces cross at rest: an edge at vertex \d+ in 'one' .* in 'two'"):
         RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
-
-
-def test_an_identified_tilt_of_gravity_counts():
-    robot = beam().with_parameters(gravity_tilt_1=0.2)
-    scene = RobotScene({"one": (robot, AWAY)})
-    start = state = scene.begin()
-    for _ in range(5):
-        state = scene.step(state)
-    torch.testing.assert_close(state.body.q, start.body.q, rtol=0.0, atol=1e-8)
-
-
-def test_a_turned_robot_with_fibres_is_refused(monkeypatch):
-    robot = beam()
-    family = FibreFamily(0.0, 0.0, tension=1e4)
-    wound = ConvexMaterial(4e4, bulk_1=4e6, density=1000.0, fibres=[family])
-    monkeypatch.setitem(robot.simulator.__dict__, "material", wound)
-    with pytest.raises(InputError, match="has fibres"):
-        RobotScene({"one": (robot, POSE)})

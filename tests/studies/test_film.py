@@ -40,9 +40,7 @@ def test_a_command_makes_it(finished, folder, can_draw):
     [
         (["trial=80 g"], "the trial is '80 g': "),
         (["models=[teapot]"], "models names teapot: choose some of "),
-        (["models=[]"], "models names none: choose some of "),
         (["slower=0"], "slower is 0: "),
-        (["run=nowhere"], "nowhere"),
         (["motion=eight_4s"], "no motion was driven in "),
     ],
 )
@@ -52,11 +50,3 @@ def test_what_cannot_be_filmed_is_said(finished, folder, change, said):
     assert err.startswith("error: ")
     assert said in err
     assert err.count("\n") == 1
-
-
-def test_folders_of_runs_need_no_quotes(folder):
-    name = "runs/budget=quick,seed=2"
-    for argument in (f"run={name}", f"run='{name}'"):
-        code, err = end_of(cli.main, "warp-resphys", "view", "film", argument)
-        assert code == 2
-        assert err.startswith(f"error: {name}")

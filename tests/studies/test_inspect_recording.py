@@ -8,7 +8,6 @@ from matplotlib.colors import to_rgb
 from support.command_line import refusal, settings_of
 from warp_resphys.data.recordings.arrays import write_recording
 from warp_resphys.data.recordings.quality import quality
-from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
@@ -100,10 +99,8 @@ def test_files_are_told_by_their_ends():
     ("overrides", "message"),
     [
         (["still=base 1"], "still is 'base 1': it must be a list"),
-        (["least_jump=small"], "least_jump is 'small': it must be a number"),
         (["longest_gap=-1"], "longest_gap is -1"),
         (["recording.rate=fast"], "recording.rate is 'fast'"),
-        (["recording.labels=a"], "recording.labels is 'a'"),
         (["compare_with=[a.h5]"], "compare_with needs two or more markers"),
     ],
 )
@@ -116,11 +113,3 @@ def test_command_ends_with_one_sentence(folder, path):
     sentence = refusal("inspect", path, "still=[foot]")
     assert sentence.startswith(f"error: {path} has no marker named 'foot'; it has 'tip'")
     assert sentence.count("\n") == 1
-
-
-def test_beam_recording(tmp_path, shared_data):
-    path = shared_data / "beam_mocap" / "beam_load101_V2_a.c3d"
-    moving = [label for label in read_recording(path).labels if label.startswith("Tip")]
-    config = configured(f"recording.path={path}", "still=[Base - 1,Base - 2,Base - 3]")
-    text = inspect_recording(config.changed(moving=moving), tmp_path)
-    assert "Base - 1 jumps 15 times, farthest by 1.22 mm, in frame 61." in text

@@ -7,8 +7,6 @@ import time
 import numpy as np
 import pytest
 
-from support.main_job import end_of
-from warp_resphys import cli
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load, recorded_trial
 from warp_resphys.robot.twin.stream import Packet
@@ -97,24 +95,3 @@ def test_its_page_shows_the_estimate_and_what_comes(robot):
         assert _summary(live)[0].startswith("an estimate for a packet in ")
     finally:
         server.stop()
-
-
-def test_a_trial_and_a_source_are_not_both_given(finished):
-    pytest.importorskip("viser")
-    run = f"run={finished[0]}"
-    code, err = end_of(cli.main, "warp-resphys", "view", run, "source=150 g", "trial=150 g", "port=0", "seconds=1")
-    assert code == 2
-    assert "trial and source are both given" in err
-
-
-def test_a_summary_says_why_no_packet_was_taken(robot):
-    live = LiveTwin(robot, "udp://127.0.0.1:0", SETTINGS)
-    host, port = live.address.removeprefix("udp://").split(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.sendto(b'{"time": 1, "markers": {"vertex_0": [1000, 0, 0]}}', (host, int(port)))
-    until_time = time.monotonic() + 20.0
-    while len(live.words) < 2 and time.monotonic() < until_time:
-        live.step()
-    live.close()
-    assert _summary(live)[0] == "no frames"
-    assert any("give positions in metres" in line for line in _summary(live))

@@ -8,10 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from ..settings.run import RunSettings
-from .figures import TONES, FloatArray, in_style, new_figure, use_logarithm
+from .figures import marker_boxes
 from .page import (
     NO_BREAK_SPACE,
     Canvas,
@@ -72,10 +71,12 @@ def write_ablation_report(
             "published."
         )
     how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
+    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
+    alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
     body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
     with figures_beside(path) as folder:
-        draw = partial(marker_boxes, box_errors(metrics), uncorrected)
-        figure = Canvas(folder).figure("marker_ablation", draw, describe_boxes(metrics), caption)
+        draw = partial(marker_boxes, {row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
+        figure = Canvas(folder).figure("marker_ablation", draw, alt, caption)
     write_page(
         path,
         [
@@ -119,41 +120,3 @@ def _markers_below(rows: Sequence[Mapping[str, Any]], key: str, threshold: float
     """The smallest number of markers from which on a value stays below a threshold."""
     above = [int(row["markers"]) for row in rows if not row[key] < threshold]
     return min((int(row["markers"]) for row in rows if int(row["markers"]) > max(above, default=0)), default=None)
-
-
-def box_errors(metrics: Mapping[str, Any]) -> dict[int, FloatArray]:
-    """Return the errors [mm] of all draws by number of markers."""
-    return {int(row["markers"]): np.array(row["errors_mm"]) for row in metrics["by_markers"]}
-
-
-def describe_boxes(metrics: Mapping[str, Any]) -> str:
-    """Return a description of the box plot, with its medians."""
-    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in metrics["by_markers"])
-    return f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
-
-
-@in_style()
-def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
-    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
-
-    Args:
-        errors: (D,) errors [mm] of the draws, by number of markers.
-        uncorrected: Error without any correction [mm].
-    """
-    ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
-    grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
-    figure = new_figure(3.6)
-    axes, count = figure.subplots(), len(errors)
-    lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
-    axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
-    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
-    place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
-    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
-    axes.set_xlim(0.5, count + 0.5)
-    axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
-    axes.set_yscale("log")
-    axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
-    use_logarithm(axes)
-    axes.grid(visible=False, axis="x")
-    axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
-    return figure

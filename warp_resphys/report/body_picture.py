@@ -122,7 +122,8 @@ def draw_mesh(
 def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, renderer: Renderer | None = None) -> None:
     """Draw the translucent body, its measured markers on stems, and rings at their nominal positions, from two sides.
 
-    Lines connect rings with the markers outside of them, whose names and residuals are written beside them.
+    Lines connect rings with the markers outside of them. Names and residuals of these markers, and of those that were
+    left out of the fit, are written beside them.
 
     Args:
         path: The PNG file to write.
@@ -143,7 +144,8 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
     half = np.max([own for _, own in frames], axis=0)
     half = np.maximum(half, _NARROWEST * half.max())
     size = picture_size(half, _LONGER_SIDE)
-    away = np.linalg.norm(markers - recordings.nominal, axis=1) > _RING * radius  # Not those that were not seen.
+    seen = np.isfinite(markers).all(axis=1)
+    away = seen & (np.linalg.norm(markers - recordings.nominal, axis=1) > _RING * radius)
     layers = _registered(recordings, fixed, away, radius, max(1.0, size[1] / 900.0))
     views = [View(layers, axes, focus, half[1]) for axes, (focus, _) in zip(turned, frames, strict=True)]
     ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
@@ -156,7 +158,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
     figure = _with_titles(picture, list(_SIDES), handles)
     for at, (axes, (focus, _)) in enumerate(zip(turned, frames, strict=True)):
         across, up = ((markers - focus) @ axes[:2].T).T / half[1] * (0.5 * size[1])  # [px] from the middle.
-        for marker in np.flatnonzero(away):
+        for marker in np.flatnonzero(away | (seen & np.isin(recordings.labels, recordings.outliers))):
             place: Any = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
             name = f"{recordings.labels[marker]}: {recordings.residual_mm[marker]:.2f} mm"
             name += ", left out" * (recordings.labels[marker] in recordings.outliers)
@@ -180,7 +182,7 @@ def _registered(recordings: Recordings, fixed: IntArray, away: FloatArray, radiu
     q, triangles, seen = mesh.vertices, boundary_triangles(mesh), np.isfinite(markers).all(axis=1)
     layers = [
         Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28)),
-        Layer("lines", q, face_edges(mesh), INK, opacity=0.22, size=line),
+        Layer("lines", q, face_edges(mesh), INK, opacity=0.22, size=line, shift=0.1 * radius),
         Layer("rings", nominal, None, NOMINAL, size=_RING * radius, shift=4.0 * radius),
     ]
     if len(sharp := sharp_edges(q, triangles)):

@@ -176,6 +176,33 @@ def mean_of_trials(rows: FloatArray) -> FloatArray:
     return mean
 
 
+@in_style()
+def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
+    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+
+    Args:
+        errors: (D,) errors [mm] of the draws, by number of markers.
+        uncorrected: Error without any correction [mm].
+    """
+    ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
+    grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
+    figure = new_figure(3.6)
+    axes, count = figure.subplots(), len(errors)
+    lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
+    axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
+    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
+    place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
+    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
+    axes.set_xlim(0.5, count + 0.5)
+    axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
+    axes.set_yscale("log")
+    axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
+    use_logarithm(axes)
+    axes.grid(visible=False, axis="x")
+    axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+    return figure
+
+
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure with a white background."""
     figure.savefig(path, format="png", dpi=200, facecolor="white")

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from .figures import LABELS, TONES, FloatArray, in_style, new_figure, positive, use_logarithm
+from .page import number_text
 
 _KILO: Final = 1e-3
 _POINTS: Final = 81
@@ -101,7 +102,7 @@ def _rollout_curve(axes: Axes, epochs: FloatArray, errors: FloatArray) -> None:
     if np.isfinite(errors).any():
         best = int(np.nanargmin(errors))
         axes.plot(epochs[best], errors[best], "o", color=TONES["simulation"].light, markersize=5)
-        axes.set_title(f"lowest: {errors[best]:.2g} mm, epoch {epochs[best]:.0f}", loc="right")
+        axes.set_title(f"lowest: {number_text(errors[best])} mm, epoch {epochs[best]:.0f}", loc="right")
 
 
 def drawn_stretches(ranges: Mapping[str, tuple[float, float]]) -> FloatArray:

@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import json
-import re
 import signal
 from collections import Counter
 from pathlib import Path
@@ -88,13 +87,6 @@ def test_the_table_is_that_of_the_stored_distances(finished):
     row = rows(finished)[0]
     assert row["median_mm"] == pytest.approx(np.median(mean[0]))
     assert row["interquartile_range_mm"] == pytest.approx(np.subtract(*np.quantile(mean[0], [0.75, 0.25])))
-
-
-def test_the_report_is_self_contained(finished):
-    page = (finished / "report.html").read_text()
-    assert not re.search(r"""<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)\s*=\s*["'](?!data:)""", page)
-    assert "Box plot" in page
-    assert (finished / "figures" / "marker_ablation.png").is_file()
 
 
 @pytest.mark.slow

@@ -87,18 +87,6 @@ def test_a_fold_that_fails_is_named_and_the_others_are_kept(tmp_path):
     assert written(tmp_path).keys() == set("abcd")
 
 
-def test_the_last_fold_that_is_left_has_all_processes(tmp_path, monkeypatch):
-    run_folds(folds(tmp_path, "abc"), Workers(1))
-    asked = []
-
-    def stages_for(workers):
-        asked.append(workers)
-        return stages("d", False, 0.0, workers)
-
-    run_folds({**folds(tmp_path, "abc"), "d": Fold("d", tmp_path / "fold_d", stages_for)}, Workers(4))
-    assert asked[-1] == Workers(4)
-
-
 @pytest.mark.slow
 def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path, monkeypatch):
     program = f"""if __name__ == "__main__":

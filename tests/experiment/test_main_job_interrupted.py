@@ -1,17 +1,13 @@
 """The main job, interrupted and killed: what it keeps, and how it goes on."""
 
-import os
 import signal
-import subprocess
-import sys
-import time
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.main_job import IN_RUN, REPOSITORY, TINY, errors, run, same_errors
+from support.main_job import IN_RUN, TINY, errors, run, same_errors
 from warp_resphys.experiment.parts import PartRollout
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.learning.reconstruction import LBFGSB
@@ -95,14 +91,3 @@ class TestInterruption:
         assert run(*arguments)[0] == 0
         with read_hdf5("run/reconstruction_resphys.h5", "reconstruction") as file:
             np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
-
-    def test_killed_without_warning(self, finished, folder):
-        program = "from warp_resphys.cli import main\nmain()"
-        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-        child = subprocess.Popen([sys.executable, "-c", program, *TINY, IN_RUN], env=environment)
-        while not Path("run/dataset.h5").exists() and child.poll() is None:
-            time.sleep(0.002)
-        child.kill()
-        assert child.wait(timeout=60) == -signal.SIGKILL
-        assert run(*TINY, IN_RUN)[0] == 0
-        same_errors(errors(), errors(finished[0]))

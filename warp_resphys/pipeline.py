@@ -49,13 +49,13 @@ from .experiment.files import (
 from .experiment.folds import Fold, run_folds
 from .experiment.identify import identify
 from .experiment.identify_law import identify_law
-from .experiment.importing import import_recordings, import_scaled
 from .experiment.laboratory import run_laboratory
 from .experiment.learn import train
 from .experiment.models import SIMFREE
 from .experiment.parts import workers_for
 from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.reconstruct import reconstruct
+from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
@@ -292,7 +292,7 @@ def prepare(run: RunSettings) -> None:
     if run.pictures is None:
         check_run(run)
     else:
-        from .experiment.pictures import check_pictures
+        from .experiment.pictures.stages import check_pictures
 
         check_pictures(run)
 
@@ -313,7 +313,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     """
     prepare(run)
     if run.pictures is not None:
-        from .experiment.pictures import picture_stages, print_pictures
+        from .experiment.pictures.stages import picture_stages, print_pictures
 
         run_stages(picture_stages(run, files_read(run, run)), folder)
         print_pictures(run, folder)

@@ -17,8 +17,8 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
-from warp_resphys.experiment.importing import import_recordings, sessions_text
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
+from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5

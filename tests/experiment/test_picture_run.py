@@ -16,8 +16,8 @@ from support.configured import composed, settings
 from support.main_job import IN_RUN
 from support.tags import draw_tag
 from warp_resphys.energies.law_files import read_law
-from warp_resphys.experiment.picture_laboratory import noisy_mask
-from warp_resphys.experiment.pictures import picture_stages
+from warp_resphys.experiment.pictures.laboratory import noisy_mask
+from warp_resphys.experiment.pictures.stages import picture_stages
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5
 from warp_resphys.io.settings import parse

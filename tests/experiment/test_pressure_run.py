@@ -24,8 +24,8 @@ from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.files import Dataset
-from warp_resphys.experiment.importing import import_recordings
 from warp_resphys.experiment.reconstruct import replayed_errors
+from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import InputError, ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5
 from warp_resphys.io.settings import parse

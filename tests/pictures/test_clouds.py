@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens
-from warp_resphys.experiment.picture_laboratory import depth_image
+from warp_resphys.experiment.pictures.laboratory import depth_image
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of

@@ -10,7 +10,7 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens
-from warp_resphys.experiment.picture_laboratory import noisy_mask
+from warp_resphys.experiment.pictures.laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import ParameterSearch

@@ -36,7 +36,7 @@ from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
-from .reading import vertical
+from .recordings.reading import vertical
 from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of, substeps_of, target_settings
 
 FloatArray = NDArray[np.float64]

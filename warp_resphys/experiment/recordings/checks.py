@@ -5,22 +5,22 @@ from itertools import combinations
 
 import numpy as np
 
-from ..data.markers import follow_vertices
-from ..data.registration import axes_rotation
-from ..data.rigid_bodies import owners
-from ..fem.body import Body
-from ..io.errors import InputError, listed, naming, number_of
-from ..mesh.mesh import select_vertices
-from ..settings.run import RunSettings
-from ..settings.stages import PlayedSettings
-from ..settings.trials import MarkerSettings, RecordedData, Trial
-from .actuators import Drive, drive_of
-from .build import build_material, marker_view_of, mounted_on
-from .files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
-from .laboratory import input_sequences
+from ...data.markers import follow_vertices
+from ...data.registration import axes_rotation
+from ...data.rigid_bodies import owners
+from ...fem.body import Body
+from ...io.errors import InputError, listed, naming, number_of
+from ...mesh.mesh import select_vertices
+from ...settings.run import RunSettings
+from ...settings.stages import PlayedSettings
+from ...settings.trials import MarkerSettings, RecordedData, Trial
+from ..actuators import Drive, drive_of
+from ..build import build_material, marker_view_of, mounted_on
+from ..files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
+from ..laboratory import input_sequences
+from ..simulate import substeps_of
+from ..trials import all_trials, folds_of, split_of, trials_of
 from .reading import standing_enough
-from .simulate import substeps_of
-from .trials import all_trials, folds_of, split_of, trials_of
 
 
 def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body) -> None:

@@ -7,16 +7,16 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..data.markers import bind_markers
-from ..io.atomic import atomic_path
-from ..io.files import write_json
-from ..io.stages import StageContext
-from ..pictures.camera import PlacedCamera
-from ..pictures.outlines import ClosedSurface
-from ..pictures.seen import Photo, SeenPose
-from ..settings.pictures import PictureData, PoseSettings, SimulatedCamera
-from ..settings.stages import PictureStage
-from .build import build_body, build_simulator
+from ...data.markers import bind_markers
+from ...io.atomic import atomic_path
+from ...io.files import write_json
+from ...io.stages import StageContext
+from ...pictures.camera import PlacedCamera
+from ...pictures.outlines import ClosedSurface
+from ...pictures.seen import Photo, SeenPose
+from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera
+from ...settings.stages import PictureStage
+from ..build import build_body, build_simulator
 from .seen_poses import read_lenses, released_force, scene_file
 
 FloatArray = NDArray[np.float64]

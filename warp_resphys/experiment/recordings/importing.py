@@ -13,24 +13,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.actuation import NO_INPUT
-from ..data.base_motion import at_times, check_steps
-from ..data.recordings.processing import smooth
-from ..data.recordings.quality import quality
-from ..data.registration import Registration
-from ..data.rigid import root_mean_square
-from ..data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
-from ..io.errors import DataFileError, InputError, number_of
-from ..io.files import write_json
-from ..io.stages import StageContext
-from ..settings.stages import ImportStage
-from ..settings.trials import ReadingSettings, Trial
-from .actuators import Drive
-from .build import bound_markers
-from .files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
+from ...data.actuation import NO_INPUT
+from ...data.base_motion import at_times, check_steps
+from ...data.recordings.processing import smooth
+from ...data.recordings.quality import quality
+from ...data.registration import Registration
+from ...data.rigid import root_mean_square
+from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
+from ...io.errors import DataFileError, InputError, number_of
+from ...io.files import write_json
+from ...io.stages import StageContext
+from ...settings.stages import ImportStage
+from ...settings.trials import ReadingSettings, Trial
+from ..actuators import Drive
+from ..build import bound_markers
+from ..files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
+from ..trials import evenly
 from .observing import Observed, Observer
 from .reading import vertical
-from .trials import evenly
 
 log = logging.getLogger(__name__)
 

@@ -17,28 +17,28 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from ..energies.law_files import LAW_FORMAT, unit_of
-from ..io.errors import InputError
-from ..io.files import atomic_hdf5, create, read_json, write_json
-from ..io.progress import Progress
-from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..learning.bounds import Bounds
-from ..learning.identification import ParameterSearch
-from ..learning.parameters import TILTS, configured_parameters, own_name, split_name
-from ..pictures.camera import CORRECTIONS, PlacedCamera
-from ..pictures.misfit import PictureMisfit, values_of
-from ..pictures.motion import OF_RELEASE
-from ..pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
-from ..report.identification_section import parameter_rows
-from ..report.page import NONE, number_text
-from ..report.pictures_page import PictureResult, picture_verdict, write_pictures_report
-from ..settings.pictures import PictureData, PoseSettings
-from ..settings.run import RunSettings
-from ..settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
-from .build import build_mesh, simulation_device
-from .files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
-from .identify import Checkpoint, bounds_of, search_parameters
-from .picture_laboratory import frame_files, play_camera
+from ...energies.law_files import LAW_FORMAT, unit_of
+from ...io.errors import InputError
+from ...io.files import atomic_hdf5, create, read_json, write_json
+from ...io.progress import Progress
+from ...io.stages import Stage, StageContext, package_versions, resources_used
+from ...learning.bounds import Bounds
+from ...learning.identification import ParameterSearch
+from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
+from ...pictures.camera import CORRECTIONS, PlacedCamera
+from ...pictures.misfit import PictureMisfit, values_of
+from ...pictures.motion import OF_RELEASE
+from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
+from ...report.identification_section import parameter_rows
+from ...report.page import NONE, number_text
+from ...report.pictures_page import PictureResult, picture_verdict, write_pictures_report
+from ...settings.pictures import PictureData, PoseSettings
+from ...settings.run import RunSettings
+from ...settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
+from ..build import build_mesh, simulation_device
+from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
+from ..identify import Checkpoint, bounds_of, search_parameters
+from .laboratory import frame_files, play_camera
 from .seen_poses import (
     PICTURES,
     SCENE,

@@ -8,25 +8,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.actuation import NO_INPUT, check_inputs
-from ..data.base_motion import followed, in_frame, prescribed, rigid
-from ..data.marker_view import MarkerView
-from ..data.obstacle_motion import configured, prescribed_all
-from ..data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
-from ..data.recordings.quality import check_base, check_motion
-from ..data.recordings.recording import Recording
-from ..data.recordings.release import Release, valve_opening
-from ..data.registration import Registration, register_markers
-from ..data.rigid import RigidTransform
-from ..data.rigid_bodies import corners_of, owners
-from ..dynamics.simulator import Simulator
-from ..io.errors import DataFileError, listed
-from ..io.stages import StageContext
-from ..settings.stages import ImportStage
-from ..settings.trials import BaseMotion, MotionSettings, Trial
-from .actuators import Drive, drive_of
-from .build import build_simulator
-from .files import SLACK, STATIC, UNDER_INPUTS
+from ...data.actuation import NO_INPUT, check_inputs
+from ...data.base_motion import followed, in_frame, prescribed, rigid
+from ...data.marker_view import MarkerView
+from ...data.obstacle_motion import configured, prescribed_all
+from ...data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
+from ...data.recordings.quality import check_base, check_motion
+from ...data.recordings.recording import Recording
+from ...data.recordings.release import Release, valve_opening
+from ...data.registration import Registration, register_markers
+from ...data.rigid import RigidTransform
+from ...data.rigid_bodies import corners_of, owners
+from ...dynamics.simulator import Simulator
+from ...io.errors import DataFileError, listed
+from ...io.stages import StageContext
+from ...settings.stages import ImportStage
+from ...settings.trials import BaseMotion, MotionSettings, Trial
+from ..actuators import Drive, drive_of
+from ..build import build_simulator
+from ..files import SLACK, STATIC, UNDER_INPUTS
 from .reading import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)

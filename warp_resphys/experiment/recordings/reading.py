@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.assignment import assign
-from ..data.marker_view import MarkerView
-from ..data.obstacle_motion import recorded
-from ..data.recordings.bag import Bag
-from ..data.recordings.quality import check_passive
-from ..data.recordings.reading import read_recording
-from ..data.recordings.recording import Recording
-from ..data.recordings.text import Table
-from ..data.registration import axes_rotation
-from ..data.rigid_bodies import corners_of, motion_between, owners, with_corners
-from ..dynamics.simulator import Simulator
-from ..io.errors import DataFileError, InputError, listed
-from ..settings.stages import ImportStage
-from ..settings.trials import ReadingSettings, Trial
-from ..stepping.inputs import Inputs
-from .actuators import Drive
-from .build import bound_markers, marker_view_of, nominal_places
-from .files import STATIC, payload_inputs
+from ...data.assignment import assign
+from ...data.marker_view import MarkerView
+from ...data.obstacle_motion import recorded
+from ...data.recordings.bag import Bag
+from ...data.recordings.quality import check_passive
+from ...data.recordings.reading import read_recording
+from ...data.recordings.recording import Recording
+from ...data.recordings.text import Table
+from ...data.registration import axes_rotation
+from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
+from ...dynamics.simulator import Simulator
+from ...io.errors import DataFileError, InputError, listed
+from ...settings.stages import ImportStage
+from ...settings.trials import ReadingSettings, Trial
+from ...stepping.inputs import Inputs
+from ..actuators import Drive
+from ..build import bound_markers, marker_view_of, nominal_places
+from ..files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
 

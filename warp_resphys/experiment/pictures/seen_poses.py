@@ -12,20 +12,20 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ..data.camera import Lens
-from ..data.markers import bind_markers
-from ..fem.body import Body
-from ..io.atomic import atomic_path, digest
-from ..io.errors import DataFileError, InputError, MeshError, listed
-from ..io.files import atomic_hdf5, create, read_array, read_hdf5
-from ..io.stages import StageContext
-from ..mesh.mesh import Mesh, quadratic, select_vertices
-from ..mesh.readers import METRES, read_mesh
-from ..pictures.camera import PlacedCamera
-from ..pictures.clouds import Cloud
-from ..pictures.motion import ReleasedForce
-from ..pictures.outlines import ClosedSurface, Outline
-from ..pictures.reading import (
+from ...data.camera import Lens
+from ...data.markers import bind_markers
+from ...fem.body import Body
+from ...io.atomic import atomic_path, digest
+from ...io.errors import DataFileError, InputError, MeshError, listed
+from ...io.files import atomic_hdf5, create, read_array, read_hdf5
+from ...io.stages import StageContext
+from ...mesh.mesh import Mesh, quadratic, select_vertices
+from ...mesh.readers import METRES, read_mesh
+from ...pictures.camera import PlacedCamera
+from ...pictures.clouds import Cloud
+from ...pictures.motion import ReleasedForce
+from ...pictures.outlines import ClosedSurface, Outline
+from ...pictures.reading import (
     Colours,
     Frame,
     SceneFile,
@@ -36,13 +36,13 @@ from ..pictures.reading import (
     read_scene,
     read_tracked,
 )
-from ..pictures.scans import read_scan
-from ..pictures.seen import Photo, SeenPose
-from ..pictures.tags import Tag
-from ..settings.body import MaterialSettings
-from ..settings.pictures import PictureData, PoseSettings
-from ..settings.stages import PictureStage
-from .build import build_mesh, build_simulator
+from ...pictures.scans import read_scan
+from ...pictures.seen import Photo, SeenPose
+from ...pictures.tags import Tag
+from ...settings.body import MaterialSettings
+from ...settings.pictures import PictureData, PoseSettings
+from ...settings.stages import PictureStage
+from ..build import build_mesh, build_simulator
 
 log = logging.getLogger(__name__)
 

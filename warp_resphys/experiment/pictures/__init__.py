@@ -1,0 +1,1 @@
+"""Identification of a material from pictures: the stages and a simulated camera."""

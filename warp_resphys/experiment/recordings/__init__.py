@@ -1,0 +1,1 @@
+"""Recordings: read, registered to the body, and imported as trials."""

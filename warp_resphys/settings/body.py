@@ -315,11 +315,3 @@ class SimulatorSettings(SteppedSettings):
     gravity: Vector = setting((0.0, 0.0, -9.80709), "acceleration of gravity", "m/s^2")
     solver: SolveSettings = SolveSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")
-
-
-class SimulationSettings(SimulatorSettings):
-    """A simulator and the material of its body; the other keys of a run's configuration are ignored."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    simulation: MaterialSettings

@@ -10,7 +10,7 @@ import pytest
 from support.command_line import outcome, refusal
 from support.configured import settings
 from support.main_job import IN_RUN
-from warp_resphys.experiment.pictures import picture_stages
+from warp_resphys.experiment.pictures.stages import picture_stages
 from warp_resphys.io.stages import run_stages
 from warp_resphys.pictures.reading import read_tracked
 from warp_resphys.settings.pictures import SimulatedCamera

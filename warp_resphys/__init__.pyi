@@ -41,6 +41,7 @@ from .energies.surfaces import SurfaceContact as SurfaceContact
 from .energies.tendons import Tendons as Tendons
 from .fem.body import Body as Body
 from .fem.body import PointMass as PointMass
+from .fem.rigid import Glue as Glue
 from .fem.rigid import Rigid as Rigid
 from .fem.scene import Scene as Scene
 from .io.errors import ConvergenceError as ConvergenceError

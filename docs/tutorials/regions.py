@@ -127,7 +127,7 @@ print(
 )
 
 # %% [markdown]
-# In an experiment, regions, rigid parts, further meshes and materials are YAML, as in
+# In an experiment, regions, rigid parts, further meshes, glue and materials are YAML, as in
 # [`experiment=beam_regions`](../simulator.md#several-materials-rigid-parts-several-bodies).
 #
 # ## Summary

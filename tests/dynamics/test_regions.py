@@ -1,4 +1,4 @@
-"""Bodies of several solids and rigid parts."""
+"""Bodies of several solids, rigid parts and glued meshes."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.regions import beam
+from support.regions import beam, two_boxes
 from warp_resphys import (
     Body,
     Corotated,
@@ -21,7 +21,7 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
-from warp_resphys.fem.rigid import Rigid
+from warp_resphys.fem.rigid import Glue, Rigid
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import central_difference
 
@@ -144,6 +144,22 @@ def test_gradients_through_a_rigid_part(name):
     slopes = (1e-2 * by_value * value.detach(), 1e-1 * by_load)
     for slope, (expected, uncertain) in zip(slopes, (one, two), strict=True):
         assert float(slope) == pytest.approx(expected, abs=3.0 * uncertain + 1e-6 * abs(expected))
+
+
+def test_boxes_that_are_glued_bend_like_one():
+    mesh, ends = two_boxes()
+    fixed = select_vertices(mesh, x=0.0)
+    glued = Simulator(Body(mesh, fixed, glued=[Glue(ends, "left")]), Corotated(2e5, 0.45)).static_equilibrium()
+    whole = box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
+    one = Simulator(Body(whole, select_vertices(whole, x=0.0)), Corotated(2e5, 0.45)).static_equilibrium()
+    sag = [float((q[0, :, 2] - torch.as_tensor(m.vertices[:, 2])).min()) for q, m in ((glued.q, mesh), (one.q, whole))]
+    assert sag[0] == pytest.approx(sag[1], rel=0.05)
+    face = torch.as_tensor(ends)
+    inside = np.flatnonzero(np.isclose(mesh.vertices[:, 0], 0.05) & (np.arange(len(mesh.vertices)) < ends.min()))
+    corners = [i for i in inside if np.isclose(mesh.vertices[ends], mesh.vertices[i]).all(1).any()]
+    for i in corners:  # Corners coincide at rest, and stay together.
+        twin = face[np.isclose(mesh.vertices[ends], mesh.vertices[i]).all(1).argmax()]
+        torch.testing.assert_close(glued.q[0, i], glued.q[0, twin], rtol=0.0, atol=1e-15)
 
 
 def test_modes_and_stiffness_of_a_body_with_a_rigid_part():

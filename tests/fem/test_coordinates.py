@@ -1,13 +1,13 @@
-"""Vertices as weighted sums of control vertices: rigid parts."""
+"""Vertices as weighted sums of control vertices: rigid parts and glue."""
 
 import numpy as np
 import pytest
 import torch
 
-from support.regions import beam
+from support.regions import beam, two_boxes
 from warp_resphys import Body, Mesh, box_tetrahedra, select_vertices
-from warp_resphys.fem.coordinates import DeviceCoordinates, barycentric, control_vertices
-from warp_resphys.fem.rigid import Rigid
+from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
+from warp_resphys.fem.rigid import Glue, Rigid
 from warp_resphys.io.errors import InputError
 
 
@@ -38,6 +38,16 @@ def test_composed_points_give_the_same_deformation_gradients():
     torch.testing.assert_close(work, (forces * device.expand(control)).sum())
 
 
+def test_glue_to_a_vertex_that_is_glued_is_resolved():
+    one, two = np.array([1.0]), np.array([0.25, 0.75])
+    chain = Coordinates.of(4, {1: (np.array([0]), one), 2: (np.array([0, 1]), two), 3: (np.array([2]), one)})
+    np.testing.assert_allclose(chain.matrix.toarray()[:, 0], np.ones(4))
+    with pytest.raises(InputError, match="determine each other"):
+        Coordinates.of(2, {0: (np.array([1]), one), 1: (np.array([0]), one)})
+
+
+MESH, ENDS = two_boxes()
+FAR, FAR_ENDS = two_boxes(gap=0.002)
 FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np.arange(72, 81)})
 
 
@@ -46,9 +56,13 @@ FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np
     [
         (lambda: Body(beam(), select_vertices(beam(), x=0.1), rigid={"cap": Rigid()}), "'cap' are fixed"),
         (lambda: Body(FLAT, rigid={"cap": Rigid(), "next": Rigid()}), "share vertices"),
+        (lambda: Body(MESH, glued=[Glue(ENDS, "right")]), "belongs to it"),
+        (lambda: Body(MESH, ENDS[:1], glued=[Glue(ENDS, "left")]), "is fixed"),
+        (lambda: Body(MESH, rigid={"right": Rigid()}, glued=[Glue(ENDS, "left")]), "part of a rigid part"),
+        (lambda: Body(FAR, glued=[Glue(FAR_ENDS, "left")]), "farther than the tolerance"),
         (lambda: Rigid(stiffness=0.0), "must be positive, in Pa"),
     ],
 )
-def test_invalid_rigid_parts_are_refused(make, key):
+def test_invalid_rigid_parts_and_glue_are_refused(make, key):
     with pytest.raises(InputError, match=key):
         make()

@@ -149,7 +149,7 @@ class Linearisation:
         return matrix, np.repeat(p.inertia[0].cpu().numpy()[pattern.free], 3)
 
     def inertia_matrix(self, x: torch.Tensor) -> scipy.sparse.csc_array:
-        """Returns the inertia (3 F, 3 F) in H, including rigid parts [N/m]."""
+        """Returns the inertia (3 F, 3 F) in H, including rigid parts and glued vertices [N/m]."""
         whole, diagonal = self.matrix(x)
         if not len(self._coordinates.dependent):
             return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))

@@ -91,7 +91,7 @@ def _blocks(inertia: scipy.sparse.csc_array) -> NDArray[np.int64]:
 
 
 def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
-    """Returns the triangular R with R^T R = M; only the few coordinates of rigid parts are coupled."""
+    """Returns the triangular R with R^T R = M; only the few coordinates of rigid parts and glue are coupled."""
     coupled, root = _blocks(inertia), scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
     if len(coupled):
         block = inertia[coupled][:, coupled].toarray()

@@ -27,6 +27,7 @@ import torch
 from typing_extensions import override
 
 from ..fem.elements import Points
+from ..fem.scene import Scene
 from ..io.errors import InputError, MeshError
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
@@ -167,7 +168,13 @@ class BoundSurfaceContact(BoundEnergy):
     def __init__(self, contact: SurfaceContact, site: EnergySite) -> None:
         super().__init__(contact, site)
         self._contact = contact
-        rest = site.rest_positions
+        body, rest = site.body, site.rest_positions
+        members = body.bodies.values() if isinstance(body, Scene) else (body,)
+        if any(member.glued for member in members):
+            raise InputError(
+                "contact between surfaces does not support glue, where the boundary of a mesh is no surface: leave it "
+                "out."
+            )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=rest.device)

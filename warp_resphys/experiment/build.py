@@ -23,7 +23,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
 from ..energies.materials import Material
 from ..fem.body import Body
-from ..fem.rigid import Rigid
+from ..fem.rigid import Glue, Rigid
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
 from ..io.machine import find_device
@@ -198,8 +198,9 @@ def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) 
     energies = build_actuators(settings, mesh, payload_at)
     fixed = () if settings.fixed is None else select_vertices(mesh, **settings.fixed.arguments())
     rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
+    glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
     physics = dict(settings.physics)
-    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, **physics)
+    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, glued=glued, **physics)
 
 
 def whole_mesh(settings: BodySettings) -> Mesh:
@@ -222,6 +223,20 @@ def whole_mesh(settings: BodySettings) -> Mesh:
     if twice := joined.regions.keys() & mesh.regions.keys():
         raise MeshError(f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part.")
     return replace(joined, regions={**joined.regions, **mesh.regions})
+
+
+def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
+    """Returns the glue of one entry of ``glued``."""
+    glue = settings.glued[number]
+    try:
+        members = np.unique(mesh.cells[mesh.region(glue.region)])
+        mesh.region(glue.to)
+        vertices = np.intersect1d(select_vertices(mesh, **glue.at.arguments()), members)
+    except MeshError as error:
+        raise MeshError(f"glued[{number}]: {error}") from None
+    if not len(vertices):
+        raise MeshError(f"glued[{number}].at: no vertex of the region {glue.region!r} lies there.")
+    return Glue(vertices, glue.to, glue.tolerance)
 
 
 def _with_regions(mesh: Mesh, settings: BodySettings) -> Mesh:

@@ -10,10 +10,11 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
+from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from .coordinates import Coordinates, rigid_weights
 from .elements import Discretisation, Points, discretise
-from .rigid import Rigid
+from .rigid import Glue, Rigid
 
 MASS_MODES = ("row_sum", "per_vertex")
 
@@ -89,6 +90,7 @@ class Body:
     point_masses: Sequence[PointMass] = field(default=())  # attached weights
     energies: Sequence[BodyEnergy] = field(default=())  # energies besides the material: pressure, fibres
     rigid: Mapping[str, Rigid] = field(default_factory=dict)  # rigid parts, by region of the mesh
+    glued: Sequence[Glue] = field(default=())  # vertices that follow a region with a non-matching mesh
     # sets of integration points of each energy
     energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
@@ -109,8 +111,8 @@ class Body:
         if duplicates:
             raise InputError(f"two energies of the body depend on {duplicates[0]}: put them into one.")
         object.__setattr__(self, "energy_points", tuple(energy.points(self.mesh) for energy in self.energies))
-        if self.rigid:
-            self.coordinates  # noqa: B018  # Checks rigid parts.
+        if self.rigid or self.glued:
+            self.coordinates  # noqa: B018  # Checks rigid parts and glue.
 
     @classmethod
     def rigid_body(cls, mesh: Mesh, part: Rigid | None = None, **options: Any) -> "Body":
@@ -160,9 +162,10 @@ class Body:
         return self.mesh.vertices
 
     def __repr__(self) -> str:
-        """Mesh, number of fixed vertices, rigid parts and energies."""
+        """Mesh, number of fixed vertices, rigid parts, energies, and number of glued regions."""
         parts = [repr(self.mesh), f"{len(self.fixed_vertices)} fixed vertices"]
         parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
+        parts += [f"{len(self.glued)} glued"] if self.glued else []
         return f"Body({', '.join(parts)})"
 
     @property
@@ -182,7 +185,7 @@ class Body:
 
     def discretised(self, cells: NDArray[np.int64] | None = None) -> Discretisation:
         """Returns integration points and volumes of some cells, or of all."""
-        return discretise(self.mesh, self.volume_integration, cells)
+        return discretise(self.mesh, self.volume_integration, cells, cracks=bool(self.glued))
 
     @cached_property
     def soft_cells(self) -> NDArray[np.int64] | None:
@@ -207,8 +210,8 @@ class Body:
         """Control vertices of the rigid parts, and the map from control vertices to all vertices.
 
         Raises:
-            InputError: a rigid part with only some vertices fixed, two parts that share vertices, or a flat
-                part.
+            InputError: a rigid part with only some vertices fixed, two parts that share vertices, a flat part,
+                or glued vertices that are fixed, rigid, or too far from the region they are glued to.
             MeshError: an unknown region.
         """
         weights: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
@@ -229,7 +232,34 @@ class Body:
             part_of_vertex |= dict.fromkeys(vertices.tolist(), name)
             controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name)
             weights |= part_weights
+        for glue in self.glued:
+            glued = self._glued_weights(glue, part_of_vertex)
+            if twice := weights.keys() & glued.keys():
+                raise InputError(f"vertex {min(twice)} is glued twice: leave it out of the glue to {glue.to!r}.")
+            weights |= glued
         return controls, Coordinates.of(self.n_vertices, weights)
+
+    def _glued_weights(
+        self, glue: Glue, rigid: Mapping[int, str]
+    ) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Returns control vertices and weights of glued vertices, from the shape functions of the containing cells."""
+        vertices = np.unique(_vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
+        cells = self.mesh.cells[self.mesh.region(glue.to)]
+        for what, others in (("fixed", self.fixed_vertices), ("part of a rigid part", np.array(list(rigid)))):
+            if np.isin(vertices, others).any():
+                raise InputError(f"a vertex that is glued to {glue.to!r} is {what}: leave it out of the glue.")
+        if np.isin(vertices, cells).any():
+            raise InputError(f"a vertex that is glued to {glue.to!r} belongs to it: glue vertices of another region.")
+        used, renumbered = np.unique(cells, return_inverse=True)
+        region = Mesh(self.mesh.vertices[used], renumbered.reshape(cells.shape))
+        places = locate(region, self.mesh.vertices[vertices])
+        if float(places.outside.max()) > glue.tolerance:
+            far = int(places.outside.argmax())
+            raise InputError(
+                f"vertex {vertices[far]} is {places.outside[far]:.3g} m from the region {glue.to!r} that it is glued "
+                f"to, farther than the tolerance of {glue.tolerance:g} m: move the meshes together, or raise it."
+            )
+        return {int(i): (cells[c], w) for i, c, w in zip(vertices, places.cells, places.weights, strict=True)}
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:

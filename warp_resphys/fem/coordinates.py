@@ -1,9 +1,10 @@
 """Vertices as weighted sums of control vertices, x = W r.
 
-A free vertex is its own control vertex. A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is
-controlled by four of its vertices, and the weights of the others are their barycentric coordinates. As W acts on each
-component alike, the operator F = sum_a x_a g_a^T of a point keeps its form, F = sum_c r_c (sum_a W_ac g_a)^T: energies
-use control vertices only, and the Hessian in r, W^T H W, is assembled without forming H.
+A free vertex is its own control vertex. A glued vertex has the shape functions of the face it is glued to as weights.
+A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is controlled by four of its vertices, and
+the weights of the others are their barycentric coordinates. As W acts on each component alike, the operator
+F = sum_a x_a g_a^T of a point keeps its form, F = sum_c r_c (sum_a W_ac g_a)^T: energies use control vertices only, and
+the Hessian in r, W^T H W, is assembled without forming H.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,15 +38,30 @@ class Coordinates:
 
     @classmethod
     def of(cls, n_vertices: int, weights: Mapping[int, tuple[IntArray, FloatArray]]) -> "Coordinates":
-        """Builds the map from the control vertices and weights of each dependent vertex."""
+        """Builds the map from the control vertices and weights of each dependent vertex.
+
+        A dependent vertex may be a weighted sum of other dependent vertices; these are substituted.
+
+        Raises:
+            InputError: two vertices determine each other.
+        """
         dependent = np.array(sorted(weights), dtype=np.int64)
         if not len(dependent):
             return cls(n_vertices, dependent, scipy.sparse.csr_array((0, n_vertices)))
-        rows = np.repeat(np.arange(len(dependent)), [len(weights[i][0]) for i in dependent])
+        free = np.ones(n_vertices)
+        free[dependent] = 0.0
+        rows = np.repeat(dependent, [len(weights[i][0]) for i in dependent])
         columns, values = (np.concatenate([weights[i][k] for i in dependent]) for k in (0, 1))
-        return cls(
-            n_vertices, dependent, scipy.sparse.csr_array((values, (rows, columns)), (len(dependent), n_vertices))
-        )
+        given = scipy.sparse.csr_array((values, (rows, columns)), (n_vertices, n_vertices))
+        matrix = scipy.sparse.csr_array(scipy.sparse.diags_array(free) + given)
+        for _ in range(len(dependent)):
+            if not matrix[:, dependent].nnz:
+                break
+            matrix = scipy.sparse.csr_array(matrix @ matrix)
+            matrix.eliminate_zeros()
+        if matrix[:, dependent].nnz:
+            raise InputError("glued vertices determine each other: glue one side of an interface to the other only.")
+        return cls(n_vertices, dependent, scipy.sparse.csr_array(matrix[dependent]))
 
     @classmethod
     def joined(cls, maps: "Sequence[Coordinates]") -> "Coordinates":

@@ -84,7 +84,7 @@ def _per_vertex(cells: NDArray[np.int64], n_vertices: int, values: Array) -> sci
 
 
 def discretise(
-    mesh: Mesh, volume_integration: str = "centre", cells: NDArray[np.int64] | None = None
+    mesh: Mesh, volume_integration: str = "centre", cells: NDArray[np.int64] | None = None, cracks: bool = False
 ) -> Discretisation:
     """Returns the points, masses and loads of a mesh, or of some of its cells.
 
@@ -99,6 +99,7 @@ def discretise(
         mesh: the rest shape.
         volume_integration: ``centre`` or ``full``.
         cells: (M',) cell indices, all cells if omitted. Averages over patches are restricted to these cells.
+        cracks: whether vertices may coincide, like those of glued parts.
 
     Raises:
         InputError: an unknown volume integration.
@@ -109,19 +110,19 @@ def discretise(
             f"volume_integration is {volume_integration!r}: choose one of {', '.join(VOLUME_INTEGRATIONS)}."
         )
     if cells is not None:
-        return _discretise_cells(mesh, volume_integration, cells)
-    check_mesh(mesh)
+        return _discretise_cells(mesh, volume_integration, cells, cracks)
+    check_mesh(mesh, cracks)
     full = volume_integration == "full"
     if mesh.element.volume_modes is None:
         return _linear_tetrahedra(mesh, full)
     return _isoparametric(mesh, full)
 
 
-def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int64]) -> Discretisation:
+def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int64], cracks: bool) -> Discretisation:
     """Returns the discretisation of a submesh, with the vertex numbers of the whole mesh."""
     used, renumbered = np.unique(mesh.cells[cells], return_inverse=True)
     part = Mesh(mesh.vertices[used], renumbered.reshape(-1, mesh.cells.shape[1]))
-    own = discretise(part, volume_integration)
+    own = discretise(part, volume_integration, cracks=cracks)
     spread = scipy.sparse.eye_array(len(mesh.vertices), format="csc")[:, used]
     return Discretisation(
         tuple(replace(points, nodes=used[points.nodes]) for points in own.point_sets),

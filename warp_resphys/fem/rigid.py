@@ -1,10 +1,11 @@
-"""Rigid parts, which make vertices of a body depend on others (`fem.coordinates`)."""
+"""Rigid parts and glue, which make vertices of a body depend on others (`fem.coordinates`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..io.errors import InputError
 
@@ -24,3 +25,12 @@ class Rigid:
         """Checks the stiffness."""
         if not (np.isfinite(self.stiffness) and self.stiffness > 0.0):
             raise InputError(f"the stiffness of a rigid part is {self.stiffness:g}: it must be positive, in Pa.")
+
+
+@dataclass(frozen=True)
+class Glue:
+    """Vertices glued to a region of the mesh whose cells need not match theirs."""
+
+    vertices: ArrayLike  # (n,) glued vertices
+    to: str  # region they are glued to
+    tolerance: float = 1e-3  # largest distance from the region [m]; gaps are kept

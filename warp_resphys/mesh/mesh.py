@@ -160,10 +160,14 @@ def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
     return Mesh(np.concatenate(vertices), np.concatenate(cells, axis=1), mesh.regions)
 
 
-def check_mesh(mesh: Mesh) -> None:
+def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
     """Checks that a mesh is valid for finite elements.
 
     The Jacobian determinant of each cell must be positive at the quadrature points and at the nodes.
+
+    Args:
+        mesh: The mesh.
+        cracks: Whether vertices may coincide, like those of glued parts.
 
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
@@ -176,7 +180,8 @@ def check_mesh(mesh: Mesh) -> None:
     _refuse(np.any((cells < 0) | (cells >= count), axis=1), "cells", f"have indices outside 0 to {count - 1}")
     unused = np.bincount(cells.ravel(), minlength=count) == 0
     _refuse(unused, "vertices", "belong to no cell; reading with drop_unreferenced leaves them out")
-    _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge them")
+    if not cracks:
+        _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge or glue them")
     volumes, determinants = _normalised_volumes(mesh)
     _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat; remove them or mesh the body anew")
     _refuse(determinants < DEGENERATE_VOLUME, "cells", "are inverted or folded; reorder or move their nodes")

@@ -122,6 +122,15 @@ class PartSettings(Settings):
     shift: Vector = setting((0.0, 0.0, 0.0), "displacement from the coordinates of its own mesh", "m")
 
 
+class GlueSettings(Settings):
+    """Glue between regions whose cells do not match: vertices that follow another region, by `fem.rigid.Glue`."""
+
+    region: Word = setting(description="region with the glued vertices")
+    at: PlaceSettings = setting(description="where the glued vertices of that region lie")
+    to: Word = setting(description="region that they follow")
+    tolerance: Positive = setting(1.0e-3, "largest distance from that region", "m")
+
+
 class ChamberSettings(Settings):
     """Closed chambers of the mesh, each with its own pressure."""
 
@@ -253,6 +262,7 @@ class BodySettings(Settings):
     mesh: MeshSettings
     physics: PhysicsSettings = PhysicsSettings()
     parts: dict[str, PartSettings] = setting({}, "further meshes; the cells of the first one are the region 'body'")
+    glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
     fixed: PlaceSettings | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")

@@ -1,4 +1,6 @@
 import re
+import sys
+from dataclasses import fields
 from importlib import resources
 from math import pi
 
@@ -8,19 +10,27 @@ from scipy.integrate import trapezoid
 
 from support.configured import composed
 from warp_resphys.experiment.build import build_mesh
-from warp_resphys.io.errors import MeshError
+from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
-from warp_resphys.mesh.arm_section import section_grids, section_quadrilaterals
+from warp_resphys.mesh.arm_tetrahedra import tetrahedra
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
-from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
+from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
 from warp_resphys.settings.mesh import MeshGroup
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
-SHAPES = [("lobed", 3), ("round", 2), ("round", 5)]
+SHAPES = [
+    ("half_disc", "lobed", 3),
+    ("half_disc", "round", 2),
+    ("half_disc", "round", 5),
+    ("disc", "lobed", 4),
+    ("disc", "round", 3),
+    ("sector", "round", 3),
+    ("sector", "round", 6),
+]
 
 
 def volume(mesh, faces):
@@ -62,55 +72,112 @@ def lobes(radius, inner):
     return 3.0 * trapezoid(0.5 * reach**2, angle)
 
 
-def areas(section, size):
-    """Areas of a chamber and of all that the outline encloses, in a mesh."""
-    grids, chambers = section_grids(section, section.divisions(size))
-    places, quads = section_quadrilaterals(grids)
-    corners = [np.concatenate([grid.ravel() for grid in grids])[places][own] for own in quads]
-    own = [0.5 * (x.conj() * np.roll(x, -1, axis=1)).imag.sum() for x in corners]
-    return sum(a for a, chamber in zip(own, chambers, strict=True) if chamber == 0), sum(own)
+def polygons(section, size):
+    divisions = section.divisions(size)
+    return section.chamber_polygon(divisions), section.body_polygon(divisions)
+
+
+def area(polygon):
+    """Area of (N,) complex corners, counter-clockwise."""
+    return 0.5 * (polygon.conj() * np.roll(polygon, -1)).imag.sum()
+
+
+def quad_areas(mesh, faces):
+    """Area of the (F, 3 | 4) faces."""
+    corners = mesh.vertices[face_triangles(faces)]
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
 
 
 def configured(*overrides):
     return parse(MeshGroup, {"mesh": composed(*overrides)["mesh"]}).mesh
 
 
-@pytest.mark.parametrize("size", [0.01, 0.002])
-def test_sopra_has_its_chambers_and_its_silicone_at_every_size(size):
-    mesh, surfaces = mesh_arm(ArmGeometry(), size)
+@pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])
+def test_sopra_has_its_chambers_and_its_silicone_at_every_size(cells, size):
+    if cells == "tetrahedra":
+        pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(ArmGeometry(), size, cells)
     check_mesh(mesh)
-    assert scaled_jacobian(mesh).min() > 0.45
+    assert cells == "tetrahedra" or scaled_jacobian(mesh).min() > 0.45
     volumes = [-volume(mesh, surfaces[f"chamber_{i}"]) for i in range(1, 7)]
     np.testing.assert_allclose(volumes, sopra_chambers(), rtol=1e-5)
     assert cell_volumes(mesh).sum() == pytest.approx(sopra_silicone(), rel=2e-3)
 
 
-@pytest.mark.parametrize(("outline", "count"), SHAPES)
-def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(outline, count):
-    section = ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025), count, outline, wall=0.003, web=0.0025).section(0.025)
-    fine = areas(section, 1e-4)
-    assert fine[0] == pytest.approx(pi / 2.0 * section.arc_radius**2, rel=1e-12)
+@pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
+def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, outline, count):
+    section = ArmGeometry(
+        (0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025
+    ).section(0.025)
+    fine = [area(polygon) for polygon in polygons(section, 1e-4)]
     for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
-        np.testing.assert_allclose(areas(section, size), fine, rtol=1e-12)
+        np.testing.assert_allclose([area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12)
         assert all(0.0 < growth < most for growth in section.growth(section.divisions(size)))
 
 
-@pytest.mark.parametrize(("outline", "count", "size"), [*((*shape, 0.01) for shape in SHAPES), (*SHAPES[0], 0.0025)])
-def test_walls_and_webs_are_as_thick_as_asked(outline, count, size):
-    geometry = ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025), count, outline, wall=0.003, web=0.0025)
+def test_walls_flat_sides_and_arcs_are_divided_by_their_own_lengths():
+    section = ArmGeometry().section(0.02248)
+    lines = (("A1", "B1"), ("C", "W"), ("C", "M"), ("O", "W"), ("A1", "C"), ("B1", "V"))
+    for size, numbers in ((1.0, (1, 1, 1)), (0.0065, (1, 2, 1)), (0.005, (1, 2, 2)), (0.002, (2, 5, 5))):
+        divisions = section.divisions(size)
+        assert [divisions[line] for line in lines] == list(np.repeat(numbers, 2))
+    assert max(ArmGeometry(profile="sector", outline="round", chambers=2).section(0.025).divisions(1.0).values()) == 2
+
+
+def test_polygons_are_measured_against_the_circle():
+    section = ArmGeometry(profile="disc", outline="round").section(0.0283923)
+    assert area(polygons(section, 1.0)[1]) == pytest.approx(pi * section.radius**2, rel=1e-12)
+    assert area(polygons(section, 1.0)[0]) == pytest.approx(pi * section.arc_radius**2, rel=1e-12)
+
+
+def test_chamber_stands_where_it_was_published(shared_data):
+    published = read_mesh(shared_data / "sopra_mesh" / "sopra_494.vtk", drop_unreferenced=True)
+    points = ArmGeometry().section(0.0283923).points  # where its corners lie on the outline
+    lobe = np.array([points["B0"], points["B1"], points["B2"]])
+    outline = np.outer(np.exp(2j * pi * np.arange(3) / 3), [*lobe, *lobe.conj()])
+    for part, axis in ((outline.real, 0), (outline.imag, 1)):
+        ends = published.vertices[:, axis].min(), published.vertices[:, axis].max()
+        np.testing.assert_allclose((part.min(), part.max()), ends, atol=2e-6)
+    mesh, _ = mesh_arm(ArmGeometry(), 0.002)
+    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(np.ptp(published.vertices[:, 2]), abs=2e-6)
+    for ours, theirs in zip(find_chambers(mesh), find_chambers(published), strict=True):
+        for side in (np.min, np.max):
+            np.testing.assert_allclose(
+                side(mesh.vertices[ours.vertices], axis=0),
+                side(published.vertices[theirs.vertices], axis=0),
+                atol=6e-4,
+            )
+
+
+@pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
+@pytest.mark.parametrize("size", [0.01, 0.0025])
+def test_walls_and_webs_are_as_thick_as_asked(profile, outline, count, size):
+    geometry = ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025)
     mesh, surfaces = mesh_arm(geometry, size, layers=0.03)
     check_mesh(mesh)
-    assert scaled_jacobian(mesh).min() > 0.2
+    assert scaled_jacobian(mesh).min() > (0.18 if profile == "disc" else 0.2)
     assert len(surfaces) == 3 + count
     first = np.unique(surfaces["chamber_1"])
     across = mesh.vertices[first, :2] @ [np.sin(pi / count), -np.cos(pi / count)]
-    assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)  # the middle of the web is at 0
+    if profile != "disc":  # corners are kept
+        assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)  # the middle of the web is at 0
     wall = mesh.vertices[:, 0].max() - mesh.vertices[first, 0].max()
     assert wall == pytest.approx(0.003, abs=1e-3 if size > 0.005 else 1e-4)
 
 
-def test_surfaces_are_named_as_the_contract_says():
-    mesh, surfaces = mesh_arm(ArmGeometry(), 0.012)
+def test_solid_and_chambers_fill_the_outline():
+    mesh, surfaces = mesh_arm(ArmGeometry((0.1,), (0.01, 0.01), (0.025, 0.025)), 0.005)
+    outline = quad_areas(mesh, surfaces["base"])
+    hollow = -sum(volume(mesh, surfaces[f"chamber_{i}"]) for i in (1, 2, 3))
+    assert cell_volumes(mesh).sum() + hollow == pytest.approx(0.12 * outline, rel=1e-12)
+    assert quad_areas(mesh, surfaces["tip"]) == pytest.approx(outline, rel=1e-12)
+
+
+@pytest.mark.parametrize("cells", ["hexahedra", "tetrahedra"])
+def test_surfaces_are_named_as_the_contract_says(cells):
+    if cells == "tetrahedra":
+        pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(ArmGeometry(), 0.012, cells)
     assert list(surfaces) == ["base", "tip", "outside", *(f"chamber_{i}" for i in range(1, 7))]
     named = np.concatenate(list(surfaces.values()))
     assert len(np.unique(np.sort(named, axis=1), axis=0)) == len(named) == len(boundary_faces(mesh))
@@ -127,6 +194,31 @@ def test_surfaces_are_named_as_the_contract_says():
     assert np.all(np.diff(mesh.vertices[:, 2]) < 1e-12)  # numbered from the base down
 
 
+def test_tetrahedra_have_the_same_volumes():
+    pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh = tetrahedra(ArmGeometry(), 0.005)
+    volumes = [-volume(mesh, chamber.faces) for chamber in find_chambers(mesh)]
+    np.testing.assert_allclose(volumes, sopra_chambers(), rtol=0.05)
+    check_mesh(quadratic(mesh))
+
+
+def test_rotated_segments_take_tetrahedra():
+    geometry = ArmGeometry(outline="round", rotations=(0.0, 60.0))
+    with pytest.raises(MeshError, match="set the arm's cells to tetrahedra"):
+        mesh_arm(geometry, 0.01)
+    pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
+    mesh, surfaces = mesh_arm(geometry, 0.012, "tetrahedra")
+    centre = mesh.vertices[np.unique(surfaces["chamber_4"])].mean(axis=0)
+    assert np.degrees(np.arctan2(centre[1], centre[0])) == pytest.approx(60.0, abs=2.0)
+
+
+def test_without_gmsh_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    with pytest.raises(MeshError, match=r"need gmsh, which cannot be imported .*pip install gmsh"):
+        mesh_arm(ArmGeometry(), 0.01, "tetrahedra")
+    mesh_arm(ArmGeometry(), 0.01)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -135,9 +227,11 @@ def test_surfaces_are_named_as_the_contract_says():
         ({"radii": (0.028, -0.02, 0.016)}, "radii has -0.02"),
         ({"wall": float("nan")}, "wall has nan"),
         ({"chambers": 1}, "chambers are 1 a segment"),
-        ({"outline": "square"}, "outline is 'square'"),
+        ({"profile": "square"}, "profile is 'square'"),
+        ({"profile": "sector"}, "lobed outline does not go with sectors"),
         ({"wall": 0.02}, "3 chambers do not fit: make the wall"),
         ({"core": 0.002}, "a core of 1.167 mm leaves webs of|a core of 2 mm leaves webs of"),
+        ({"rotations": (10.0,)}, "rotations are 1 numbers, but 2 chamber_lengths need 2"),
         ({"chamber_lengths": 0.1}, "chamber_lengths are 0.1: give a list"),
         ({"wall": 0.0005, "web": 0.02}, "lobes of the outline do not meet"),
     ],
@@ -152,7 +246,9 @@ def test_measures_that_make_no_arm(changes, message):
     [
         ({"size": 0.0}, "size has 0.0"),
         ({"size": 1e-5}, "more than 2000000 cells"),
+        ({"size": 0.01, "cells": "bricks"}, "cells are 'bricks'"),
         ({"size": 0.01, "layers": -1.0}, "layers has -1.0"),
+        ({"size": 0.01, "layers": 0.1, "cells": "tetrahedra"}, "layers are for arms of hexahedra"),
     ],
 )
 def test_sizes_that_make_no_mesh(arguments, message):
@@ -160,7 +256,7 @@ def test_sizes_that_make_no_mesh(arguments, message):
         mesh_arm(ArmGeometry(), **arguments)
 
 
-@pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm_fine", 1950)])
+@pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)])
 def test_shipped_arms(option, count):
     mesh = build_mesh(configured(f"mesh={option}"))
     assert len(mesh.vertices) == count
@@ -170,7 +266,6 @@ def test_shipped_arms(option, count):
     np.testing.assert_allclose([-volume(mesh, chamber.faces) for chamber in chambers], sopra_chambers(), rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
     rows = re.findall(r"mesh\.size=(\S+) mesh\.layers=(\S+) save=(\S+)`", (SHIPPED / "README.md").read_text())
     assert {name for _, _, name in rows} == {path.name for path in SHIPPED.iterdir() if path.name.endswith(".msh")}
@@ -184,6 +279,19 @@ def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
         assert list(named) == list(surfaces)
         for key, faces in surfaces.items():
             np.testing.assert_array_equal(named[key], faces)
+
+
+def test_unknown_shipped_arm():
+    with pytest.raises(InputError, match="'octopus'"):
+        build_mesh(configured("mesh=arm", "mesh.name=octopus"))
+
+
+def test_generated_arm_is_configured():
+    arm = configured("mesh=arm_generated", "mesh.chambers=4", "mesh.size=0.012")
+    assert ArmGeometry(**{item.name: getattr(arm, item.name) for item in fields(ArmGeometry)}) == ArmGeometry(
+        chambers=4
+    )
+    assert len(find_chambers(build_mesh(arm))) == 8
 
 
 def test_named_surfaces_survive_a_file(tmp_path):

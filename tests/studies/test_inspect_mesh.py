@@ -166,6 +166,7 @@ def test_an_arm_is_written_as_it_is_described(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "error", "message"),
     [
+        (["mesh.order=2"], MeshError, r"mesh\.order is 2: choose 1, or 2 for tetrahedra"),
         (["density=-1"], InputError, "density is -1"),
         (["mesh.radii=0.02"], InputError, r"mesh\.radii"),
     ],

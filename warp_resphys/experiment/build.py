@@ -31,7 +31,7 @@ from ..io.settings import parse
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import ArmGeometry
 from ..mesh.boxes import boxes_hexahedra
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, select_cells, select_vertices
+from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, quadratic, select_cells, select_vertices
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
 from ..mesh.tetrahedra import fill_surface
@@ -113,7 +113,8 @@ def _read_or_generate(settings: MeshSettings) -> Mesh:
             return rod(**{key: value for key, value in dict(settings).items() if key != "kind"})
         case GeneratedArm():
             geometry = ArmGeometry(**{field.name: getattr(settings, field.name) for field in fields(ArmGeometry)})
-            return mesh_arm(geometry, settings.size, settings.layers)[0]
+            mesh, _ = mesh_arm(geometry, settings.size, settings.cells, settings.layers)
+            return quadratic(mesh) if settings.order == 2 else mesh
 
 
 def finer(settings: MeshSettings, times: float) -> MeshSettings:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from math import ceil, cos, pi, sin, sqrt
+from math import asin, ceil, cos, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,6 @@ Edge = tuple[str, str]  # names of the ends, in alphabetical order if used as a 
 Divisions = Mapping[Edge, int]
 Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and index of the wedge
 
-_ROWS = 2  # pieces in half of the outer arc of a chamber
 SOLID = -1  # replaces the number of a chamber
 _LEAST_ROOM = 0.1  # smallest size of a chamber, over the radius of the outline
 _LARGEST_TURN = 1.15  # largest angle of an arc replaced by one edge [rad]
@@ -86,17 +85,18 @@ class Section:
     The half wedge counter-clockwise from the middle of chamber 1 is described by named points, and mirrored:
 
         O            the axis
-        M, C         flat side of the chamber: its middle and its corner
-        A0 to A2     outer arc of the chamber, from its corner to its crown
-        B0 to B2     the outline opposite the arc
-        W            middle of the web opposite C
+        M, C, (E)    inner side of the chamber: its middle, its corner, and the end of a sector's straight side
+        A0 to Am     outer arc of the chamber, from its last corner (C or E) to its crown
+        B0 to Bm     the outline opposite the arc
+        W, (U)       middle of the web opposite C (and E)
         V            middle of the web on the outline; for a lobed outline the same as B0
-        X1, X2       inside the chamber, next to A1 and A2, for the caps
+        Xm, Xc, X1, X2  inside the chamber, next to M, C, A1 and A2, for the caps
     """
 
     radius: float  # largest radius of the outline [m]
     count: int  # number of chambers
-    outline: str  # as in `ArmGeometry`, like all that follows
+    profile: str  # as in `ArmGeometry`, like all that follows
+    outline: str
     wall: float  # [m]
     web: float  # [m]
     core: float | None = None  # [m]; None: the smallest that the webs allow
@@ -110,23 +110,37 @@ class Section:
     def arc_centre(self) -> float:
         """Distance from the axis to the centre of the chamber's outer arc [m]."""
         reach, s, c = self.radius - self.wall, sin(self.half_angle), cos(self.half_angle)
-        # With centre d and radius a = reach - d, the corner's distance from the middle of the web is d s - a c; it
-        # equals half the web.
-        return (0.5 * self.web + reach * c) / (s + c) if self.core is None else self.core
+        if self.profile == "sector":
+            return 0.0
+        # With centre d and radius a = reach - d, the distance from the middle of the web is d s - a c for the corner of
+        # a half disc and d s - a for a disc; it equals half the web.
+        if self.profile == "half_disc":
+            return (0.5 * self.web + reach * c) / (s + c) if self.core is None else self.core
+        return (0.5 * self.web + reach) / (s + 1.0) if self.core is None else 0.5 * (self.core + reach)
 
     @property
     def arc_radius(self) -> float:
         """Radius of the outer arc of a chamber [m]."""
         return self.radius - self.wall - self.arc_centre
 
+    @property
+    def inner_radius(self) -> float:
+        """Distance between the axis and a chamber [m]."""
+        if self.profile == "half_disc":
+            return self.arc_centre
+        if self.profile == "disc":
+            return self.arc_centre - self.arc_radius
+        return self.web / sin(self.half_angle) if self.core is None else self.core
+
     def check(self) -> None:
         """Raises MeshError if the chambers do not fit."""
         where = f"where the arm's radius is {1e3 * self.radius:.4g} mm"
         d, a, s, c = self.arc_centre, self.arc_radius, sin(self.half_angle), cos(self.half_angle)
-        if a < _LEAST_ROOM * self.radius or d <= 0.0:
+        room = a - self.inner_radius if self.profile == "sector" else a
+        if room < _LEAST_ROOM * self.radius or self.inner_radius <= 0.0:
             raise MeshError(f"{where}, {self.count} chambers do not fit: make the wall, the web or the core thinner.")
         if self.core is not None:
-            gap = 2.0 * (d * s - a * c)
+            gap = 2.0 * {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s}[self.profile]
             if gap < self.web * (1.0 - 1e-9):
                 raise MeshError(
                     f"{where}, a core of {1e3 * self.core:.4g} mm leaves webs of {1e3 * gap:.4g} mm between chambers, "
@@ -144,22 +158,44 @@ class Section:
             return complex(self.radius * c, self.radius * s)
         return (d * c + sqrt(max((self.arc_radius + self.wall) ** 2 - (d * s) ** 2, 0.0))) * complex(c, s)
 
+    @property
+    def rows(self) -> int:
+        """Number m of pieces in half of the outer arc."""
+        return 1 if self.profile == "sector" else 2
+
+    @property
+    def inner_side(self) -> tuple[str, ...]:
+        """Names of the points on half of the inner side, from its middle."""
+        return ("M", "C", "E") if self.profile == "sector" else ("M", "C")
+
     @cached_property
     def points(self) -> Mapping[str, complex]:
         """The named points."""
-        d, a, valley = self.arc_centre, self.arc_radius, self._valley()
-        corner = complex(d, a)
-        point = {"O": 0j, "M": complex(d), "V": valley, "C": corner}
-        point["B0"] = valley if self.outline == "lobed" else self.radius * corner / abs(corner)
-        for i, t in enumerate(np.linspace(0.0, 1.0, _ROWS + 1)):
-            point[f"A{i}"] = complex(Piece(corner, complex(d + a), complex(d)).points(t))
+        d, a, half, valley = self.arc_centre, self.arc_radius, self.half_angle, self._valley()
+        point = {"O": 0j, "M": complex(self.inner_radius), "V": valley}
+        if self.profile == "sector":
+            for name, radius in (("C", self.inner_radius), ("E", a)):
+                point[name] = radius * np.exp(1j * (half - asin(0.5 * self.web / radius)))
+        elif self.profile == "half_disc":
+            point["C"] = complex(d, a)
+        else:  # the point with the thinnest wall towards the valley, or with the thinnest web
+            lobe = valley - d if self.outline == "lobed" else np.exp(1j * (half / 2 + pi / 2))
+            point["C"] = d + a * lobe / abs(lobe)
+        last = point[self.inner_side[-1]]
+        point["B0"] = valley if self.outline == "lobed" else self.radius * last / abs(last)
+        for i, t in enumerate(np.linspace(0.0, 1.0, self.rows + 1)):
+            point[f"A{i}"] = complex(Piece(last, complex(d + a), complex(d)).points(t))
             point[f"B{i}"] = complex(Piece(point["B0"], complex(self.radius), self._outline_centre).points(t))
-        point |= {"X1": d + (0.45 + 0.2j) * a, "X2": complex(d + 0.65 * a)}
-        along = np.exp(1j * self.half_angle)
-        foot = (corner / along).real
+        if self.profile == "half_disc":
+            point |= {"X1": d + (0.45 + 0.2j) * a, "X2": complex(d + 0.65 * a)}
+        elif self.profile == "disc":
+            point |= {f"X{name[-1].lower()}": 0.5 * (d + point[name]) for name in ("M", "C", "A1", "A2")}
+        along = np.exp(1j * half)
+        feet = [(point[name] / along).real for name in self.inner_side[1:]]
         if self.outline == "lobed":  # opposite the valley, at the same distance from the corners
-            foot = max(2.0 * foot - abs(valley), 0.5 * foot)
-        point["W"] = foot * along
+            feet[-1] = max(2.0 * feet[-1] - abs(valley), 0.5 * feet[-1])
+        for name, foot in zip("WU", feet, strict=False):
+            point[name] = foot * along
         return point
 
     @property
@@ -173,17 +209,22 @@ class Section:
         centre: complex | None = None
         if letters == "B" or (letters == "BV" and self.outline == "round"):
             centre = self._outline_centre
-        elif letters in ("A", "AC"):
+        elif letters in {"half_disc": ("A", "AC"), "disc": ("A", "AC", "CM"), "sector": ("A", "CM")}[self.profile]:
             centre = complex(self.arc_centre)
         return Piece(self.points[first], self.points[last], centre)
 
     def motion(self, name: str) -> complex:
-        """Returns the displacement of a named point per unit of growth; corners are fixed."""
-        point = self.points[name]
-        if name[0] in "AMC":
-            return 0j if name in ("A0", "C", "M") else point - self.arc_centre
+        """Returns the displacement of a named point per unit of growth; corners are fixed, or keep the web's width."""
+        point, along = self.points[name], complex(np.exp(1j * self.half_angle))
+        if name[0] in "AMCE":
+            if self.profile == "sector" and name not in ("M", "A1"):
+                return (point / along).real * along
+            corner = self.profile == "half_disc" and name in ("A0", "C", "M")
+            return 0j if corner else point - self.arc_centre
         if name[0] in "BV":
             return 0j if self.outline == "lobed" and name in ("B0", "V") else point - self._outline_centre
+        if name == "W" and self.profile == "disc":  # moves with the opposite corner, as in `points`
+            return (2.0 if self.outline == "lobed" else 1.0) * (self.motion("C") / along).real * along
         return 0j
 
     def divisions(self, size: float) -> Divisions:
@@ -214,28 +255,28 @@ class Section:
 
     def edge(self, first: str, last: str) -> Edge:
         """Returns the key of the line between two named points, with synonyms resolved."""
-        same = {"A0": "C", **({"B0": "V"} if self.outline == "lobed" else {})}
+        same = {"A0": self.inner_side[-1], **({"B0": "V"} if self.outline == "lobed" else {})}
         a, b = sorted((same.get(first, first), same.get(last, last)))
         return a, b
 
     def growth(self, divisions: Divisions) -> Growth:
         """Returns the growth for which the polygons have the areas of the curves."""
-        return Growth(*(self._growth(sides, divisions) for sides in (self._chamber_sides, self._outline_sides)))
+        return Growth(*(self._polygon(sides, divisions)[1] for sides in (self._chamber_sides, self._outline_sides)))
 
     @property
     def _chamber_sides(self) -> tuple[Edge, ...]:
         """Pairs of neighbouring names along half of a chamber's outline, from its crown."""
-        arc = [f"A{i}" for i in range(_ROWS, -1, -1)]
-        return (*pairwise(arc), ("C", "M"))
+        arc = [f"A{i}" for i in range(self.rows, -1, -1)]
+        return (*pairwise(arc), *pairwise(self.inner_side[::-1]))
 
     @property
     def _outline_sides(self) -> tuple[Edge, ...]:
         """Pairs of neighbouring names along half of the outline opposite a chamber, from its crown."""
-        arc = [f"B{i}" for i in range(_ROWS, -1, -1)]
+        arc = [f"B{i}" for i in range(self.rows, -1, -1)]
         return tuple(pairwise(arc if self.outline == "lobed" else [*arc, "V"]))
 
-    def _growth(self, sides: Sequence[Edge], divisions: Divisions) -> float:
-        """Returns the growth of the polygon along the sides.
+    def _polygon(self, sides: Sequence[Edge], divisions: Divisions) -> tuple[ComplexArray, float]:
+        """Returns the polygon's corners along the sides, and its growth.
 
         A polygon with corners p + e w has the area A0 + A1 e + A2 e^2, which must equal that of the curve.
         """
@@ -250,7 +291,20 @@ class Section:
         a0, a2 = _fan(p, p), _fan(w, w)
         a1 = _fan(p, w) + _fan(w, p)
         lack = area - a0
-        return float(2.0 * lack / (a1 + sqrt(a1**2 + 4.0 * a2 * lack)))
+        growth = float(2.0 * lack / (a1 + sqrt(a1**2 + 4.0 * a2 * lack)))
+        return np.asarray(p + growth * w, dtype=np.complex128), growth
+
+    def chamber_polygon(self, divisions: Divisions) -> ComplexArray:
+        """Returns the corners of chamber 1, counter-clockwise from its crown."""
+        upper, _ = self._polygon(self._chamber_sides, divisions)
+        return np.concatenate([upper, upper[-2:0:-1].conj()])
+
+    def body_polygon(self, divisions: Divisions) -> ComplexArray:
+        """Returns the corners of the arm's outline, counter-clockwise from chamber 1."""
+        half, _ = self._polygon(self._outline_sides, divisions)
+        turns = np.exp(2j * self.half_angle * np.arange(self.count))
+        wedge = np.concatenate([half[:0:-1].conj(), half[:-1]])
+        return np.asarray((turns[:, None] * wedge).ravel(), dtype=np.complex128)
 
     def line(self, first: Corner, last: Corner, t: NDArray[np.float64], growth: Growth) -> ComplexArray:
         """Returns the points at fractions (T,) of the line between two neighbouring corners, after the growth."""
@@ -267,19 +321,31 @@ class Section:
 
     def blocks(self) -> Iterator[tuple[list[Corner], int]]:
         """Yields the blocks that fill the section: four corners, and the index of the chamber or `SOLID`."""
-        solid = [("O", "M", "C", "W")]
-        solid += [(f"A{i}", f"B{i}", f"B{i + 1}", f"A{i + 1}") for i in range(_ROWS)]
+        m, n = self.rows, self.count
+        inner, middle = self.inner_side, ("O", "W", "U")
+        solid = [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(inner) - 1)]
+        solid += [(f"A{i}", f"B{i}", f"B{i + 1}", f"A{i + 1}") for i in range(m)]
         if self.outline == "round":
-            solid.append(("W", "C", "B0", "V"))
-        hollow = [("M", "X1", "A1", "C"), ("X1", "X2", "A2", "A1")]
-        for j in range(self.count):
+            solid.append((middle[len(inner) - 1], inner[-1], "B0", "V"))
+        hollow = {
+            "half_disc": [("M", "X1", "A1", "C"), ("X1", "X2", "A2", "A1")],
+            "disc": [
+                ("M", "Xm", "Xc", "C"),
+                ("C", "Xc", "X1", "A1"),
+                ("A1", "X1", "X2", "A2"),
+                ("Xm", "X2", "X1", "Xc"),
+            ],
+            "sector": [("M", "A1", "A0", "C")],
+        }[self.profile]
+        for j in range(n):
             for mirrored in (False, True):
                 yield from (([(name, mirrored, j) for name in names], SOLID) for names in solid)
                 yield from (([(name, mirrored, j) for name in names], j) for names in hollow)
-            yield [("M", False, j), ("X1", True, j), ("X2", False, j), ("X1", False, j)], j
+            if self.profile == "half_disc":
+                yield [("M", False, j), ("X1", True, j), ("X2", False, j), ("X1", False, j)], j
             if self.outline == "lobed":
-                after = (j + 1) % self.count
-                yield [("W", False, j), ("C", False, j), ("V", False, j), ("C", True, after)], SOLID
+                corner, back = inner[-1], middle[len(inner) - 1]
+                yield [(back, False, j), (corner, False, j), ("V", False, j), (corner, True, (j + 1) % n)], SOLID
 
 
 def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:

@@ -138,17 +138,25 @@ class GeneratedArm(Settings):
 
     kind: Literal["arm_generated"]
     size: Positive = setting(0.01, "size of the cells", "m")
+    cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
     layers: Positive | None = setting(None, "length along the arm; null: 2.5 times the size", "m")
+    order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
     chamber_lengths: Some[Positive] = setting((0.120, 0.120), "lengths of the chambers, one per segment", "m")
     caps: Some[Positive] = setting((0.010, 0.021, 0.005), "solid parts before, between and after the chambers", "m")
     radii: Some[Positive] = setting(
         (0.0283923, 0.0212942, 0.0165622), "radii before the first chambers and after those of every segment", "m"
     )
     chambers: Natural = setting(3, "chambers per segment")
+    profile: Word = setting("half_disc", "half_disc, disc or sector")
     outline: Word = setting("lobed", "lobed, around the chambers, or round")
     wall: Positive = setting(0.004, "thickness of the wall", "m")
     web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
     core: Positive | None = setting(None, "distance of the chambers from the axis at the base; null: the least", "m")
+    rotations: Many[float] = setting(
+        (),
+        "rotations of the chambers, one per segment; for tetrahedra and a round outline",
+        "degrees",
+    )
 
 
 MeshSettings = Annotated[

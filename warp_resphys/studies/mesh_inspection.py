@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from ..experiment.build import build_mesh
+from ..io.errors import MeshError
 from ..mesh.arm import name_surfaces
 from ..mesh.cavities import MOST_TRIANGLES, open_cavities
 from ..mesh.chambers import find_chambers
@@ -63,6 +64,8 @@ def inspect_mesh(
     rows.append(("open cavities", _cavities(mesh)))
     if file is not None:
         if isinstance(settings, GeneratedArm):
+            if settings.order == 2 and settings.cells != "tetrahedra":
+                raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
             surfaces = name_surfaces(mesh)
         write_mesh(file, mesh, surfaces)
     if picture is not None:

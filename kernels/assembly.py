@@ -155,3 +155,44 @@ def scatter_kernel(scalar: Any) -> Any:
                     values_out[b, at] = scalar(total[r, c])
 
     return scatter_blocks
+
+
+@functools.cache
+def projection_kernel(scalar: Any) -> Any:
+    """Returns `project_blocks` for values of type ``wp.float64`` or ``wp.float32``."""
+    module = named_module(f"assembly.projection.{scalar.__name__}")
+
+    @wp.kernel(module=module)
+    def project_blocks(
+        active: wp.array[int],  # (B) zero: skip the environment
+        blocks: wp.array2d[int],  # (T, 3) block, and the projections of its row and its column, or -1
+        projections: wp.array[wp.mat33d],  # (R)
+        address: wp.array2d[int],  # (blocks, 9) index in the value array, or -1
+        values_out: wp.array2d[scalar],  # (B, layout size) [N/m]
+    ):
+        """Replaces H by P H P, plus the mean diagonal entry in the directions normal to symmetry planes."""
+        b, t = wp.tid()
+        if active[b] == 0:
+            return
+        block, row, column = blocks[t, 0], blocks[t, 1], blocks[t, 2]
+        total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+        for r in range(3):
+            for c in range(3):
+                at = address[block, 3 * r + c]
+                if at < 0:
+                    at = address[block, 3 * c + r]
+                total[r, c] = wp.float64(values_out[b, at])
+        mean = wp.trace(total) / wp.float64(3.0)
+        if row >= 0:
+            total = projections[row] * total
+        if column >= 0:
+            total = total * projections[column]
+        if row >= 0 and row == column:
+            total += mean * (wp.identity(n=3, dtype=wp.float64) - projections[row])
+        for r in range(3):
+            for c in range(3):
+                at = address[block, 3 * r + c]
+                if at >= 0:
+                    values_out[b, at] = scalar(total[r, c])
+
+    return project_blocks

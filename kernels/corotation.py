@@ -43,6 +43,7 @@ def sum_at_vertices(
 
 @wp.kernel
 def rotation(
+    held: wp.array[int],  # (N) not zero: vertices without rotation
     gradient: wp.array2d[wp.mat33d],  # (B, N) up to a positive factor
     rotation_out: wp.array2d[wp.mat33d],
 ):
@@ -51,7 +52,7 @@ def rotation(
     f = gradient[b, i]
     size = wp.determinant(f)
     rotation_out[b, i] = wp.identity(n=3, dtype=wp.float64)
-    if size > SMALLEST:
+    if held[i] == 0 and size > SMALLEST:
         rotation_out[b, i] = polar_rotation((ONE / wp.pow(size, THIRD)) * f)
 
 

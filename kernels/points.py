@@ -131,6 +131,17 @@ def inertia_residual(
 
 
 @wp.kernel
+def project(
+    vertices: wp.array[int],  # (R)
+    projections: wp.array[wp.mat33d],  # (R)
+    vectors_out: wp.array2d[wp.vec3d],  # (B, N)
+):
+    """Removes the components of vectors that are normal to symmetry planes."""
+    b, r = wp.tid()
+    vectors_out[b, vertices[r]] = projections[r] * vectors_out[b, vertices[r]]
+
+
+@wp.kernel
 def tangent_product(
     nodes: wp.array2d[int],
     gradients: wp.array2d[wp.vec3d],

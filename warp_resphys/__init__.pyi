@@ -44,6 +44,7 @@ from .fem.body import PointMass as PointMass
 from .fem.rigid import Glue as Glue
 from .fem.rigid import Rigid as Rigid
 from .fem.scene import Scene as Scene
+from .fem.symmetry import SymmetryPlane as SymmetryPlane
 from .io.errors import ConvergenceError as ConvergenceError
 from .io.errors import DataFileError as DataFileError
 from .io.errors import InputError as InputError

@@ -20,6 +20,7 @@ from warp_resphys import (
 )
 from warp_resphys.dynamics import equilibrium, hessian
 from warp_resphys.dynamics.corotation import Corotation
+from warp_resphys.fem.symmetry import SymmetryPlane
 from warp_resphys.linalg.pardiso import has_pardiso
 from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
 from warp_resphys.stepping.inputs import Inputs
@@ -37,6 +38,7 @@ BODIES = {
     "tendon": lambda: Body(
         BOX, select_vertices(BOX, x=0.0), energies=[Tendons([[[0.0, 0.01, 0.04], [0.06, 0.01, 0.04]]], 400.0)]
     ),
+    "symmetry": lambda: Body(BOX, select_vertices(BOX, x=0.0), symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
 }
 
 
@@ -130,6 +132,24 @@ def test_rotations_are_those_of_the_body_since_the_factor_of_its_environment():
     torch.testing.assert_close(whole, vectors)
 
 
+def test_vertices_in_symmetry_planes_and_inverted_ones_are_not_turned():
+    sim = simulator("symmetry", "pardiso")
+    potential, vertices = sim.workspace(1).potential, np.arange(sim.body.n_vertices)
+    corotation, rest = Corotation(potential, vertices), sim.rest_state().q
+    potential.positions.copy_(rest)
+    corotation.record()
+    potential.positions.copy_(rest @ turned(0.7).T)
+    corotation.update()
+    vectors = torch.ones_like(rest)
+    corotation.rotate(vectors)
+    moved = (vectors - 1.0).abs().amax(-1)[0] > 0.1
+    assert (moved.numpy() == ((BOX.vertices[:, 1] > 1e-9) | (BOX.vertices[:, 0] < 1e-9))).all()
+    potential.positions.copy_(-rest)
+    corotation.update()
+    corotation.rotate(vectors := torch.ones_like(rest))
+    torch.testing.assert_close(vectors, torch.ones_like(rest))
+
+
 def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
     both = []
     for name in ("pardiso", "banded"):
@@ -147,6 +167,7 @@ def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
         ("tetrahedra", "quasi_newton", 0.499),
         ("hexahedra", "projective_dynamics", 0.45),
         ("rigid part", "newton", 0.45),
+        ("symmetry", "quasi_newton", 0.45),
         ("tendon", "quasi_newton", 0.45),
     ],
 )

@@ -17,6 +17,7 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
+    SymmetryPlane,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -450,3 +451,13 @@ def test_a_clamp_that_moves_through_an_obstacle_is_refused():
         with pytest.raises(InputError, match="'plate'"):
             simulator.static_equilibrium(inputs)
     simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015])))
+
+
+def test_bodies_and_inputs_that_contact_refuses():
+    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
+    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
+    with pytest.raises(InputError, match="symmetry planes has no contact"):
+        Simulator(half)
+    simulator = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
+    with pytest.raises(InputError, match="without moves=True"):
+        simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))

@@ -20,6 +20,7 @@ from warp_resphys import (
     SolverSettings,
     State,
     SurfaceContact,
+    SymmetryPlane,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -496,6 +497,8 @@ def test_refusals():
         SurfaceContact(distance=0.0)
     with pytest.raises(InputError, match="surface_friction"):
         SurfaceContact(friction=-0.1)
+    with pytest.raises(InputError, match="symmetry planes"):
+        Simulator(Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()]))
     with pytest.raises(InputError, match="midpoint"):
         Simulator(Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
     simulator = landing()

@@ -51,6 +51,16 @@ def test_halves_that_are_glued_bend_like_one_beam():
                 torch.testing.assert_close(end[i], end[k], rtol=0.0, atol=1e-14)
 
 
+def test_half_a_beam_behind_a_symmetry_plane_sags_like_the_whole_one():
+    half = [*WHOLE[:1], WHOLE[1].replace("0.03, 0.03], divisions: [10, 2, 2]", "0.015, 0.03], divisions: [10, 1, 2]")]
+    sags = []
+    for overrides in ([*half, *WHOLE[2:], "symmetry={y: 0.015}"], WHOLE):
+        built = simulator(*overrides)
+        sags.append(float((built.static_equilibrium().q[0, :, 2] - built.rest_positions[:, 2]).min()))
+    assert sags[1] < -1e-3
+    assert sags[0] == pytest.approx(sags[1], rel=1e-6)
+
+
 def test_a_region_of_another_mesh_has_its_own_material_and_may_be_rigid():
     soft = [*HALVES, "simulation.regions={body: {}, tip: {youngs_modulus: 50e3}}"]
     assert {"body_youngs_modulus", "tip_youngs_modulus"} <= set(simulator(*soft).parameters)
@@ -89,6 +99,7 @@ def test_a_run_accepts_them():
             "cannot be joined",
         ),
         ("glued=[{region: lid, at: {x: 0.05}, to: body}]", r"glued\[0\]: "),
+        ("symmetry={y: 0.5}", "no vertex lies in the symmetry plane"),
         ("glued=[{region: tip, at: {x: 0.0}, to: body}]", r"glued\[0\].at: no vertex of the region 'tip'"),
         ("glued=[{region: tip, at: {x: 0.1}, to: body}]", "farther than the tolerance"),
         ("parts.tip.shift=[0,0]", "parts.tip.shift"),

@@ -14,6 +14,7 @@ from warp_resphys import (
     Muscles,
     Pressure,
     Simulator,
+    SymmetryPlane,
     Tendons,
     box_hexahedra,
     find_chambers,
@@ -67,3 +68,9 @@ def test_the_motion_moves_with_the_body(name):
 def test_a_matrix_that_is_no_rotation_is_refused(rotation):
     with pytest.raises(InputError, match="the rotation is"):
         BODIES["tendon"][0].moved(rotation, SHIFT)
+
+
+def test_a_symmetric_body_stays():
+    plane = SymmetryPlane((0.0, 1.0, 0.0))
+    with pytest.raises(InputError, match="symmetry plane"):
+        Body(BOX, symmetry=[plane], **CLAMPED).moved(ROTATION, SHIFT)

@@ -21,6 +21,7 @@ class BlockPattern:
         vertices: (N, 3) rest positions [m].
         eliminated: (H,) vertices that are not unknowns: the fixed and the dependent ones.
         sets: sets of points of all energies.
+        sliding: (R,) vertices in symmetry planes.
 
     Attributes:
         free: (F,) vertices that are not fixed.
@@ -32,6 +33,7 @@ class BlockPattern:
         diagonal_vertex: (E,) vertex of a diagonal block, else -1.
         offsets: first cell block of each point set.
         n_cell_blocks: number of cell blocks of all point sets.
+        sliding_blocks: (T, 3) blocks of sliding vertices, and the projections of their row and column, or -1.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class BlockPattern:
         vertices: NDArray[np.float64],
         eliminated: NDArray[np.int64],
         sets: Sequence[Points],
+        sliding: Sequence[int] | NDArray[np.int64] = (),
     ) -> None:
         is_free = np.ones(len(vertices), dtype=bool)
         is_free[eliminated] = False
@@ -60,6 +63,11 @@ class BlockPattern:
             self.offsets.append(self.n_cell_blocks)
             self.n_cell_blocks += len(pair)
         self._collect(np.concatenate(sources), np.concatenate(pairs))
+        projection = np.full(len(vertices), -1)
+        projection[np.asarray(sliding, dtype=np.int64)] = np.arange(len(sliding))
+        ends = projection[self.free][np.stack([self.rows, self.cols], axis=1)]
+        touched = np.flatnonzero((ends >= 0).any(axis=1))
+        self.sliding_blocks = np.column_stack([touched, ends[touched]])
 
     def unknowns(self, device: torch.device) -> torch.Tensor:
         """Returns the indices (3 F,) of the free coordinates."""
@@ -118,6 +126,11 @@ class HessianAssembly:
         scalar = wp.float64 if solver.dtype == torch.float64 else wp.float32
         values = warp_view(self.values, scalar)
         commands.append(p.record(kernels.scatter_kernel(scalar), dim, inputs, [values]))
+        if count := len(pattern.sliding_blocks):
+            projected = p.upload(pattern.sliding_blocks.astype(np.int32), int)
+            planes = warp_view(p.coordinates.projections, wp.mat33d)
+            inputs = [active, projected, planes, p.upload(solver.address, int)]
+            commands.append(p.record(kernels.projection_kernel(scalar), (p.batch, count), inputs, [values]))
         self.launches = p.capture(*commands)
 
     def __call__(self) -> torch.Tensor:

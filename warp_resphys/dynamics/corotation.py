@@ -17,7 +17,7 @@ from ..kernels import corotation as kernels
 
 
 class Corotation:
-    """Rotations of a batch since its last factors.
+    """Rotations of a batch since its last factors; none of vertices in symmetry planes.
 
     Args:
         potential: the potential, whose positions are used.
@@ -43,7 +43,9 @@ class Corotation:
                 p.record(kernels.cell_gradients, (p.batch, s.cells), [s.nodes, operators, positions], [gradient]),
                 p.record(kernels.sum_at_vertices, shape, [s.start, s.incident, s.nodes_per_cell, gradient], [total]),
             ]
-        commands.append(p.record(kernels.rotation, shape, [total], [rotation]))
+        held = np.zeros(shape[1], dtype=np.int32)
+        held[p.coordinates.sliding.cpu().numpy()] = 1
+        commands.append(p.record(kernels.rotation, shape, [p.upload(held, int), total], [rotation]))
         own = [p.upload(vertices.astype(np.int32), int), before, rotation]
         self._compute = p.capture(*commands)
         self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), own, [since]))

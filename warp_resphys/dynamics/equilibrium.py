@@ -276,7 +276,7 @@ def _solve(
     parts: list[SolveReport] = []
     while not potential.place_fixed(fixed, fixed_positions, _LEAST_WAY if len(parts) < _MOST_PARTS else 1.0):
         assert potential.feasible is not None
-        parts.append(solver.solve(potential.feasible.clone()))
+        parts.append(solver.solve(potential.coordinates.hold(potential.feasible.clone())))
         potential.feasible.copy_(potential.positions)
     if len(fixed):
         start = start.clone()

@@ -62,8 +62,9 @@ class Linearisation:
         self._at, self._has_factor = self.start, True
 
     def hold(self, x: torch.Tensor) -> torch.Tensor:
-        """Returns x with fixed and dependent vertices in their places."""
-        return self._coordinates.expand(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
+        """Returns x with fixed and dependent vertices in their places, and sliding vertices in their planes."""
+        held = self._coordinates.hold(x.index_copy(1, self._workspace.fixed, self._fixed_positions))
+        return self._coordinates.expand(held)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
         """Returns g (B, N, 3) at x [N], zero at fixed vertices: the additional force for which x solves the step."""

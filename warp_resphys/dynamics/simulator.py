@@ -113,6 +113,8 @@ class Simulator:
         self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
         if len(self.fixed) == body.n_vertices:
             raise InputError("every vertex is fixed: leave some free to move.")
+        if settings.name == "projective_dynamics" and len(body.coordinates.sliding):
+            raise InputError("solver is projective_dynamics, which knows no symmetry planes: choose quasi_newton.")
         if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
@@ -123,7 +125,7 @@ class Simulator:
         self._energies, self._terms = energies, PotentialTerms(energies, self._coordinates)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
         sets = [points for item in placed for points in item.points]
-        pattern = BlockPattern(body.vertices, eliminated, sets)
+        pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
         self._make_workspace = partial(
             Workspace, placed, body.coordinates, self.fixed, pattern, device=self.device, dtype=self.dtype
         )
@@ -367,7 +369,7 @@ class Simulator:
             inputs: inputs, of which the poses of obstacles matter.
             parameters: parameters or prepared constants (`prepare`).
         """
-        if len(self.fixed):
+        if len(self.fixed) or len(self.body.coordinates.sliding):
             return True
         with torch.no_grad():
             moved = replace(state, q=state.q + _SHIFT)

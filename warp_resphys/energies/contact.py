@@ -502,8 +502,9 @@ class BoundContact(BoundEnergy):
 
     def _check_body(self, body: Body) -> None:
         """Raises InputError for a body whose vertices contact cannot move on their own."""
-        if len(body.glued):
-            raise InputError("a body with glued vertices has no contact with obstacles: leave one of them out.")
+        if len(body.symmetry) or len(body.glued):
+            what = "symmetry planes" if len(body.symmetry) else "glued vertices"
+            raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
 
     def _check_start(self, rest: torch.Tensor) -> None:
         """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -161,25 +162,39 @@ class IncrementalPotential(Launcher):
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
+        project = self._projections(residual)
+        self._load_commands += project
         self._load_commands.append(
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
         )
         energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
         sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
+        self._internal_commands += project
         self._internal_commands.append(
             self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
         )
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)
 
+    def _projections(self, residual: Any) -> list[Any]:
+        """Returns the launch that removes the residual normal to symmetry planes, if there are any."""
+        c = self.coordinates
+        if not c.slides:
+            return []
+        planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
+        return [self.record(kernels.project, (self.batch, len(c.sliding)), planes, [residual])]
+
     def restrict(self, field: torch.Tensor) -> torch.Tensor:
-        """Returns a field (B, N, 3, ...) that is zero at vertices without unknowns."""
-        return field * self.free_mask.view(-1, *[1] * (field.ndim - 2))
+        """Returns a field (B, N, 3, ...) that is zero at vertices without unknowns and normal to symmetry planes."""
+        mask = self.free_mask.view(-1, *[1] * (field.ndim - 2))
+        return self.coordinates.restrict(field * mask)
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers, with zero inertia and load at fixed vertices."""
         own = self.terms
         own.target.copy_(terms.target.detach())
+        if self.coordinates.slides:
+            own.target.copy_(self.coordinates.hold(own.target))
         torch.mul(terms.inertia.detach(), self.free_mask, out=own.inertia)
         torch.mul(terms.force.detach(), self.free_mask[:, None], out=own.force)
         for name, buffer in own.values.items():
@@ -230,6 +245,9 @@ class IncrementalPotential(Launcher):
         parts = (term.low_rank(values, self._position_view) for term, values in pairs)
         columns = [part for part in parts if part is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
+        if self.low_rank is not None and self.coordinates.slides:
+            whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
+            self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
 
     def pair_tangents(self, clamp: bool = False, active: torch.Tensor | None = None) -> list[PairTangents]:
         """Returns the parts of the Hessian at ``positions`` that couple vertices of different cells.
@@ -249,11 +267,11 @@ class IncrementalPotential(Launcher):
         return self._feasible[0][0] if self._feasible else None
 
     def improved_start(self, start: torch.Tensor) -> torch.Tensor:
-        """Returns positions (B, N, 3) at which a solve starts instead of `start` (`Term.improve_start`)."""
+        """Returns positions (B, N, 3) at which a solve starts instead of `start` (`Term.improve_start`), in planes."""
         positions = start.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
         for term in self.energies:
             term.improve_start(warp_view(positions, wp.vec3d))
-        return positions
+        return self.coordinates.hold(positions)
 
     def check_start(self, follows: bool) -> None:
         """Checks `feasible`, with fixed vertices where they were before (`Term.check_start`).

@@ -170,10 +170,10 @@ class BoundSurfaceContact(BoundEnergy):
         self._contact = contact
         body, rest = site.body, site.rest_positions
         members = body.bodies.values() if isinstance(body, Scene) else (body,)
-        if any(member.glued for member in members):
+        if any(member.glued or member.symmetry for member in members):
             raise InputError(
-                "contact between surfaces does not support glue, where the boundary of a mesh is no surface: leave it "
-                "out."
+                "contact between surfaces does not support symmetry planes or glue, where the boundary of a mesh is no "
+                "surface: leave them out."
             )
         (points,) = site.points
         assert isinstance(points, SurfacePoints)

@@ -24,6 +24,7 @@ from ..energies.catalogue import make_material
 from ..energies.materials import Material
 from ..fem.body import Body
 from ..fem.rigid import Glue, Rigid
+from ..fem.symmetry import SymmetryPlane
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
 from ..io.machine import find_device
@@ -47,6 +48,7 @@ from ..settings.mesh import (
     RodMesh,
     ShippedArm,
     SurfaceMesh,
+    SymmetrySettings,
     TetrahedralBox,
 )
 from ..settings.trials import BindingSettings, MarkerSettings, RigidBodySettings
@@ -200,8 +202,18 @@ def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) 
     fixed = () if settings.fixed is None else select_vertices(mesh, **settings.fixed.arguments())
     rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
     glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
+    planes = _symmetry_planes(settings.symmetry)
     physics = dict(settings.physics)
-    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, glued=glued, **physics)
+    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, glued=glued, symmetry=planes, **physics)
+
+
+def _symmetry_planes(settings: SymmetrySettings | None) -> list[SymmetryPlane]:
+    """Returns the planes of the group ``symmetry``."""
+    if settings is None:
+        return []
+    at = [getattr(settings, axis) for axis in "xyz"]
+    normals = np.eye(3).tolist()
+    return [SymmetryPlane(n, x, settings.tolerance) for n, x in zip(normals, at, strict=True) if x is not None]
 
 
 def whole_mesh(settings: BodySettings) -> Mesh:

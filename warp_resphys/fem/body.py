@@ -15,6 +15,7 @@ from ..mesh.mesh import Mesh
 from .coordinates import Coordinates, rigid_weights
 from .elements import Discretisation, Points, discretise
 from .rigid import Glue, Rigid
+from .symmetry import SymmetryPlane
 
 MASS_MODES = ("row_sum", "per_vertex")
 
@@ -91,6 +92,7 @@ class Body:
     energies: Sequence[BodyEnergy] = field(default=())  # energies besides the material: pressure, fibres
     rigid: Mapping[str, Rigid] = field(default_factory=dict)  # rigid parts, by region of the mesh
     glued: Sequence[Glue] = field(default=())  # vertices that follow a region with a non-matching mesh
+    symmetry: Sequence[SymmetryPlane] = field(default=())  # planes in which their vertices slide
     # sets of integration points of each energy
     energy_points: tuple[tuple[Points, ...], ...] = field(init=False, repr=False, compare=False)
 
@@ -111,8 +113,8 @@ class Body:
         if duplicates:
             raise InputError(f"two energies of the body depend on {duplicates[0]}: put them into one.")
         object.__setattr__(self, "energy_points", tuple(energy.points(self.mesh) for energy in self.energies))
-        if self.rigid or self.glued:
-            self.coordinates  # noqa: B018  # Checks rigid parts and glue.
+        if self.rigid or self.glued or self.symmetry:
+            self.coordinates  # noqa: B018  # Checks rigid parts, glue and planes.
 
     @classmethod
     def rigid_body(cls, mesh: Mesh, part: Rigid | None = None, **options: Any) -> "Body":
@@ -141,13 +143,17 @@ class Body:
             translation: (3,) t [m].
 
         Raises:
-            InputError: a matrix that is no rotation.
+            InputError: a body with a symmetry plane, or a matrix that is no rotation.
         """
         r, t = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
         if r.shape != (3, 3) or not np.allclose(r @ r.T, np.eye(3), atol=1e-9) or np.linalg.det(r) < 0.0:
             raise InputError(f"the rotation is {r.tolist()}: give a (3, 3) matrix of orthogonal rows, without mirror.")
         if t.shape != (3,) or not np.isfinite(t).all():
             raise InputError(f"the translation is {t.tolist()}: give three numbers, in m.")
+        if self.symmetry:
+            raise InputError(
+                "a body with a symmetry plane stays in its place: leave the plane out, and model all of it."
+            )
         mesh = replace(self.mesh, vertices=self.mesh.vertices @ r.T + t)
         return replace(self, mesh=mesh, energies=[energy.moved(r, t) for energy in self.energies])
 
@@ -162,10 +168,10 @@ class Body:
         return self.mesh.vertices
 
     def __repr__(self) -> str:
-        """Mesh, number of fixed vertices, rigid parts, energies, and number of glued regions."""
+        """Mesh, number of fixed vertices, rigid parts, energies, and numbers of glued regions and symmetry planes."""
         parts = [repr(self.mesh), f"{len(self.fixed_vertices)} fixed vertices"]
         parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
-        parts += [f"{len(self.glued)} glued"] if self.glued else []
+        parts += [f"{len(given)} {name}" for name in ("glued", "symmetry") if (given := getattr(self, name))]
         return f"Body({', '.join(parts)})"
 
     @property
@@ -202,7 +208,7 @@ class Body:
 
     @property
     def coordinates(self) -> Coordinates:
-        """The map from control vertices to all vertices."""
+        """The map from control vertices, some of which slide in planes, to all vertices."""
         return self._dependence[1]
 
     @cached_property
@@ -210,8 +216,9 @@ class Body:
         """Control vertices of the rigid parts, and the map from control vertices to all vertices.
 
         Raises:
-            InputError: a rigid part with only some vertices fixed, two parts that share vertices, a flat part,
-                or glued vertices that are fixed, rigid, or too far from the region they are glued to.
+            InputError: a rigid part with only some vertices fixed, two parts that share vertices, a flat part, a
+                symmetry plane without vertices, or glued vertices that are fixed, rigid, or too far from the region
+                they are glued to.
             MeshError: an unknown region.
         """
         weights: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
@@ -230,14 +237,15 @@ class Body:
             if other := next((part_of_vertex[i] for i in vertices.tolist() if i in part_of_vertex), None):
                 raise InputError(f"the rigid parts {other!r} and {name!r} share vertices: make them one region.")
             part_of_vertex |= dict.fromkeys(vertices.tolist(), name)
-            controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name)
+            controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name, self.symmetry)
             weights |= part_weights
         for glue in self.glued:
             glued = self._glued_weights(glue, part_of_vertex)
             if twice := weights.keys() & glued.keys():
                 raise InputError(f"vertex {min(twice)} is glued twice: leave it out of the glue to {glue.to!r}.")
             weights |= glued
-        return controls, Coordinates.of(self.n_vertices, weights)
+        coordinates = Coordinates.of(self.n_vertices, weights)
+        return controls, coordinates.with_planes(self.symmetry, self.mesh.vertices, self.fixed_vertices)
 
     def _glued_weights(
         self, glue: Glue, rigid: Mapping[int, str]

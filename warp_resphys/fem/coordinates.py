@@ -1,14 +1,15 @@
-"""Vertices as weighted sums of control vertices, x = W r.
+"""Vertices as weighted sums of control vertices that may slide in planes, x = W (P r + o).
 
 A free vertex is its own control vertex. A glued vertex has the shape functions of the face it is glued to as weights.
 A rigid part is an affine body (Lan et al., Affine Body Dynamics, 2022): it is controlled by four of its vertices, and
 the weights of the others are their barycentric coordinates. As W acts on each component alike, the operator
 F = sum_a x_a g_a^T of a point keeps its form, F = sum_c r_c (sum_a W_ac g_a)^T: energies use control vertices only, and
-the Hessian in r, W^T H W, is assembled without forming H.
+the Hessian in r, W^T H W, is assembled without forming H. A control vertex in a symmetry plane through its rest
+position x0 moves along the plane only: P = I - n n^T and o = (I - P) x0; for all other vertices P = I.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..io.errors import InputError
 from .elements import Points
+from .symmetry import SymmetryPlane, tangential_projections
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -35,6 +37,9 @@ class Coordinates:
     n_vertices: int  # N
     dependent: IntArray  # (S,) vertices determined by control vertices, ascending
     weights: scipy.sparse.csr_array  # (S, N) weights of the control vertices in each dependent vertex
+    sliding: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (R,) control vertices in planes
+    projections: FloatArray = field(default_factory=lambda: np.zeros((0, 3, 3)))  # (R, 3, 3) P of the sliding vertices
+    offsets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (R, 3) o of the sliding vertices [m]
 
     @classmethod
     def of(cls, n_vertices: int, weights: Mapping[int, tuple[IntArray, FloatArray]]) -> "Coordinates":
@@ -67,9 +72,45 @@ class Coordinates:
     def joined(cls, maps: "Sequence[Coordinates]") -> "Coordinates":
         """Returns the map of several bodies with their vertices concatenated."""
         first = np.cumsum([0, *(own.n_vertices for own in maps)])
-        dependent = np.concatenate([own.dependent + start for own, start in zip(maps, first, strict=False)])
+        dependent, sliding = (
+            np.concatenate([getattr(own, name) + start for own, start in zip(maps, first, strict=False)])
+            for name in ("dependent", "sliding")
+        )
         weights = scipy.sparse.csr_array(scipy.sparse.block_diag([own.weights for own in maps]))
-        return cls(int(first[-1]), dependent, weights)
+        projections, offsets = (np.concatenate([getattr(own, n) for own in maps]) for n in ("projections", "offsets"))
+        return cls(int(first[-1]), dependent, weights, sliding, projections, offsets)
+
+    def with_planes(self, planes: Sequence[SymmetryPlane], vertices: FloatArray, fixed: IntArray) -> "Coordinates":
+        """Returns the map with vertices that slide in symmetry planes.
+
+        Args:
+            planes: the planes.
+            vertices: (N, 3) rest positions [m].
+            fixed: (D,) fixed vertices, which do not slide.
+
+        Raises:
+            InputError: a plane without vertices, or with a dependent vertex whose control vertices lie outside of it.
+        """
+        if not planes:
+            return self
+        contained = np.stack([plane.contains(vertices) for plane in planes], axis=1)  # (N, S)
+        for plane, inside in zip(planes, contained.T, strict=True):
+            if not inside.any():
+                raise InputError(
+                    f"no vertex lies in the symmetry plane with normal {plane.normal} and offset {plane.offset:g} m: "
+                    "move the plane or the mesh."
+                )
+            controls = abs(self.weights[inside[self.dependent]]).sum(axis=0) > _ROUNDING
+            if (controls & ~inside).any():
+                raise InputError(
+                    f"a glued or rigid vertex in the symmetry plane with normal {plane.normal} is controlled by "
+                    "vertices outside of it: glue it to a face that the plane cuts too, or cut the rigid part by it."
+                )
+        contained[self.dependent] = contained[fixed] = False
+        sliding = np.flatnonzero(contained.any(axis=1))
+        projections = tangential_projections(np.array([plane.normal for plane in planes]), contained[sliding])
+        offsets = np.einsum("rij,rj->ri", np.eye(3) - projections, vertices[sliding])
+        return replace(self, sliding=sliding, projections=projections, offsets=offsets)
 
     def __bool__(self) -> bool:
         """Whether any vertex depends on others."""
@@ -144,9 +185,12 @@ class DeviceCoordinates:
 
     Attributes:
         dependent: (S,) vertices determined by control vertices.
+        sliding: (R,) control vertices in symmetry planes.
+        projections: (R, 3, 3) projections onto the directions along these planes.
         controls: (S, w) control vertices of the dependent ones, in any order.
         weights: (S, w) their weights, zero in places that a vertex does not need.
         depends: whether there are dependent vertices.
+        slides: whether there are sliding vertices.
     """
 
     def __init__(self, coordinates: Coordinates, like: torch.Tensor) -> None:
@@ -159,7 +203,11 @@ class DeviceCoordinates:
         self._carried = self.dependent[entry // self.controls.shape[1]]
         self._shares = self.weights.ravel()[entry, None]
         self._moved, self._counts = self.controls.ravel()[entry].unique_consecutive(return_counts=True)
-        self.depends = len(coordinates.dependent) > 0
+        self.depends, self.slides = len(coordinates.dependent) > 0, len(coordinates.sliding) > 0
+        self.sliding = torch.as_tensor(coordinates.sliding, device=like.device)
+        self.projections, self._offsets = (
+            torch.as_tensor(values).to(like) for values in (coordinates.projections, coordinates.offsets)
+        )
 
     def expand(self, r: torch.Tensor) -> torch.Tensor:
         """Returns a field (B, N, ...) with the values at dependent vertices computed from the control vertices."""
@@ -168,32 +216,52 @@ class DeviceCoordinates:
         at = [r.index_select(1, column) for column in self.controls.unbind(1)]
         return r.index_copy(1, self.dependent, weighted_sum(self.weights, at))
 
+    def hold(self, r: torch.Tensor) -> torch.Tensor:
+        """Returns positions (B, N, 3) with those of sliding vertices projected onto their planes, P r + o."""
+        if not self.slides:
+            return r
+        return r.index_copy(1, self.sliding, self._project(r) + self._offsets)
+
+    def restrict(self, field: torch.Tensor) -> torch.Tensor:
+        """Returns forces or displacements (B, N, 3, ...) of control vertices, without those normal to planes, P f."""
+        return field.index_copy(1, self.sliding, self._project(field)) if self.slides else field
+
+    def _project(self, field: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("rij,brj...->bri...", self.projections, field.index_select(1, self.sliding))
+
     def reduce(self, forces: torch.Tensor) -> torch.Tensor:
-        """Returns W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
+        """Returns P W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
         if not self.depends:
-            return forces
+            return self.restrict(forces)
         rows = forces.index_select(1, self._carried).movedim(1, 0).flatten(1) * self._shares
         sums = torch.segment_reduce(rows, "sum", lengths=self._counts, axis=0, unsafe=True)
         sums = sums.view(-1, forces.shape[0], *forces.shape[2:]).movedim(0, 1)
         kept = forces.index_fill(1, self.dependent, 0.0)
-        return kept.index_copy(1, self._moved, kept.index_select(1, self._moved) + sums)
+        return self.restrict(kept.index_copy(1, self._moved, kept.index_select(1, self._moved) + sums))
 
 
-def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> IntArray:
+def control_vertices(
+    vertices: FloatArray, candidates: IntArray, name: str, planes: Sequence[SymmetryPlane] = ()
+) -> IntArray:
     """Returns four vertices that span a large tetrahedron, so that the weights of the others are small.
+
+    A vertex in a symmetry plane is controlled by vertices in that plane: three lie in a plane that cuts the part, two
+    in both of two planes, one in all of three.
 
     Args:
         vertices: (N, 3) rest positions [m].
         candidates: vertices to choose from.
         name: name of the part, for messages.
+        planes: symmetry planes.
 
     Raises:
-        InputError: all candidates lie in a plane.
+        InputError: all candidates lie in a plane, or they have no such vertices in the symmetry planes.
     """
     places = vertices[candidates]
+    inside = [own for plane in planes if (own := plane.contains(places)).any()]
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     chosen: list[int] = []
-    for _ in range(4):
+    for allowed in _corner_sets(inside, len(candidates)):
         if not chosen:
             heights = -(places @ np.array([1.0, 1e-3, 1e-6]))
         else:
@@ -201,16 +269,35 @@ def control_vertices(vertices: FloatArray, candidates: IntArray, name: str) -> I
             basis = np.linalg.qr((base[1:] - base[0]).T)[0] if len(chosen) > 1 else np.zeros((3, 0))
             offsets = places - base[0]
             heights = np.linalg.norm(offsets - (offsets @ basis) @ basis.T, axis=1)
-        chosen.append(int(heights.argmax()))
-        if len(chosen) > 1 and not heights[chosen[-1]] > _FLAT * size:
-            raise InputError(f"the rigid part {name!r} is flat: it needs vertices that do not lie in a plane.")
-    for _ in range(10):  # Exchange corners to enlarge the tetrahedron, until no weight exceeds one.
+        chosen.append(int(np.where(allowed, heights, -np.inf).argmax()))
+        if not allowed.any() or (len(chosen) > 1 and not heights[chosen[-1]] > _FLAT * size):
+            raise InputError(
+                f"the rigid part {name!r} has too few vertices along the {len(inside)} symmetry planes that touch it: "
+                "cut it by them."
+                if inside
+                else f"the rigid part {name!r} is flat: it needs vertices that do not lie in a plane."
+            )
+    for _ in range(0 if inside else 10):  # Exchange corners to enlarge the tetrahedron, until no weight exceeds one.
         weights = barycentric(places[chosen], places)
         point, corner = np.unravel_index(int(np.abs(weights).argmax()), weights.shape)
         if abs(weights[point, corner]) < 1.0 + 1e-9:
             break
         chosen[corner] = int(point)
     return np.sort(candidates[chosen])
+
+
+def _corner_sets(inside: Sequence[NDArray[np.bool_]], count: int) -> list[NDArray[np.bool_]]:
+    """Returns the candidates (count,) of each of the four control vertices, from those inside each symmetry plane."""
+    match inside:
+        case []:
+            return [np.ones(count, dtype=bool)] * 4
+        case [a]:
+            return [a, a, a, ~a]
+        case [a, b]:
+            return [a & b, a & b, a & ~b, b & ~a]
+        case [a, b, c, *_]:
+            return [a & b & c, a & b & ~c, b & c & ~a, a & c & ~b]
+    raise AssertionError
 
 
 def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
@@ -220,10 +307,10 @@ def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
 
 
 def rigid_weights(
-    vertices: FloatArray, members: IntArray, name: str
+    vertices: FloatArray, members: IntArray, name: str, planes: Sequence[SymmetryPlane] = ()
 ) -> tuple[IntArray, dict[int, tuple[IntArray, FloatArray]]]:
     """Returns the four control vertices of a rigid part, and control vertices and weights of its other vertices."""
-    controls = control_vertices(vertices, members, name)
+    controls = control_vertices(vertices, members, name, planes)
     others = np.setdiff1d(members, controls)
     weights = barycentric(vertices[controls], vertices[others])
     return controls, {int(i): (controls, w) for i, w in zip(others, weights, strict=True)}

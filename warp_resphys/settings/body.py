@@ -8,7 +8,7 @@ from typing_extensions import override
 from ..io.classes import ClassSettings, package_of
 from ..io.errors import listed
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
-from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings
+from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
 from .obstacles import ContactSettings, ObstacleSettings, SurfaceContactSettings
 
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
@@ -266,6 +266,7 @@ class BodySettings(Settings):
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
     fixed: PlaceSettings | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
+    symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers")
     tendons: TendonSettings | None = setting(None, "tendons that pull")
@@ -287,7 +288,7 @@ class BodySettings(Settings):
     def _touches(self) -> Self:
         if not self.obstacles and self.contact != ContactSettings():
             raise ValueError("contact is set, but obstacles has none: name an obstacle, or leave contact out.")
-        if self.fixed is None and not self.obstacles:
+        if self.fixed is None and not self.obstacles and self.symmetry is None:
             raise ValueError("fixed is null, and obstacles has none that the body lies on: name fixed vertices.")
         for key in ("stiffness", "friction"):
             values = getattr(self.contact, key)

@@ -44,6 +44,15 @@ class PlaceSettings(_Given):
     tolerance: Positive | None = setting(None, "largest distance from the plane; null: 1e-9", "m")
 
 
+class SymmetrySettings(_Given):
+    """Symmetry planes: the mesh is one side of them, and its vertices in a plane only move within it."""
+
+    x: float | None = setting(None, "position of the plane normal to x; null: none", "m")
+    y: float | None = setting(None, "position of the plane normal to y", "m")
+    z: float | None = setting(None, "position of the plane normal to z", "m")
+    tolerance: Positive = setting(1e-9, "largest distance of a vertex in a plane", "m")
+
+
 class BoxSettings(_Given):
     """Cells with their centres in a box."""
 

@@ -87,16 +87,23 @@ def test_scenes_with_depths_lenses_and_a_scan(tmp_path):
 
 
 def points_of(path):
-    """Points of a tetrahedron, in a format for each extension."""
+    """Points of a tetrahedron with a colour, in a format for each extension."""
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    if path.suffix == ".npy":
+    header = "# .PCD\nFIELDS rgb x y z\nSIZE 4 4 4 4\nTYPE U F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\n"
+    rows = np.column_stack([np.full(4, 7.0), points])
+    if path.name == "ascii.pcd":
+        path.write_text(header + "DATA ascii\n" + "\n".join(" ".join(f"{x:g}" for x in row) for row in rows))
+    elif path.name == "binary.pcd":
+        kinds = [("rgb", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+        path.write_bytes((header + "DATA binary\n").encode() + np.array([*map(tuple, rows)], dtype=kinds).tobytes())
+    elif path.suffix == ".npy":
         np.save(path, points)
     else:
         trimesh.PointCloud(points).export(path)
     return points
 
 
-@pytest.mark.parametrize("name", ["scan.npy", "scan.ply", "scan.xyz"])
+@pytest.mark.parametrize("name", ["ascii.pcd", "binary.pcd", "scan.npy", "scan.ply", "scan.xyz"])
 def test_scans_of_points(tmp_path, name):
     expected = points_of(tmp_path / name)
     points, normals = read_scan(tmp_path / name, 1e-3)
@@ -115,11 +122,13 @@ def test_a_scanned_surface_has_points_on_its_triangles_and_outer_normals(tmp_pat
 def test_files_that_are_no_scans_are_said(tmp_path):
     (tmp_path / "scan.txt").write_text("0 0 0")
     (tmp_path / "scan.ply").write_text("nothing")
+    (tmp_path / "packed.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
     np.save(tmp_path / "flat.npy", np.zeros((4, 2)))
     np.save(tmp_path / "empty.npy", np.full((4, 3), np.nan))
     for name, words in {
-        "scan.txt": "its extension is none of .npy, .ply",
+        "scan.txt": "its extension is none of .npy, .pcd, .ply",
         "scan.ply": "cannot read a scan from",
+        "packed.pcd": "must be ascii or binary",
         "flat.npy": r"not \(points, 3\)",
         "empty.npy": "has no points",
         "none.ply": "there is no such file",

@@ -11,6 +11,7 @@ from .outlines import FloatArray
 
 _READ_BY_TRIMESH = (".ply", ".xyz", ".obj", ".off", ".stl")
 _SAMPLED = 20_000  # points on the triangles of a surface
+_PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray, FloatArray | None]:
@@ -30,10 +31,12 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
     try:
         if path.suffix == ".npy":
             points = np.asarray(read_arrays(path)[""], dtype=np.float64)
+        elif path.suffix == ".pcd":
+            points = _pcd(path)
         elif path.suffix in _READ_BY_TRIMESH:
             points, normals = _by_trimesh(path, seed)
         else:
-            known = ", ".join((".npy", *_READ_BY_TRIMESH))
+            known = ", ".join((".npy", ".pcd", *_READ_BY_TRIMESH))
             raise ValueError(f"its extension is none of {known}")
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"it has the shape {points.shape}, not (points, 3)")
@@ -59,3 +62,27 @@ def _by_trimesh(path: Path, seed: int) -> tuple[FloatArray, FloatArray | None]:
         points, faces = trimesh.sample.sample_surface(read, _SAMPLED, seed=seed)
         return np.asarray(points, dtype=np.float64), np.asarray(read.face_normals[faces], dtype=np.float64)
     return np.asarray(read.vertices, dtype=np.float64), None
+
+
+def _pcd(path: Path) -> FloatArray:
+    """Points of a file of the Point Cloud Library, as text or binary."""
+    content, start, head = path.read_bytes(), 0, dict[str, list[str]]()
+    while "DATA" not in head:
+        end = content.index(b"\n", start)
+        key, *values = content[start:end].decode("ascii").split() or ["#"]
+        head[key], start = values, end + 1
+    counts = [int(count) for count in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
+    if head["DATA"] == ["ascii"]:
+        column = dict(zip(head["FIELDS"], np.cumsum([0, *counts]), strict=False))
+        rows = np.array([line.split() for line in content[start:].decode("ascii").splitlines() if line], dtype=float)
+        return np.asarray(rows[:, [column[axis] for axis in "xyz"]])
+    if head["DATA"] != ["binary"]:
+        raise ValueError(f"its data are {' '.join(head['DATA'])}, and must be ascii or binary")
+    fields = [
+        (f"{number}_{name}" if name == "_" else name, f"<{_PCD_TYPES[kind]}{size}", (count,))
+        for number, (name, kind, size, count) in enumerate(
+            zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True)
+        )
+    ]
+    rows = np.frombuffer(content, np.dtype(fields), int(head["POINTS"][0]), start)
+    return np.concatenate([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)

@@ -91,7 +91,7 @@ class PoseSettings(Settings):
     mask: ColourSettings | None = setting(None, "colours of the body, where its frames have no masks; null: data.mask")
     outline: bool = setting(True, "whether the body's outline is compared")
     points: Word | None = setting(None, "file of tracked points, a row per frame")
-    cloud: Word | None = setting(None, "file of a scan: .ply, .xyz, .npy, .obj, .off or .stl")
+    cloud: Word | None = setting(None, "file of a scan: .ply, .xyz, .pcd, .npy, .obj, .off or .stl")
     depth: bool = setting(True, "whether depth images of its frames are compared")
     gravity: Vector | None = setting(None, "gravity in the axes of the scene; null: as configured", "m/s^2")
     clamp_turn: float = setting(0.0, "rotation of the second clamp against the first", "degrees")

@@ -10,7 +10,8 @@ For example::
             return (between(self.pairs),)
 
 The function takes the kinematic variable of a point, a vector (a position, a difference of positions) or a matrix (a
-deformation gradient), and the values at the point: parameters and inputs, in the order of their declaration. `kernels.pointwise` describes the accuracy of the derivatives.
+deformation gradient), and the values at the point: parameters and inputs, in the order of their declaration.
+`kernels.pointwise` describes the accuracy of the derivatives.
 """
 
 from abc import abstractmethod

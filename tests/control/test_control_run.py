@@ -249,16 +249,6 @@ class TestReducedTwin:
         moved = np.abs(twin.now.markers - now.markers).max()
         assert np.abs(stepped - seen - (twin.now.markers - now.markers)).max() < 0.6 * moved
 
-    def test_packets_that_come_late_change_nothing(self, corrected, swing):
-        both = [self.twin(corrected) for _ in range(2)]
-        order = list(range(20))
-        order[7], order[9] = order[9], order[7]
-        for twin, numbers in zip(both, (range(20), order), strict=True):
-            for number in numbers:
-                twin.take(number * corrected.time_step, swing[number], tendon_tension=self.commands)
-                _ = twin.now
-        np.testing.assert_array_equal(both[0].now.markers, both[1].now.markers)
-
     def test_it_is_a_setting(self, folder):
         settings = TwinSettings(
             horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"

@@ -44,12 +44,6 @@ def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
     np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
 
 
-def test_missing_marker_names_it_and_what_is_there(trajectory):
-    recording = Recording(("a", "b", "c"), trajectory, 100.0, Path("swing.c3d"))
-    with pytest.raises(DataFileError, match="'d'"):
-        recording.select(["a", "d"])
-
-
 def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(DataFileError, match="No such file"):
         read_recording(tmp_path / "absent.c3d")

@@ -7,7 +7,6 @@ import pytest
 from warp_resphys.data.recordings.jumps import find_jumps, find_swaps
 from warp_resphys.data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
 from warp_resphys.data.recordings.quality import check_base, compare_base, noise_level, quality, quality_table
-from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
@@ -75,14 +74,6 @@ def test_interpolation_follows_a_swing(rate):
     assert error < 1.1 * bound
     assert bound < 2e-6
     np.testing.assert_allclose(new.actuation[:, 0], true, atol=0.01 * (omega / 100.0) ** 2 / 8.0)
-
-
-def test_interpolation_leaves_masked_frames_masked():
-    recording = swinging()
-    recording.positions[100:120, 0] = np.nan
-    new = resample(recording, 200.0)
-    np.testing.assert_array_equal(np.flatnonzero(~new.seen[:, 0]), np.arange(199, 240))
-    assert new.seen[:, 1:].all()
 
 
 def test_trimming_keeps_the_time_from_the_release_and_the_rest_shape():
@@ -221,21 +212,3 @@ def test_base_markers_that_were_moved():
     bumped.positions[:, 3] = np.nan
     with pytest.raises(DataFileError, match="'base 2' is never seen"):
         check_base([first, bumped], BASE)
-
-
-@pytest.mark.parametrize(
-    ("name", "jumps", "drifting"),
-    [
-        ("gravity", (0, 0, 1, 0, 1, 0), []),
-        ("load101", (0, 0, 3, 15, 1, 6), ["Base - 1", "Base - 2"]),
-    ],
-)
-def test_quality_of_the_beam_recordings(shared_data, name, jumps, drifting):
-    """Base markers jump and drift, as their owners' files show; tips swing and do not."""
-    recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d")
-    base = [label for label in recording.labels if label.startswith("Base")]
-    result = quality(recording, base)
-    assert tuple(len(marker.jumps) for marker in result.markers) == jumps
-    assert [marker.label for marker in result.markers if marker.drift is not None and marker.drift > 2e-4] == drifting
-    for marker in result.markers:
-        assert 2e-6 < marker.noise < 7e-6

@@ -12,7 +12,6 @@ from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.text import Table
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import atomic_hdf5
 
 
 @pytest.fixture
@@ -478,21 +477,6 @@ def test_hdf5_gives_back_what_was_written(tmp_path, positions):
         assert file["positions"].attrs["units"] == "m"
 
 
-def test_hdf5_of_another_program(tmp_path, positions):
-    with h5py.File(tmp_path / "swing.hdf5", "w") as file:
-        file["positions"] = 1e2 * positions
-        file["positions"].attrs["units"] = "cm"
-        file["labels"] = ["a", "b", "c"]
-        file["rate_hz"] = 100
-    recording = read_recording(tmp_path / "swing.hdf5")
-    np.testing.assert_allclose(recording.positions, positions)
-    assert recording.labels == ("a", "b", "c")
-    with atomic_hdf5(tmp_path / "run.h5", "trajectories"):
-        pass
-    with pytest.raises(DataFileError, match="'trajectories'"):
-        read_recording(tmp_path / "run.h5")
-
-
 def plate(count=20):
     """(T, 3) and (T, 4) a rigid body that moves and turns, and the points on its axes (T, 3, 3), in m."""
     turn = Rotation.from_rotvec(np.linspace(0.0, 2.5, count)[:, None] * [0.6, 0.0, 0.8])
@@ -527,36 +511,3 @@ def test_a_rigid_body_is_four_markers(tmp_path, positions, suffix):
     names = recording.labels[1:]
     fitted = register_markers(recording.positions[10, 1:], nominal, names, source=path)
     assert fitted.rms < 1e-7  # one rigid body registers
-
-
-def test_rigid_bodies_that_are_not_whole(tmp_path):
-    path = tmp_path / "swing.csv"
-    path.write_text("frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy\n" + "\n".join(f"{k},1,2,{k},1,0,0" for k in range(9)))
-    with pytest.raises(DataFileError, match=r"'a\.qz'"):
-        read_recording(path, rate=100.0)
-    path.write_text(
-        "frame,a.x [mm],a.y,a.z,b.qw,b.qx,b.qy,b.qz\n" + "\n".join(f"{k},1,2,{k},1,0,0,0" for k in range(9))
-    )
-    with pytest.raises(DataFileError, match="the rigid body b has no place"):
-        read_recording(path, rate=100.0)
-    path.write_text(
-        "frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy,a.qz\n" + "\n".join(f"{k},1,2,{k},0,0,0,0" for k in range(9))
-    )
-    with pytest.raises(DataFileError, match="the quaternion of a has the length 0 in frame 1 from the start"):
-        read_recording(path, rate=100.0)
-    np.savez(tmp_path / "swing.npz", positions=np.ones((9, 2, 3)), quaternions=np.ones((9, 4)), rate_hz=100.0)
-    with pytest.raises(DataFileError, match=r"quaternions have the shape \(9, 4\)"):
-        read_recording(tmp_path / "swing.npz")
-    path.write_text(
-        "frame,a.x [mm],a.y,a.z,a.qw,a.qx,a.qy,a.qw\n" + "\n".join(f"{k},1,2,{k},1,0,0,1" for k in range(9))
-    )
-    with pytest.raises(DataFileError, match=r"has two columns named 'a\.qw'"):
-        read_recording(path, rate=100.0)
-    twice = {"positions": np.random.default_rng(0).normal(size=(9, 2, 3)), "labels": ["a", "a +x"], "rate_hz": 100.0}
-    turns = np.stack([np.tile([1.0, 0.0, 0.0, 0.0], (9, 1)), np.full((9, 4), np.nan)], axis=1)
-    np.savez(tmp_path / "swing.npz", quaternions=turns, **twice)
-    with pytest.raises(DataFileError, match=r"'a \+x'"):
-        read_recording(tmp_path / "swing.npz")
-    turns[3, 0], twice["positions"][3, 0] = 0.0, np.nan  # not seen
-    np.savez(tmp_path / "swing.npz", quaternions=turns, **{**twice, "labels": ["a", "b"]})
-    assert np.flatnonzero(~read_recording(tmp_path / "swing.npz").seen[:, 2]).tolist() == [3]

@@ -46,13 +46,6 @@ def test_the_opening_is_found_between_frames(opening, amplitude):
     assert result == pytest.approx(opening, abs=3e-3)
 
 
-def test_a_leak_before_the_opening_is_not_the_opening():
-    """As at 50 mbar: a tenth of the way comes slowly, the rest at once."""
-    path = swing(0.2, 1.5e-3)
-    leak = 1.2e-4 * np.clip(np.arange(150) / 18.0, 0.0, 1.0)
-    assert valve_opening(recorded(path - leak[:, None] * [0.8, 0.0, 0.0]), ("a",)) == pytest.approx(0.2, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("path", "followed", "message"),
     [

@@ -6,14 +6,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.chambered import KINDS, chambered
-from warp_resphys import Body, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, box_hexahedra
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.settings.trials import MotionSettings
-from warp_resphys.stepping.inputs import Inputs
-from warp_resphys.stepping.state import State
 
 
 def deformed(body, stretch):
@@ -36,19 +33,6 @@ def test_an_affine_map_has_the_rotation_of_its_polar_decomposition_everywhere(ki
     np.testing.assert_allclose(frames.to_rest(q, v, frames.to_world(q, v, force)), force, atol=1e-12)
     rest = deformed(body, np.eye(3))
     np.testing.assert_allclose(frames.to_world(rest, (q - rest) / 0.01, force), frames.to_world(q, v, force), atol=1e-9)
-
-
-class Constant:
-    """A model that sees nothing and always predicts the same force."""
-
-    def __init__(self, rest, force):
-        self.rest, self.force = rest, force
-
-    def encode(self, q, v, actuation):
-        return q.new_zeros(len(q), 1)
-
-    def decode(self, inputs, hidden):
-        return [self.force.expand(len(inputs), -1, -1)], hidden
 
 
 STEP = 0.01
@@ -85,29 +69,6 @@ class TestBaseFrame:
             for actual, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
                 torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-11)
             torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
-
-    def test_a_roll_out_does_not_depend_on_how_base_and_gravity_are_turned_together(self):
-        mesh = box_hexahedra(divisions=(3, 1, 1))
-        rest = torch.as_tensor(mesh.vertices)[None]
-        turn = Rotation.from_rotvec([0.4, -1.1, 0.7])
-        place = np.array([0.2, 0.1, -0.3])
-        force = 0.02 * torch.randn(rest.shape, dtype=rest.dtype, generator=torch.Generator().manual_seed(1))
-        fixed = select_vertices(mesh, x=0.0)
-        motions = []
-        for rotation, at in ((Rotation.identity(), 0.0 * place), (turn, place)):
-            body = Body(mesh, fixed)
-            sim = Simulator(body, time_step=STEP, gravity=rotation.apply([0.0, 0.0, -9.81]), relative_tolerance=1e-12)
-            pose = torch.from_numpy(np.concatenate([at, rotation.as_rotvec()])).expand(2, 1, 6)
-            predict = LearnedPredictor(Constant(rest[0], force), torch.zeros(1, 0), base=BaseFrame(pose, STEP))
-            q = torch.from_numpy(rotation.apply(mesh.vertices) + at)[None]
-            state = State(q, 0.0 * q)
-            held = Inputs(fixed_positions=q[:, fixed])
-            for k in range(10):
-                state, _ = sim.step(state, held.plus(predict(state, k)))
-            motions.append((rotation.inv().apply(state.q[0].numpy() - at), rotation.inv().apply(state.v[0].numpy())))
-        assert np.abs(motions[0][0] - mesh.vertices).max() > 1e-3
-        for first, second in zip(*motions, strict=True):
-            np.testing.assert_allclose(first, second, atol=1e-8)
 
 
 def test_what_networks_are_told_of_a_base_are_its_velocities_and_gravity():

@@ -51,30 +51,6 @@ def test_numbers_and_lists_are_for_every_environment(dtype, batch):
     assert float((moved - simulator.step(start)[0].q)[:, -1, 2].min()) > 0.0
 
 
-@pytest.mark.parametrize("given", [0.2, np.array([0.1, 0.3])])
-def test_numbers_stay_numbers_in_other_inputs(given):
-    """In float32, for two environments, by every method that makes other inputs of some."""
-    simulator = pulled(torch.float32)
-    start, force = simulator.rest_state(2), simulator.tensor(np.full((2, len(MESH.vertices), 3), 1e-3))
-    inputs = Inputs(tendon_tension=given)
-    expected = simulator.step(start, Inputs(tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
-    pushed = simulator.step(start, Inputs(force, tendon_tension=simulator.tensor(np.full((2, 2), given))))[0].q
-    last = torch.tensor([1])
-    for other in (inputs.at(0), inputs.replace(attached_mass=None), inputs.to(force), inputs.repeat(2)):
-        assert torch.equal(simulator.step(start, other)[0].q, expected)
-    for other in (inputs.plus(force), inputs.replace(external_force=force)):
-        assert torch.equal(simulator.step(start, other)[0].q, pushed)
-    numbers = Inputs(np.full((len(MESH.vertices), 3), 5e-4), tendon_tension=given).plus(0.5 * force)
-    assert torch.equal(simulator.step(start, numbers)[0].q, pushed)
-    alone = simulator.step(simulator.rest_state(), inputs.select(last))[0].q
-    assert alone.numpy() == pytest.approx(expected[:1].numpy(), abs=1e-6)
-    scene = Scene({"a": simulator.body, "b": simulator.body})
-    both = Simulator(scene, simulator.material, dtype=torch.float32)
-    own = {"a": Inputs(tendon_tension=given, external_force=np.full((len(MESH.vertices), 3), 1e-3)), "b": Inputs()}
-    moved = both.step(both.rest_state(2), scene.inputs(own))[0].q[:, scene.vertex_slice("a")]
-    assert moved.numpy() == pytest.approx(pushed.numpy(), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -175,13 +175,6 @@ def test_friction_of_a_region_of_the_body():
     assert float(force) == pytest.approx(-float(mu * (factors[new.vertices] * normal).sum()), rel=1e-6)
 
 
-def test_regions_of_friction_that_do_not_fit():
-    with pytest.raises(InputError, match=r"friction_factors: the mesh has no region 'foot'; it has left, top"):
-        vertex_factors(HALVES, {"foot": 2.0})
-    with pytest.raises(InputError, match="'top' shares cells with another region"):
-        vertex_factors(HALVES, {"left": 2.0, "top": 0.5})
-
-
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_batch_is_bit_for_bit_its_environments(moves):
     """In a groove, whose two sides approach by different ways."""

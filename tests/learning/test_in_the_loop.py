@@ -15,7 +15,6 @@ from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
-from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.replay import Replay, Start, Windows
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
@@ -92,19 +91,6 @@ class TestAtSteps:
     def test_a_late_release_is_time_zero(self):
         result = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
         np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
-
-
-def test_errors_are_means_over_the_markers_that_were_seen():
-    observed = np.zeros((4, 2, 3))
-    simulated = np.zeros((4, 2, 3))
-    simulated[:, 0, 0], simulated[:, 1, 2] = 0.003, 0.001
-    observed[1, 0] = observed[2] = np.nan
-    np.testing.assert_allclose(marker_errors(simulated, observed), [2.0, 1.0, 2.0])
-    simulated[2:] = np.nan
-    np.testing.assert_allclose(marker_errors(simulated, observed), [2.0, 1.0, np.nan])
-    simulated[1] = np.nan
-    simulated[1, 1] = 0.0
-    np.testing.assert_allclose(marker_errors(simulated, observed)[:2], [2.0, 0.0])
 
 
 def observed_motions(frames=8):

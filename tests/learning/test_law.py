@@ -85,12 +85,3 @@ def test_neighbouring_relaxation_times_become_one_branch():
     together = 0.01 ** (1 / 4) * 0.015 ** (3 / 4)  # the mean of the logarithms, weighted by the moduli
     branches = {"prony_modulus_1": 4e4, "prony_time_1": together, "prony_modulus_2": 2e4, "prony_time_2": 0.1}
     assert {name: value for name, value in found.items() if name.startswith("prony")} == pytest.approx(branches)
-
-
-def test_families_that_hardly_pull_are_left_out():
-    families = [{"fibre_tension_1": 1e5, "fibre_azimuth_1": a, "fibre_elevation_1": 0.1} for a in (0.2, 0.4)]
-    found = _constants([{"c10": 1e5}, *families], np.array([0.4, 1e-5, 0.3]))
-    assert found["fibre_azimuth_1"] == 0.4
-    assert found["fibre_tension_1"] == pytest.approx(3e4)
-    assert found["fibre_toe_1"] > 0.0
-    assert not any(name.endswith("_2") for name in found)

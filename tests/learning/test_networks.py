@@ -41,16 +41,6 @@ def built(kind):
 
 
 class TestSkipMLP:
-    def test_published_structure(self):
-        network = SkipMLP(30, 12, blocks=5, layers=3, width=512, activation="normalised_elu")
-        assert len(network.blocks) == 5
-        for i, block in enumerate(network.blocks):
-            hidden = [nn.Linear, nn.LayerNorm, nn.ELU]
-            assert [type(m) for m in block] == 3 * hidden + [nn.Linear]
-            sizes = [(m.in_features, m.out_features) for m in block if isinstance(m, nn.Linear)]
-            assert sizes == [(30 if i == 0 else 12, 512), (512, 512), (512, 512), (512, 12)]
-            assert all(m.normalized_shape == (512,) for m in block if isinstance(m, nn.LayerNorm))
-
     def test_blocks_after_the_first_add_to_their_input(self):
         torch.manual_seed(0)
         network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
@@ -74,13 +64,6 @@ class TestPOD:
         missed = (samples - coder.decode(coder.encode(samples))).flatten(1)
         smallest = torch.linalg.svdvals(x)[4:].square().sum()  # Eckart and Young
         np.testing.assert_allclose(missed.square().sum(), smallest, rtol=1e-10)
-
-    def test_coordinates_have_unit_mean_square_down_to_the_floor(self):
-        samples = field(40)  # deviations fall as 2^-k: the floor of 0.3 % lies between the 8th and 9th after the first
-        coordinates = pod_coder(samples, 12).encode(samples)
-        size = coordinates.square().mean(0).sqrt().numpy()
-        np.testing.assert_allclose(size[:9], 1.0, rtol=1e-10)
-        np.testing.assert_allclose(size[9:], 0.5 ** np.arange(9, 12) / 3e-3, rtol=1e-10)
 
     @pytest.mark.parametrize(("samples", "modes"), [(40, 19), (40, 0)])
     def test_modes_that_the_samples_do_not_have(self, samples, modes):

@@ -370,17 +370,6 @@ def test_a_trial_is_left_out_as_if_the_others_were_identified():
     assert np.linalg.norm(np.subtract(moved, moves)) < 0.05 * np.linalg.norm(moves)
 
 
-@pytest.mark.parametrize("known", [1, 3])
-def test_a_new_session_has_the_variance_of_the_joint_prior(known):
-    """Placements are c + d_k of every session, with normal c and d_k; those of some sessions are known."""
-    accuracy = Accuracy(2e-3, 1e-3, 0.1, between_sessions=0.4)
-    joint = np.ones((known + 1, known + 1)) + accuracy.between_sessions**2 * np.eye(known + 1)
-    inside, across = joint[:-1, :-1], joint[:-1, -1]
-    expected = np.sqrt(joint[-1, -1] - across @ np.linalg.solve(inside, across))
-    like = torch.zeros(4, 3).double()
-    np.testing.assert_allclose(accuracy.of_new_session(like, known), expected * accuracy.directions(like), rtol=1e-12)
-
-
 @pytest.mark.slow
 def test_deviations_cover_the_effect_of_placements():
     """Over drawn placements and noise, moduli scatter as much as they are said to."""

@@ -183,11 +183,6 @@ def test_background_and_isolated_points_are_left_out():
             Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)
 
 
-def test_a_scan_that_points_the_other_way_is_said():
-    with pytest.raises(InputError, match=r"check the directions of its pose \(world_to_cloud"):
-        Cloud(scan(REST, 0.0, 500) * (-1.0, 1.0, 1.0)).around(SCANNER, MESH, CLAMP)
-
-
 def test_a_lens_sees_no_rays_where_it_cannot_be_undistorted():
     lens = Lens(LENS.matrix, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64))
     pixels = torch.tensor([[160.0, 120.0], [250.0, 160.0], [3000.0, 2000.0]], dtype=torch.float64)

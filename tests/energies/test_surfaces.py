@@ -444,7 +444,7 @@ def test_the_matrix_of_a_step_has_its_pairs(rigid):
     assert float(simulator.contacts(state, State(x, state.v))["surfaces"].normal.norm()) > 0.0
 
 
-@pytest.mark.parametrize("rise", [2e-3, 0.03])
+@pytest.mark.parametrize("rise", [2e-3, pytest.param(0.03, marks=pytest.mark.slow)])
 def test_driven_vertices_push_in_one_step(rise, device):
     """A plate that goes up by more than the gap below a cube, or its height, lifts it; momentum and gradient."""
     simulator = landing(device=device)

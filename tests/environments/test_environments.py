@@ -195,6 +195,7 @@ class TestPictures:
         np.testing.assert_allclose(red[0].mean(axis=0), red[2].mean(axis=0), atol=8.0)  # The goal stays in place.
         environment.close()
 
+    @pytest.mark.slow
     @pytest.mark.usefixtures("can_draw")
     def test_a_camera_looks_from_the_side_and_has_up_upwards(self):
         corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.1, 0.0, 0.0]])

@@ -141,6 +141,7 @@ def search(pose, ranges):
     return ParameterSearch(PictureMisfit([pose], ranges, known)).run([first], 25, tolerance=1e-6)
 
 
+@pytest.mark.slow
 def test_stiffness_density_damping_and_release_come_back(seen):
     """With a known force; where row times are ignored, the release is late by the rows of the body, 9 ms."""
     ranges = {name: range_ for name, range_ in RANGES.items() if name != "release_force_3"}

@@ -20,7 +20,6 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.fem.rigid import Glue, Rigid
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import central_difference
@@ -160,18 +159,6 @@ def test_boxes_that_are_glued_bend_like_one():
     for i in corners:  # Corners coincide at rest, and stay together.
         twin = face[np.isclose(mesh.vertices[ends], mesh.vertices[i]).all(1).argmax()]
         torch.testing.assert_close(glued.q[0, i], glued.q[0, twin], rtol=0.0, atol=1e-15)
-
-
-def test_modes_and_stiffness_of_a_body_with_a_rigid_part():
-    body = clamped(rigid={"cap": Rigid(density=1000.0)})
-    simulator = Simulator(body, Corotated(2e5, 0.45))
-    stiff = {"beam": Corotated(2e5, 0.45), "cap": Corotated(2e10, 0.3, density=1000.0)}
-    other = Simulator(clamped(), stiff)
-    force = np.zeros((3 * body.n_vertices, 1))
-    force[-1] = 1e-3
-    moved, expected = (RestStiffness(s).displacements(force) for s in (simulator, other))
-    np.testing.assert_allclose(moved, expected, atol=1e-3 * np.abs(expected).max())
-    assert vibration_modes(simulator, 4).shape == (3 * body.n_vertices, 4)
 
 
 def test_an_insert_that_many_vertices_surround_does_not_widen_the_band():

@@ -8,11 +8,9 @@ import torch
 
 from warp_resphys import (
     Body,
-    Glue,
     Inputs,
     Mesh,
     Rigid,
-    Scene,
     Simulator,
     SolverSettings,
     StableNeoHookean,
@@ -21,7 +19,6 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.fem.symmetry import SymmetryPlane
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import boundary_triangles
@@ -66,8 +63,7 @@ def shared_vertices(half, whole):
     return distance.argmin(axis=1)
 
 
-@pytest.mark.parametrize("solver", ["newton", "quasi_newton"])
-@pytest.mark.parametrize(("angle", "rigid"), [(0.0, False), (TURN, False), (TURN, True)])
+@pytest.mark.parametrize(("solver", "angle", "rigid"), [("newton", 0.0, False), ("quasi_newton", TURN, True)])
 def test_half_a_beam_swings_like_the_whole_one(solver, angle, rigid):
     settings = SolverSettings(solver, relative_tolerance=1e-11)
     half, whole = (beam(side, angle, rigid) for side in (True, False))
@@ -81,17 +77,7 @@ def test_half_a_beam_swings_like_the_whole_one(solver, angle, rigid):
     assert error < 1e-7 * moved
 
 
-def test_half_a_tendon_with_half_its_tension_bends_half_a_beam():
-    half, whole = (beam(side, TURN, tendon=True) for side in (True, False))
-    poses = []
-    for body, tension in ((half, 1.0), (whole, 2.0)):
-        pull = Inputs(tendon_tension=torch.tensor([[tension]], dtype=torch.float64))
-        poses.append(simulator(body, TURN).static_equilibrium(pull).q[0])
-    error = (poses[0] - poses[1][shared_vertices(half, whole)]).norm(dim=1).max()
-    assert error < 1e-8
-
-
-@pytest.mark.parametrize("linear", ["banded", "sparse", "dense", "tiled", "multigrid"])
+@pytest.mark.parametrize("linear", ["banded", "multigrid"])
 def test_three_planes_leave_a_block_a_uniform_stretch(linear):
     mesh = box_tetrahedra((0.02, 0.02, 0.02), (3, 3, 3))
     planes = [SymmetryPlane(axis) for axis in np.eye(3)]
@@ -131,34 +117,6 @@ def test_gradients_of_half_a_beam():
     assert {row.parameter: row.relative_error for row in rows if not row.relative_error < 1e-7} == {}
 
 
-def test_gradient_by_modulus_is_that_of_the_whole_beam():
-    slopes = []
-    for body in (beam(True, TURN, True), beam(False, TURN, True)):
-        sim = simulator(body, TURN)
-        modulus = torch.tensor([[200e3]], dtype=torch.float64, requires_grad=True)
-        q = sim.rollout(sim.rest_state(), 5, parameters={"youngs_modulus": modulus}).q[-1, 0]
-        corner = np.linalg.norm(body.vertices - turned([0.1, 0.015, 0.03], TURN), axis=1).argmin()
-        (q[corner] - sim.rest_positions[corner]).square().sum().backward()
-        slopes.append(float(modulus.grad))
-    assert slopes[1] != 0.0
-    assert slopes[0] == pytest.approx(slopes[1], rel=1e-6)
-
-
-def test_modes_of_half_a_beam_are_symmetric_modes_of_the_whole():
-    half = beam(True)
-    forces = vibration_modes(simulator(half), 4).view(half.n_vertices, 3, 4)
-    assert forces[half.coordinates.sliding, 1].abs().max() < 1e-9 * forces.abs().max()
-
-
-def test_bodies_of_a_scene_keep_their_planes():
-    scene = Scene({"whole": beam(False), "half": beam(True)})
-    sim = simulator(scene)
-    q = sim.rollout(sim.rest_state(), 3).q[-1, 0]
-    half, whole = (q[scene.vertex_slice(name)] for name in ("half", "whole"))
-    same = shared_vertices(scene.bodies["half"], scene.bodies["whole"])
-    torch.testing.assert_close(half, whole[same], rtol=0.0, atol=1e-9)
-
-
 BOX = box_hexahedra(SIZE, (10, 4, 4))
 NAMED = Mesh(BOX.vertices, BOX.cells, {"cap": np.arange(144, 160), "beam": np.arange(144)})
 
@@ -181,14 +139,3 @@ NAMED = Mesh(BOX.vertices, BOX.cells, {"cap": np.arange(144, 160), "beam": np.ar
 def test_invalid_symmetry_is_refused(make, key):
     with pytest.raises(InputError, match=key):
         make()
-
-
-def test_glue_across_a_plane_is_refused():
-    one, two = box_hexahedra((0.05, 0.03, 0.03), (5, 2, 2)), box_hexahedra((0.05, 0.03, 0.03), (5, 3, 3))
-    vertices = np.concatenate([one.vertices, two.vertices + [0.05, 0.015, 0.0]])
-    cells = np.concatenate([one.cells, two.cells + len(one.vertices)])
-    mesh = Mesh(vertices, cells, {"left": np.arange(len(one.cells)), "right": np.arange(len(one.cells), len(cells))})
-    own = np.arange(len(vertices)) >= len(one.vertices)
-    glued = np.flatnonzero(own & np.isclose(vertices[:, 0], 0.05) & (vertices[:, 1] < 0.03))
-    with pytest.raises(InputError, match="symmetry plane"):
-        Body(mesh, glued=[Glue(glued, "left")], symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.025)])

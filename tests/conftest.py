@@ -33,7 +33,8 @@ wp.init()
 torch.set_num_threads(1)
 
 NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
-LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_run"}  # folders and modules of tests
+# folders and modules of tests
+LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_run", "test_inspect_mesh"}
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 

@@ -58,7 +58,7 @@ control:
   plan: {corrections: 2, reach: 0.05}
   horizon: 0.1
   feedback: {gains: [5.0], settles: 0.3}
-  reduction: {modes: [4], equilibria: 48, tangents: 24, motions: 3, seconds: 2.0, batch: 24}
+  reduction: {modes: [4], equilibria: 48, tangents: 24, motions: 3, seconds: 2.0}
 """)
 ended = subprocess.run(
     [sys.executable, "-m", "warp_resphys", "experiment=drawing"], capture_output=True, text=True, check=False

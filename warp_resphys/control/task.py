@@ -15,10 +15,9 @@ from .reference import Path
 from .world import FloatArray
 
 _POINTS = 40  # number of points of a path whose reach is checked
-
-
-_SPACING, _WEIGHTS, _ITERATIONS = 0.05, Weights(1e-3, 1e-3), 6  # of whole motions: between knots of the inputs [s]
-_PIECES = 6  # of the inputs in a receding horizon
+_SPACING = 0.05  # between knots of the inputs of a plan [s]
+_WEIGHTS, _ITERATIONS = Weights(1e-3, 1e-3), 6  # of whole motions
+_LEAST_PIECES = 3  # of the inputs in a receding horizon
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Task:
     def horizon(self, seconds: float) -> Horizon:
         """Horizon of receding plans."""
         steps = max(round(seconds / self.time_step), 1)
-        return Horizon(steps, min(_PIECES, steps))
+        return Horizon(steps, min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps))
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.

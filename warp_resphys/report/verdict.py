@@ -78,7 +78,7 @@ class ModelComparison:
 
     @property
     def outcome(self) -> Literal["helps", "harms", "same", "few", "unknown"]:
-        """What the interval of the gain says; with too few trials there is none."""
+        """Outcome by the 90 % interval of the gain; ``few`` with fewer than five trials."""
         if self.idle or self.gain is None:
             return "unknown"
         if self.gain.trials < LEAST_TRIALS:
@@ -219,7 +219,7 @@ def _listed(steps: Sequence[ModelComparison], *more: str) -> str:
 
 
 def _best_text(known: Known, where: str) -> str:
-    """What is best, and by how much."""
+    """Returns the sentence on the best model: its error, and its gain over the best model of the other kind."""
     corrected, other = best_pair(known)
     best = _least(known, (corrected, other))
     if not best:
@@ -250,7 +250,7 @@ def _unused_law(metrics: Mapping[str, Any]) -> str:
 
 
 def _to_do(metrics: Mapping[str, Any], settings: IdentifySettings | None, known: Known) -> str:
-    """What to do next: use a model, choose another split, or mend the identification."""
+    """Returns the advice: use a model, choose another split, or correct the identification."""
     best, chosen, parts = _least(known, _RANKED), recommended(known), list[str]()
     count = len(known[best]) if best else 0
     if best in _BETWEEN:

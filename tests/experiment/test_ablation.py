@@ -131,9 +131,6 @@ def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a
     ):
         for name in ("count", "markers", "error", "misfit"):
             np.testing.assert_array_equal(file[name][:], serial[name][:])
-    results, serial = (json.loads((folder / "metrics.json").read_text()) for folder in (Path("run"), finished))
-    # Two processes that have loaded torch and Warp; what this one has kept of other tests counts in both runs.
-    assert results["peak_memory_gib"] > serial["peak_memory_gib"] + 2 * 0.25
     written = Path("run/ablation.h5").stat().st_mtime_ns
     assert run(*TINY, "ablation.processes=3")[0] == 0
     assert Path("run/ablation.h5").stat().st_mtime_ns == written

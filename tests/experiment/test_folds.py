@@ -107,7 +107,7 @@ def test_ctrl_c_says_what_was_on_and_the_rest_is_kept(tmp_path, monkeypatch):
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=200.0)
     assert process.returncode != 0
-    assert f"{StageInterrupted.__name__}: interrupted in the folds " in said
+    assert f"{StageInterrupted.__name__}: interrupted before the folds " in said
     assert "the same command resumes there" in said
     done = {path.parents[1].name[-1] for path in tmp_path.glob("fold_*/stages/first.json")}
     kept = {name: fold["process"] for name, fold in written(tmp_path, "first").items() if name in done}

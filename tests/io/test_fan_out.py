@@ -14,7 +14,6 @@ import pytest
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import WorkerError, WorkerFaultError, Workers, fan_out
-from warp_resphys.io.memory import WorkersMemory
 
 
 def wait_until(condition, seconds=60.0):
@@ -24,25 +23,20 @@ def wait_until(condition, seconds=60.0):
         time.sleep(0.01)
 
 
-def work(task, advance):
+def work(task):
     """Waits until a second worker has started."""
     import torch
 
     folder, number = task
     (folder / f"worker_{os.getpid()}").touch()
     wait_until(lambda: len([*folder.glob("worker_*")]) > 1)
-    advance(number, rest=number % 2)
     return os.getpid(), torch.get_num_threads(), 10 * number
 
 
 def done(function, tasks, workers, folder):
-    """Runs tasks; returns the results and the calls of `advance`."""
-    counted = []
-
-    def advance(count=1, **fields):
-        counted.append((count, fields))
-
-    return fan_out(function, tasks, workers, advance, folder), counted
+    """Runs tasks; returns the results and the numbers of the finished tasks."""
+    numbers = []
+    return fan_out(function, tasks, workers, folder, numbers.append), numbers
 
 
 @pytest.fixture(params=["local", "dask"])
@@ -57,17 +51,14 @@ def workers(request, monkeypatch):
 
 
 def test_results_come_in_order_from_other_processes_on_one_thread(workers, tmp_path):
-    place = tmp_path / "progress"
-    results, counted = done(work, [(tmp_path, number) for number in range(1, 6)], workers, place)
+    results, numbers = done(work, [(tmp_path, number) for number in range(1, 6)], workers, tmp_path)
     assert [result for _, _, result in results] == [10, 20, 30, 40, 50]
-    assert sum(count for count, _ in counted) == 15
-    assert {fields["rest"] for _, fields in counted} == {0, 1}
+    assert sorted(numbers) == [0, 1, 2, 3, 4]
     assert len({process for process, _, _ in results} - {os.getpid()}) == 2
     assert {threads for _, threads, _ in results} == {1}
-    assert not [*place.iterdir()]
 
 
-def fails(task, advance):
+def fails(task):
     if task == "bad input":
         raise InputError("this is refused.")
     if task == "fault":
@@ -94,30 +85,25 @@ def test_a_task_that_always_kills_its_worker_is_an_error(tmp_path):
         done(fails, ["", "killed"], Workers(2), tmp_path)
 
 
-def dies_once(task, advance):
-    """Counts to three; kills itself once in between, after its progress was seen."""
+def dies_once(task):
     folder, number = task
-    for at in range(3):
-        advance(shown=at)
-        if number == 1 and at == 1 and not (folder / "died").exists():
-            wait_until((folder / "seen").exists)
-            (folder / "died").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+    if number == 1 and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
     return number**2
 
 
 @pytest.mark.slow
 def test_the_task_of_a_killed_worker_is_repeated(workers, tmp_path):
-    counts = []
-
-    def advance(count, **fields):
-        counts.append(count)
-        (tmp_path / "seen").touch()
-
-    tasks = [(tmp_path, number) for number in range(4)]
-    assert fan_out(dies_once, tasks, workers, advance, tmp_path / "progress") == [0, 1, 4, 9]
+    results, numbers = done(dies_once, [(tmp_path, number) for number in range(4)], workers, tmp_path)
+    assert results == [0, 1, 4, 9]
     assert (tmp_path / "died").exists()
-    assert sum(counts) == 12
+    assert sorted(numbers) == [0, 1, 2, 3]
+
+
+def test_workers_without_the_folder(tmp_path):
+    with pytest.raises(WorkerError, match="choose a run folder that all workers share"):
+        done(fails, [""], Workers(2), tmp_path / "elsewhere")
 
 
 def test_nothing_to_do(tmp_path):
@@ -136,7 +122,7 @@ def test_an_address_that_nobody_answers_at(tmp_path):
         done(work, [1], Workers(2, "tcp://127.0.0.1:9"), tmp_path)
 
 
-def interrupts_itself(task, advance):
+def interrupts_itself(task):
     os.kill(os.getpid(), signal.SIGINT)
     return "continues"
 
@@ -145,24 +131,10 @@ def test_workers_leave_ctrl_c_to_their_parent(tmp_path):
     assert done(interrupts_itself, [0, 1, 2], Workers(2), tmp_path)[0] == ["continues"] * 3
 
 
-def takes_memory(mebibytes, advance):
-    return len(b"x" * (mebibytes << 20))
-
-
-@pytest.mark.slow
-def test_a_worker_reports_the_memory_of_its_own_work(tmp_path):
-    gib = []
-    for mebibytes in (512, 0):
-        memory = WorkersMemory()
-        fan_out(takes_memory, [mebibytes], Workers(1), print, tmp_path, memory)
-        gib.append(memory.gib)
-    assert gib[0] - gib[1] == pytest.approx(0.5, abs=0.1)
-
-
 HELD = []
 
 
-def keeps_memory(number, advance):
+def keeps_memory(number):
     """Holds 200 MB until loky looks at the memory, once a second."""
     HELD[:] = [b"x" * 200_000_000]
     time.sleep(1.1)
@@ -175,7 +147,7 @@ def test_workers_with_all_imports_go_on(tmp_path):
     assert len({*done(keeps_memory, range(6), Workers(2), tmp_path)[0]}) <= 2
 
 
-def works_or_waits(task, advance):
+def works_or_waits(task):
     folder, waits = task
     (folder / f"process_{os.getpid()}").touch()
     wait_until(lambda: len([*folder.glob("process_*")]) > 1)
@@ -196,7 +168,7 @@ def lives(process):
 def test_workers_end_with_their_parent(tmp_path):
     """Even if it is killed: otherwise they would write to the files of a run that resumes."""
     program = "from test_fan_out import *\nfolder = Path(sys.argv[1])\n"
-    program += "fan_out(works_or_waits, [(folder, False), (folder, True)], Workers(2), print, folder)"
+    program += "fan_out(works_or_waits, [(folder, False), (folder, True)], Workers(2), folder)"
     parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parent)
     wait_until(lambda: len([*tmp_path.glob("process_*")]) == 2)
     workers = [int(path.name.removeprefix("process_")) for path in tmp_path.glob("process_*")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from ..io.errors import ResphysError
-from ..io.fan_out import ALONE, Advance, WorkerError, Workers, fan_out
+from ..io.fan_out import ALONE, WorkerError, Workers, fan_out
 from ..io.progress import Progress
 from ..io.stages import Stage, StageInterrupted, run_stages, up_to_date
 
@@ -49,34 +49,28 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
             for fold in left:
                 run_stages(fold.stages(workers), fold.folder)
         return
-    total = sum(len(fold.stages(ALONE)) for fold in left)
-    running: dict[str, str] = {}
-
-    def advance(count: int, name: str = "", stage: str = "") -> None:
-        if stage:
-            running[name] = f"{name}: {stage}"
-        else:
-            running.pop(name, None)
-        progress.advance(count, now=", ".join(running.values()))
-
+    running = {fold.name for fold in left}
+    folder = left[0].folder.parent
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        with Progress(f"{len(left)} folds", total, "stages") as progress:
-            fan_out(_run, left, workers.at_most(len(left)), advance, left[0].folder.parent)
+        with Progress("cross-validation", len(left), "folds") as progress:
+
+            def finished(number: int) -> None:
+                running.discard(left[number].name)
+                progress.advance()
+
+            fan_out(_run, left, workers.at_most(len(left)), folder, finished)
     except KeyboardInterrupt as error:
         raise StageInterrupted(
-            f"interrupted in the folds {', '.join(running)}; all saved results are kept, and "
-            "the same command resumes there"
+            f"interrupted before the folds {', '.join(sorted(running))} ended; all saved results are kept, and the "
+            "same command resumes there"
         ) from error
 
 
-def _run(fold: Fold, advance: Advance) -> None:
-    """Runs a fold in a worker process; calls `advance` at the beginning of every stage."""
-    logging.basicConfig(level=logging.WARNING, format=f"fold {fold.name}: %(message)s", force=True)
-    counts = iter([0])
+def _run(fold: Fold) -> None:
+    """Runs a fold in a worker process, which logs its stages."""
+    logging.basicConfig(level=logging.INFO, format=f"fold {fold.name}: %(message)s", force=True)
     try:
-        run_stages(
-            fold.stages(ALONE), fold.folder, begins=lambda stage: advance(next(counts, 1), name=fold.name, stage=stage)
-        )
+        run_stages(fold.stages(ALONE), fold.folder)
     except ResphysError as error:
         raise WorkerError(f"fold {fold.name}: {error}") from error
-    advance(1, name=fold.name, stage="")

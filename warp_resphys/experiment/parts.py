@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from ..io.errors import InputError
-from ..io.fan_out import Advance, Workers, fan_out
+from ..io.fan_out import Workers, fan_out
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
 from ..io.machine import available_cores
 from ..io.progress import Progress
@@ -91,7 +91,7 @@ class TrialPart:
     frames: int
     more: Any = None
 
-    def write(self, make: "Callable[[TrialPart], PartRollout]", advance: Advance) -> None:
+    def write(self, make: "Callable[[TrialPart], PartRollout]", advance: Callable[..., None]) -> None:
         """Computes the frames and writes the file, unless it is done; `advance` counts the frames."""
         count, rolled = len(self.names), 0
         if self.done:
@@ -196,12 +196,14 @@ def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], PartRollout]
                 for part in left:
                     part.write(make, progress.advance)
         else:
-            crew, memory = workers.at_most(len(left)), first.context.memory
-            fan_out(partial(_write, make), left, crew, progress.advance, first.path.parent, memory)
+            first.path.parent.mkdir(parents=True, exist_ok=True)
+            frames = [part.frames * len(part.names) for part in left]
+            crew = workers.at_most(len(left))
+            fan_out(partial(_write, make), left, crew, first.path.parent, lambda at: progress.advance(frames[at]))
 
 
-def _write(make: Callable[[TrialPart], PartRollout], part: TrialPart, advance: Advance) -> None:
-    part.write(make, lambda count=1, **shown: advance(count))
+def _write(make: Callable[[TrialPart], PartRollout], part: TrialPart) -> None:
+    part.write(make, lambda count=1, **shown: None)
 
 
 def read_parts(parts: Sequence[TrialPart], name: str) -> NDArray[Any]:

@@ -1,11 +1,8 @@
 """Runs independent tasks in worker processes of this machine, or of a Dask cluster, with joblib.
 
-Workers are single-threaded. Progress is reported through a small file for each task in a shared folder, so that joblib
-transfers only tasks and results. When a worker is lost, all tasks are submitted again: a task must return at
-once if its file is finished.
+Workers are single-threaded. When a worker is lost, unfinished tasks are submitted again.
 """
 
-import json
 import logging
 import os
 import signal
@@ -15,10 +12,9 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -27,17 +23,12 @@ from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
 from .errors import InputError, ResphysError, ResphysWarning
-from .memory import WorkersMemory, forget_peak_memory, peak_memory_gib
 from .progress import be_quiet
 
 log = logging.getLogger(__name__)
 
-Advance = Callable[..., None]
-_Status = tuple[int, dict[str, object]]  # units that a task has counted, and its latest named values
-
 _ATTEMPTS = 3
 _IDLE_SECONDS = 60.0  # after which an idle local worker ends
-_PROGRESS_SECONDS = 0.1  # interval of writing and of reading the progress
 _ANSWER_SECONDS = 10.0  # timeout of the connection to a cluster
 _PARENT_SECONDS = 0.02  # interval at which a worker checks that its parent process lives
 _LOST = {"BrokenProcessPool", "KilledWorker", "CommClosedError"}  # errors that mean that a worker is lost
@@ -77,44 +68,43 @@ ALONE = Workers()
 
 
 def fan_out(
-    function: Callable[[Any, Advance], Any],
+    function: Callable[[Any], Any],
     tasks: Sequence[Any],
     workers: Workers,
-    advance: Advance,
     folder: Path,
-    memory: WorkersMemory | None = None,
+    finished: Callable[[int], None] = lambda number: None,
 ) -> list[Any]:
     """Calls a function for every task in worker processes; returns the results in the order of the tasks.
 
     Args:
-        function: of a task and of `advance`; a module-level function, as it is pickled for the workers.
+        function: of a task; a module-level function, as it is pickled for the workers.
         tasks: started in this order.
         workers: always other processes, even a single one.
-        advance: called in a thread of this process with the number of units that workers have counted since the last
-            call (negative after a worker was lost), and the latest named values of a task.
-        folder: writable by all workers.
-        memory: counts the memory of the workers.
+        folder: which all workers must share.
+        finished: called with the number of each task, once, when it is done.
 
     Raises:
         InputError: Dask is not installed, or the cluster does not answer.
         WorkerError: a task raised a ResphysError, whose message is kept, or workers were lost repeatedly.
         WorkerFaultError: a task raised another error.
     """
-    if not tasks:
-        return []
-    folder.mkdir(parents=True, exist_ok=True)
+    results: dict[int, Any] = {}
     for attempt in range(1, _ATTEMPTS + 1):
-        reported: dict[str, _Status] = {}
-        try:
-            with (
-                TemporaryDirectory(prefix=".progress_", dir=folder, ignore_cleanup_errors=True) as place,
-                _local(workers) if workers.address is None else _dask(workers.address),
-                _followed(Path(place), reported, advance),
-            ):
-                calls = [delayed(_work)(function, task, Path(place, str(at))) for at, task in enumerate(tasks)]
-                # With n_jobs=1, joblib would work in this process.
-                outcomes = Parallel(n_jobs=max(workers.count, 2), pre_dispatch=workers.count, batch_size=1)(calls)
+        left = [(number, task) for number, task in enumerate(tasks) if number not in results]
+        if not left:
             break
+        try:
+            with _local(workers) if workers.address is None else _dask(workers.address):
+                # With n_jobs=1, joblib would work in this process.
+                parallel = Parallel(
+                    n_jobs=max(workers.count, 2),
+                    pre_dispatch=workers.count,
+                    batch_size=1,
+                    return_as="generator_unordered",
+                )
+                for number, result in parallel(delayed(_work)(function, *numbered, folder) for numbered in left):
+                    results[number] = result
+                    finished(number)
         except Exception as error:
             if not _LOST & {kind.__name__ for kind in type(error).__mro__}:
                 raise
@@ -125,29 +115,20 @@ def fan_out(
                 ) from error
             workers = workers.at_most(workers.count // 2) if workers.address is None else workers
             log.warning("a worker process was lost: its work is repeated, %d tasks at once", workers.count)
-            advance(-sum(total for total, _ in reported.values()))
-    if memory is not None:
-        peaks: dict[tuple[str, int], float] = {}
-        for _, worker, peak in outcomes:
-            peaks[worker] = max(peak, peaks.get(worker, 0.0))
-        memory.count(peaks.values())
-    return [result for result, _, _ in outcomes]
+    return [results[number] for number in range(len(tasks))]
 
 
-def _work(function: Callable[[Any, Advance], Any], task: Any, progress: Path) -> tuple[Any, tuple[str, int], float]:
-    """Runs a task in a worker process; returns its result, host and process, and peak memory [GiB]."""
+def _work(function: Callable[[Any], Any], number: int, task: Any, folder: Path) -> tuple[int, Any]:
+    """Runs a task in a worker process; returns its number and its result."""
     be_quiet()
     _begin_work()
-    forget_peak_memory()
-    worker = (socket.gethostname(), os.getpid())
-    if not progress.parent.is_dir():
+    if not folder.is_dir():
         raise WorkerError(
-            f"the worker on {worker[0]} cannot access {progress.parent.parent}: choose a run folder that all workers "
-            "share."
+            f"the worker on {socket.gethostname()} cannot access {folder}: choose a run folder that all workers share."
         )
     try:
-        with threadpool_limits(1), _ProgressFile(progress) as advance:
-            return function(task, advance), worker, peak_memory_gib()
+        with threadpool_limits(1):
+            return number, function(task)
     except ResphysError as error:
         raise WorkerError(str(error)) from None
     except Exception:
@@ -167,62 +148,6 @@ def _begin_work() -> None:
     finally:
         os.dup2(shown, 2)
         os.close(shown)
-
-
-class _ProgressFile:
-    """Writes the progress of a task: the units that it has counted, and its latest named values.
-
-    If the folder is gone, the work was cancelled or submitted again: the write fails, which ends the task.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._total, self._next = path, 0, 0.0
-        self._shown: dict[str, object] = {}
-
-    def __enter__(self) -> Advance:
-        return self._advance
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._write()
-
-    def _advance(self, count: int = 1, **shown: object) -> None:
-        self._total += count
-        self._shown = shown or self._shown
-        if shown or time.monotonic() >= self._next:
-            self._write()
-
-    def _write(self) -> None:
-        self._path.write_text(json.dumps([self._total, self._shown], default=str), encoding="utf-8")
-        self._next = time.monotonic() + _PROGRESS_SECONDS
-
-
-@contextmanager
-def _followed(folder: Path, reported: dict[str, _Status], advance: Advance) -> Iterator[None]:
-    """Reports the progress files of tasks to `advance`; `reported` has the last status by file name."""
-    ended = threading.Event()
-
-    def look() -> None:
-        for path in folder.iterdir():
-            with suppress(ValueError):  # a file that is being written
-                total, shown = json.loads(path.read_text(encoding="utf-8"))
-                before = reported.get(path.name, (0, {}))
-                if (total, shown) != before:
-                    reported[path.name] = total, shown
-                    advance(total - before[0], **shown)
-
-    def follow() -> None:
-        while not ended.wait(_PROGRESS_SECONDS):
-            look()
-
-    thread = threading.Thread(target=follow, name="progress", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-    look()
 
 
 @contextmanager

@@ -1,27 +1,13 @@
-"""Peak memory of a process and its workers, and available memory."""
+"""Peak memory of a process, and available memory."""
 
 import re
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 try:
     import resource
 except ModuleNotFoundError:  # Windows
     resource = None  # type: ignore[assignment]
-
-
-@dataclass
-class WorkersMemory:
-    """Peak memory of worker processes."""
-
-    gib: float = 0.0  # sum over the workers that ran at once [GiB]
-
-    def count(self, peaks: Iterable[float]) -> None:
-        """Adds the peaks of workers that ran at once, and keeps the largest sum so far."""
-        self.gib = max(self.gib, sum(peaks))
 
 
 def peak_memory_gib() -> float:
@@ -32,12 +18,6 @@ def peak_memory_gib() -> float:
     if resource is None:
         return 0.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
-
-
-def forget_peak_memory() -> None:
-    """Resets the peak of `peak_memory_gib`, if the system supports it."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
 
 
 def available_memory_gib() -> float:

@@ -26,7 +26,7 @@ from .atomic import digest
 from .classes import check_packages
 from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
-from .memory import WorkersMemory, peak_memory_gib
+from .memory import peak_memory_gib
 from .settings import packages_of
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,6 @@ class StageContext:
     run_dir: Path  # the run folder, where outputs are written
     fingerprint: str  # identifies everything that the outputs depend on; resumable files contain it
     settings: Any  # of the stage
-    memory: WorkersMemory = field(default_factory=WorkersMemory)  # of its worker processes
     upstream: Mapping[str, str] = field(default_factory=dict)  # fingerprints of the stages whose outputs it reads
 
 
@@ -80,7 +79,6 @@ def run_stages(
     stages: Sequence[Stage],
     run_dir: str | Path,
     wait: bool = False,
-    begins: Callable[[str], None] = lambda name: None,
 ) -> dict[str, float]:
     """Runs the stages whose outputs are missing, damaged or of other settings.
 
@@ -88,7 +86,6 @@ def run_stages(
         stages: in the order in which they run; a stage comes after its upstream stages.
         run_dir: the run folder, created if missing; one process at a time may use it.
         wait: whether to wait for another process that uses it, instead of raising.
-        begins: called with the name of a stage before it is checked and run.
 
     Returns:
         The duration of each stage, summed over interrupted runs [s].
@@ -103,7 +100,6 @@ def run_stages(
         _plan(stages, Path(run_dir) / _PLANNED)
         for stage, context in _contexts(stages, Path(run_dir)):
             try:
-                begins(stage.name)
                 took = _valid_seconds(stage, context)
                 seconds[stage.name] = _run_stage(stage, context) if took is None else took
             except KeyboardInterrupt as error:
@@ -186,7 +182,7 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
             "fingerprint": context.fingerprint,
             "upstream": dict(context.upstream),
             "seconds": seconds,
-            "peak_memory_gib": peak_memory_gib() + context.memory.gib,
+            "peak_memory_gib": peak_memory_gib(),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
             "outputs": {name: _identity(context.run_dir / name) for name in stage.outputs},
             "settings": to_plain(stage.settings),

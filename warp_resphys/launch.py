@@ -10,7 +10,8 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Container, Iterator, Sequence
+from argparse import ArgumentParser
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module, resources
 from itertools import pairwise
@@ -27,7 +28,7 @@ from hydra.errors import (
 )
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
 
 from .commands import CONFIG_PACKAGE, USER_ERROR, configuration, ends_where_nobody_reads
@@ -40,7 +41,6 @@ from .io.settings import parse
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
 TYPED: Final = ("run", "tune")
-_FOREIGN: Final = {"--config-path", "-cp", "--config-name", "-cn"}  # options that replace the package's configuration
 # Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
 _PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # a value without quotes, brackets or interpolations
@@ -98,12 +98,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
         rest, shown = [*_own_options(), *map(_quoted, arguments)], None
-        if command in TYPED and not _FOREIGN & {*rest}:
+        if command in TYPED:
             rest, shown = _without_shown(rest)
-            rest = [*freed(rest), *(_SILENT if shown is not None else ())]
-        else:
-            rest = freed(rest, typed=False)
-        sys.argv = [before[0], *rest]
+        sys.argv = [before[0], *freed(rest), *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
         with _ends_as_after_ctrl_c():
             hydra.main(version_base="1.3", **place)(job)()
@@ -168,39 +165,27 @@ def _groups(arguments: Sequence[str]) -> set[str]:
     return {entry.name for place in places for entry in place.iterdir() if entry.is_dir()}
 
 
-def freed(arguments: Sequence[str], typed: bool = True) -> list[str]:
-    """Changes overrides so that they may set keys that no YAML file mentions; the settings classes check the keys.
-
-    Args:
-        arguments: written by the user.
-        typed: whether settings classes check all keys of the command, or only those in groups.
-    """
+def freed(arguments: Sequence[str]) -> list[str]:
+    """Changes overrides so that they may set keys that no YAML file mentions; the settings classes check the keys."""
     groups = _groups(arguments)
-    return [_free(argument, groups, typed) for argument in arguments]
 
+    def free(argument: str) -> str:
+        key, equals, value = argument.partition("=")
+        first, dot, _ = key.partition("@")[0].partition(".")
+        chooses = first in groups and not dot and not value.startswith("{")
+        given = not equals or key[:1] in ("-", "+", "~") or "/" in first or first == "hydra" or chooses
+        return argument if given else f"++{argument}"
 
-def _free(argument: str, groups: Container[str], typed: bool) -> str:
-    key, equals, value = argument.partition("=")
-    first, dot, _ = key.partition("@")[0].partition(".")
-    chooses = first in groups and not dot and not value.startswith("{")
-    if not equals or key[:1] in ("-", "+", "~") or "/" in first or first == "hydra" or chooses:
-        return argument
-    return f"++{argument}" if typed or first in groups else argument
+    return [free(argument) for argument in arguments]
 
 
 def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
     """Removes ``--cfg job``; returns the key whose settings are to be shown as well: empty for all, None without it."""
-    rest, asked = list(arguments), dict[str, str]()
-    for short, long in (("-c", "--cfg"), ("-p", "--package")):
-        for at, argument in enumerate(rest):
-            if argument in (short, long) and at + 1 < len(rest):
-                asked[long] = rest[at + 1]
-                del rest[at : at + 2]
-                break
-            if argument.startswith(f"{long}="):
-                asked[long] = rest.pop(at).partition("=")[2]
-                break
-    return (rest, asked.get("--package", "")) if asked.get("--cfg") == "job" else (list(arguments), None)
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--cfg")
+    parser.add_argument("--package", default="")
+    asked, rest = parser.parse_known_args(arguments)
+    return (rest, asked.package) if asked.cfg == "job" else ([*arguments], None)
 
 
 def _show(config: DictConfig, key: str) -> None:
@@ -236,8 +221,6 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None and error.options:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {', '.join(error.options)}"
-    if isinstance(error, HydraException) and isinstance(cause, (ConfigAttributeError, ConfigKeyError)):
-        return _explain_key(error, cause)
     if isinstance(error, OverrideParseException):
         return f"cannot read the override {error.override.removeprefix('++')!r} ({_sentence(error)}): write key=value"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
@@ -255,27 +238,6 @@ def _explain(error: BaseException, started: bool) -> str | None:
     if isinstance(error, OSError):
         return f"cannot write {error.filename} ({error.strerror}): choose another run folder"
     return _sentence(error) if isinstance(error, ValueError) else None
-
-
-def _explain_key(error: HydraException, cause: OmegaConfBaseException) -> str:
-    """Message for a key that does not exist, with the most similar keys."""
-    named = re.search(r"'([^']+)'", str(error))
-    wanted = named.group(1) if named else str(cause.full_key)
-    root = {} if cause.parent_node is None else OmegaConf.to_container(cause.parent_node._get_root())
-    known = [key for key in _keys(root) if key.partition(".")[0] != "hydra"]
-    if wanted in known:  # a key inside the value does not exist
-        wanted = str(cause.full_key)
-    same_name = [key for key in known if key.rpartition(".")[2] == wanted.rpartition(".")[2]]
-    hint = did_you_mean(wanted, known, preferred=same_name)
-    return f"unknown key '{wanted}'{hint} (--cfg job lists all keys, +{wanted}=... adds a new one)"
-
-
-def _keys(config: Any, prefix: str = "") -> Iterator[str]:
-    """Yields the dotted names of all entries of a configuration."""
-    if isinstance(config, dict):
-        for key, value in config.items():
-            yield f"{prefix}{key}"
-            yield from _keys(value, f"{prefix}{key}.")
 
 
 def _sentence(error: BaseException) -> str:

@@ -63,9 +63,8 @@ def test_a_body_whose_muscles_contract_goes_through_every_stage(tmp_path, monkey
             "muscles={commanded:null,stiffness:1e4,bundles:{a:{direction:[0,0,1],within:{x:[1,2]}}}}",
             "no cell has its centre within x from 1 to 2",
         ),
-        ("+tendons.routes.left.entry_angle=1.0", r"routes\.left\.entry_angle acts by friction"),
-        ("+tendons.bristle_length=1e-3", "bristle_length is that of friction"),
-        ("+tendons.routes.left.fixed_guides=[0,1]", r"routes\.left\.fixed_guides has all guides"),
+        ("+tendons.routes.left.entry_angle=1.0", "an entry angle of tendons acts by friction"),
+        ("+tendons.routes.left.fixed_guides=[0,1]", "all guides of tendon 2 are fixed in the world"),
         ("+tendons.routes.left.fixed_guides=[2]", "the route has guides 0 to 1"),
     ],
 )

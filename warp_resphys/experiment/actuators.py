@@ -187,11 +187,9 @@ def build_tendons(settings: TendonSettings) -> Tendons:
     more: dict[str, Any] = {"directions": directions} if any(directions) else {}
     if any(fixed):
         more["fixed_guides"] = fixed
-    if settings.friction is not None:
-        entry = [route.entry_angle for route in settings.routes.values()]
-        more |= {"friction": settings.friction, "bristle_length": settings.bristle_length, "entry_angle": entry}
-    labels = tuple(settings.routes)
-    return Tendons(routes, settings.stiffness, labels=labels, toe=settings.toe, reach=settings.reach, **more)
+    more |= {key: getattr(settings, key) for key in ("stiffness", "toe", "reach", "friction", "bristle_length")}
+    entry = [route.entry_angle for route in settings.routes.values()]
+    return Tendons(routes, labels=tuple(settings.routes), entry_angle=entry, **more)
 
 
 def _divided(values: NDArray[np.float64], pieces: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 Meshes and bodies are cached by their settings, since checks, stages and reports need the same ones.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -28,7 +27,6 @@ from ..fem.symmetry import SymmetryPlane
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
 from ..io.machine import find_device
-from ..io.settings import parse
 from ..mesh.arm import mesh_arm
 from ..mesh.arm_geometry import ArmGeometry
 from ..mesh.boxes import boxes_hexahedra
@@ -42,7 +40,6 @@ from ..settings.mesh import (
     FileMesh,
     GeneratedArm,
     HexahedralBox,
-    MeshGroup,
     MeshSettings,
     PlaceSettings,
     RodMesh,
@@ -80,7 +77,7 @@ def build_mesh(settings: MeshSettings) -> Mesh:
         InputError: an unknown arm.
         MeshError: a mesh that cannot be read or simulated.
     """
-    return _built_mesh(settings.model_dump_json(), _file_of(settings))
+    return _built_mesh(settings, _file_of(settings))
 
 
 def _file_of(settings: MeshSettings) -> str | None:
@@ -90,9 +87,9 @@ def _file_of(settings: MeshSettings) -> str | None:
 
 
 @lru_cache(maxsize=8)
-def _built_mesh(content: str, file: str | None) -> Mesh:
-    """Builds a mesh from settings as JSON; ``file`` is the digest of its file."""
-    mesh = _read_or_generate(parse(MeshGroup, {"mesh": json.loads(content)}).mesh)
+def _built_mesh(settings: MeshSettings, file: str | None) -> Mesh:
+    """Builds a mesh; ``file`` is the digest of its file."""
+    mesh = _read_or_generate(settings)
     check_mesh(mesh)
     return mesh
 
@@ -183,16 +180,13 @@ def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, 
     """
     if mesh is not None:
         return _body(settings, payload_at, mesh)
-    place = None if payload_at is None else payload_at.model_dump_json()
     files = tuple(_file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values())))
-    return _built_body(BodySettings.of(settings).model_dump_json(), place, files)
+    return _built_body(BodySettings.of(settings), payload_at, files)
 
 
 @lru_cache(maxsize=8)
-def _built_body(content: str, place: str | None, files: tuple[str | None, ...]) -> Body:
-    """Builds a body from settings as JSON; ``files`` are the digests of the files of its meshes."""
-    settings = parse(BodySettings, json.loads(content))
-    payload_at = None if place is None else parse(PlaceSettings, json.loads(place))
+def _built_body(settings: BodySettings, payload_at: PlaceSettings | None, files: tuple[str | None, ...]) -> Body:
+    """Builds a body; ``files`` are the digests of the files of its meshes."""
     return _body(settings, payload_at, whole_mesh(settings))
 
 

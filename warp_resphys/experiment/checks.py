@@ -86,11 +86,9 @@ def check_run(run: RunSettings) -> None:
         names = [
             name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR
         ]
-        if (run.obstacles or run.self_contact) and run.identify.integrator == "midpoint":
-            raise InputError(
-                "identify.integrator is midpoint, by which bodies in contact may penetrate: set it to bdf2 or "
-                "implicit_euler."
-            )
+        if run.identify.integrator is not None:
+            with naming("identify."):
+                build_simulator(run.changed(integrator=run.identify.integrator), run.simulation, body)
         _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
         _check_owners(run.identify, run)

@@ -13,8 +13,6 @@ integers are accepted as floating-point numbers, and lists become tuples. Relati
 dotted key.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Self, TypeVar
 
@@ -46,14 +44,12 @@ class Settings(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
     )
 
+    def __hash__(self) -> int:  # Of other orders as well, as bodies are cached by it.
+        return hash(self.model_dump_json())
+
     def plain(self) -> dict[str, Any]:
         """Returns nested data of JSON types."""
         return self.model_dump(mode="json", by_alias=True)
-
-    def fingerprint(self) -> str:
-        """SHA-256 of the content in hexadecimal, independent of the order of keys."""
-        text = json.dumps(self.plain(), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
 
     def packages(self) -> dict[str, str]:
         """Returns the versions of the other packages whose classes these settings and all their groups name."""

@@ -6,7 +6,6 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from typing_extensions import override
 
 from ..io.classes import ClassSettings, package_of
-from ..io.errors import listed
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
 from .obstacles import ContactSettings, ObstacleSettings, SurfaceContactSettings
@@ -173,13 +172,7 @@ class TendonSettings(Settings):
     def _pulls(self) -> Self:
         if self.commanded == "contraction" and not self.stiffness > 0.0:
             raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
-        if self.friction is None and "bristle_length" in self.model_fields_set and self.bristle_length != 1.0e-4:
-            raise ValueError("bristle_length is that of friction: set friction, or leave it out.")
         for name, route in self.routes.items():
-            if route.entry_angle and self.friction is None:
-                raise ValueError(f"routes.{name}.entry_angle acts by friction: set tendons.friction, or leave it out.")
-            if len(set(route.fixed_guides)) == len(route.guides):
-                raise ValueError(f"routes.{name}.fixed_guides has all guides: one or more must lie in the body.")
             if not set(route.fixed_guides) <= set(range(len(route.guides))):
                 raise ValueError(
                     f"routes.{name}.fixed_guides is {list(route.fixed_guides)}: the route has guides 0 to "
@@ -290,13 +283,6 @@ class BodySettings(Settings):
             raise ValueError("contact is set, but obstacles has none: name an obstacle, or leave contact out.")
         if self.fixed is None and not self.obstacles and self.symmetry is None:
             raise ValueError("fixed is null, and obstacles has none that the body lies on: name fixed vertices.")
-        for key in ("stiffness", "friction"):
-            values = getattr(self.contact, key)
-            if isinstance(values, dict) and values.keys() != self.obstacles.keys():
-                raise ValueError(
-                    f"contact.{key} has values for {listed([*values])}, but the obstacles are "
-                    f"{listed([*self.obstacles])}: give a value to every one."
-                )
         return self
 
 

@@ -172,9 +172,3 @@ MeshSettings = Annotated[
     HexahedralBox | TetrahedralBox | BoxesMesh | FileMesh | SurfaceMesh | RodMesh | ShippedArm | GeneratedArm,
     Field(discriminator="kind"),
 ]
-
-
-class MeshGroup(Settings):
-    """A mesh alone."""
-
-    mesh: MeshSettings

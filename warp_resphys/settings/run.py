@@ -276,30 +276,6 @@ class RunSettings(SimulatorSettings):
         return self
 
     @model_validator(mode="after")
-    def _carries(self) -> Self:
-        for key, body in self.bodies.items():
-            if body.fibres is not None and body.chambers is None:
-                raise ValueError(
-                    f"{key}fibres are wound around chambers, but {key}chambers is null: leave the fibres out."
-                )
-        if self.payload_string is not None and self.payload_at is None:
-            raise ValueError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
-        if self.identify is not None and "fibre_stiffness" in self.identify.parameters and self.fibres is None:
-            raise ValueError("identify.parameters names fibre_stiffness, but fibres is null: give the simulator some.")
-        return self
-
-    @model_validator(mode="after")
-    def _holds_rigid_parts(self) -> Self:
-        used: dict[str, tuple[Any, str]] = {}
-        for prefix, body in self.bodies.items():
-            used[f"{prefix}integrator"] = (body.rigid, body.integrator)
-        used |= {} if self.identify is None else {"identify.integrator": (self.rigid, self.identify.integrator or "")}
-        for key, (rigid, integrator) in used.items():
-            if rigid and integrator == "midpoint":
-                raise ValueError(f"{key} is midpoint, with which rigid parts oscillate: choose implicit_euler or bdf2.")
-        return self
-
-    @model_validator(mode="after")
     def _training(self) -> Self:
         for model in ("resphys", "simfree"):
             self.training(model)

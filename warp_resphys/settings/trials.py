@@ -77,11 +77,10 @@ BaseMotion = MotionSettings | Literal["recorded", "reference"] | None
 ObstacleMotions = dict[str, MotionSettings]  # by obstacle
 
 
-class TrialSettings(Settings):
-    """Settings of a trial."""
+class _Performed(Settings):
+    """What trials of a configuration and of a run have in common."""
 
     file: Word | None = setting(None, "recording, in the folder of the data")
-    begins: Begins | None = setting(None, "how it begins; null: as data.begins")
     inputs: Some[float] | None = setting(None, "constant inputs, one for each chamber, tendon or muscle")
     onset: NotNegative | None = setting(None, "start of the inputs, by the clock of the recording; null: at once", "s")
     input_delay: float = setting(0.0, "delay of the inputs against their log", "s")
@@ -92,6 +91,12 @@ class TrialSettings(Settings):
     pull: Vector | None = setting(None, "force at the tip of a simulated body before its release", "N")
     base_motion: MotionSettings | None = setting(None, "in place of data.base_motion")
     obstacle_motion: ObstacleMotions = setting({}, "in place of data.obstacle_motion")
+
+
+class TrialSettings(_Performed):
+    """Settings of a trial."""
+
+    begins: Begins | None = setting(None, "how it begins; null: as data.begins")
 
 
 def _file(value: Any) -> Any:
@@ -111,25 +116,14 @@ TrialTable = Annotated[
 ]
 
 
-class Trial(Settings):
+class Trial(_Performed):
     """A motion of the body, or a pose."""
 
     name: str
     begins: str  # one of `Begins`, or ``given`` where a simulation provides the state
-    file: str | None = None  # its recording; None where it is simulated
-    session: str | None = None  # in which it was recorded
-    payload: float = 0.0  # mass that hangs on the body [kg]
-    pull: Vector | None = None  # force that holds the body before the release, in a simulated laboratory [N]
-    sequence: int | None = None  # number of its random inputs, or None
-    waves: WaveSettings | None = None  # its periodic inputs, in place of random ones
-    scale: float = 1.0  # factor of these inputs
+    sequence: int | None = None  # number of its random inputs in a simulated laboratory, or None
+    scale: float = 1.0  # factor of its simulated inputs
     amount: float = 0.0  # parameter of a simulated trial: a weight [kg], an angle [rad] or a factor of a motion
-    inputs: Many[float] | None = None  # as in `TrialSettings`
-    onset: float | None = None  # [s]
-    input_delay: float = 0.0  # [s]
-    labels: Many[str] | None = None
-    base_motion: MotionSettings | None = None
-    obstacle_motion: ObstacleMotions = Field(default_factory=dict)
     load: "HeldSettings | None" = None  # how it is held, where that differs from the other trials
 
     @property

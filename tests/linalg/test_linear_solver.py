@@ -47,6 +47,12 @@ def values_of(solver, dense):
     return torch.as_tensor(values).to(solver.device, solver.dtype)
 
 
+def factorised(solver, dense):
+    """The factor of regular matrices, pivoted where they are not positive definite."""
+    factor = solver.factor(values_of(solver, dense))
+    return solver.pivoted(values_of(solver, dense), factor) if factor.failed.any() else factor
+
+
 def make(kind, block, device="cpu", dtype=torch.float64):
     return make_linear_solver(kind, *pattern(), NODES, block, torch.device(device), dtype)
 
@@ -71,7 +77,7 @@ def test_solutions_equal_numpy(block, definite, device, cholespy):
     right = np.random.default_rng(1).normal(size=(BATCH, NODES * block, 4))
     for kind in layouts(device):
         solver = make(kind, block, device)
-        factor = solver.factor(values_of(solver, dense), definite=definite)
+        factor = factorised(solver, dense)
         assert not factor.failed.any()
         solution = factor.solve(torch.as_tensor(right, device=device))
         np.testing.assert_allclose(solution.cpu(), np.linalg.solve(dense, right), rtol=1e-9, atol=1e-9)
@@ -85,8 +91,7 @@ def test_matrices_that_are_not_positive_definite_are_reported_one_by_one(device,
         np.testing.assert_array_equal(solver.factor(values_of(solver, dense)).failed, [False, True, False])
 
 
-@pytest.mark.parametrize("definite", [True, False])
-def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
+def test_idle_matrices_leave_the_others_as_they_are(device, cholespy):
     """Even where they are no matrix at all."""
     dense = matrices(3, 20.0)
     dense[1] = np.nan
@@ -94,7 +99,7 @@ def test_idle_matrices_leave_the_others_as_they_are(definite, device, cholespy):
     right = torch.ones(BATCH, NODES * 3, 2, dtype=torch.float64, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device)
-        factor = solver.factor(values_of(solver, dense), definite, idle=idle)
+        factor = solver.factor(values_of(solver, dense), idle=idle)
         assert not factor.failed[[0, 2]].any()
         solution = factor.solve(right).cpu()[[0, 2]]
         np.testing.assert_allclose(solution, np.linalg.solve(dense[[0, 2]], right.cpu()[[0, 2]]), rtol=1e-9, atol=1e-9)
@@ -163,7 +168,7 @@ def test_indefinite_matrices_in_float32(device, cholespy):
     dense, right = matrices(3, 0.3), torch.ones(BATCH, NODES * 3, 1, device=device)
     for kind in layouts(device):
         solver = make(kind, 3, device, torch.float32)
-        solution = solver.factor(values_of(solver, dense), definite=False).solve(right)
+        solution = factorised(solver, dense).solve(right)
         expected = np.linalg.solve(dense, right.cpu().numpy())
         np.testing.assert_allclose(solution.cpu().numpy(), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
 
@@ -201,9 +206,10 @@ def test_an_indefinite_arrow_may_have_a_singular_band():
     dense[1:, 0] = dense[0, 1:] = np.linspace(0.5, 1.0, n - 1)
     values = torch.zeros(1, solver.n_values, dtype=torch.float64)
     values[0, solver.address[:, 0]] = torch.as_tensor(dense[rows, cols])
-    assert solver.factor(values).failed.all()
+    failed = solver.factor(values.clone())
+    assert failed.failed.all()
     right = torch.as_tensor(np.random.default_rng(0).normal(size=(1, n, 2)))
-    factor = solver.factor(values, definite=False)
+    factor = solver.pivoted(values, failed)
     assert not factor.failed.any()
     np.testing.assert_allclose(dense @ factor.solve(right)[0].numpy(), right[0], atol=1e-12)
     column = right[:, solver.dofs, 0].clone()

@@ -73,7 +73,7 @@ def test_a_singular_matrix_and_one_of_nan_have_no_factor(solver):
     singular = np.linalg.qr(matrix(4)[0])[0][:, :5]
     for broken in (singular @ singular.T, np.full((NODES, NODES), np.nan)):
         values = torch.as_tensor(broken[np.triu_indices(NODES)])[None]
-        for factor in (solver.factor(values, definite=False), solver.direction_factor(values)):
+        for factor in (solver.factor(values), solver.direction_factor(values)):
             assert factor.failed.all()
             assert np.isnan(solutions(factor)).all()
 

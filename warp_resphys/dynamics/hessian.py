@@ -146,7 +146,7 @@ class ExactHessian(HessianApproximation):
         self._potential.update_tangent()
         self._factor = self.linear.factor(self.assembly(), columns=self._columns())
         if self._factor.failed.any():
-            self._factor = self.linear.factor(self.assembly(), False, self._columns())
+            self._factor = self.linear.pivoted(self.assembly(), self._factor, self._columns())
         if self._coupled is not None:
             self._coupled.forget()
 

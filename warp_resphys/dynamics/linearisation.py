@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..energies.potential import StepTerms
 from ..fem.coordinates import DeviceCoordinates
 from ..linalg.linear_solver import Factor
-from ..linalg.sparse import SparseSolver
 from ..linalg.threads import threads_for
 from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
@@ -115,17 +114,20 @@ class Linearisation:
         p = self._potential
         return p.restrict(p.stiffness_product(direction) + p.inertia[..., None] * direction)
 
+    @property
+    def _shift(self) -> "_ShiftedHessian":
+        w, name = self._workspace, self._name
+        return w.cached(("shifted", name), lambda: _ShiftedHessian(w, name))
+
     def shifted(self, scale: float) -> Factor:
         """Returns a factor of I + scale H on the free vertices, for preconditioning.
 
         H is clamped if this is not positive definite, and without pairs (`Term.pair_tangents`).
         """
-        w, name = self._workspace, self._name
-        shift = w.cached(("shifted", name), lambda: _ShiftedHessian(w, name))
-        factor = shift(scale)
+        factor = self._shift(scale)
         if factor.failed.any():
             self._potential.update_tangent(torch.as_tensor(factor.failed, device=self._potential.device))
-            factor = shift(scale)
+            factor = self._shift(scale)
             self._potential.update_tangent()
         return factor
 
@@ -133,9 +135,7 @@ class Linearisation:
         """Returns H (3 F, 3 F) of the first environment on the free vertices, and the inertia (3 F,) in it [N/m]."""
         p, pattern = self._potential, self._workspace.pattern
         self.update(x)
-        solver = SparseSolver(pattern.rows, pattern.cols, len(pattern.free), 3, p.device, torch.float64)
-        entries = solver.mirrored(HessianAssembly(p, solver, pattern)())[0]
-        matrix = solver.matrix(entries)
+        matrix = self._shift.linear.matrix(self._shift.assemble()[0])
         if p.low_rank is not None:
             columns = p.low_rank[0].view(p.n_vertices, 3, -1)[self.free].flatten(0, 1)
             columns = scipy.sparse.csc_array(columns.cpu().numpy())
@@ -166,16 +166,16 @@ class _ShiftedHessian:
 
     def __init__(self, workspace: Workspace, linear_solver: str) -> None:
         p, k = workspace.potential, workspace.pattern
-        self._linear, self._potential = workspace.linear_solver(linear_solver), p
+        self.linear, self._potential = workspace.linear_solver(linear_solver), p
         self._dofs = k.unknowns(p.device)
-        self._assemble = HessianAssembly(p, self._linear, k)
-        diagonal = self._linear.address[k.rows == k.cols][:, [0, 4, 8]].ravel()
+        self.assemble = HessianAssembly(p, self.linear, k)
+        diagonal = self.linear.address[k.rows == k.cols][:, [0, 4, 8]].ravel()
         self._diagonal = torch.as_tensor(diagonal.astype(np.int64), device=p.device)
 
     def __call__(self, scale: float) -> Factor:
         """Returns the factor for the potential's last tangent."""
-        values = scale * self._assemble()
+        values = scale * self.assemble()
         values[:, self._diagonal] += 1.0
         columns = self._potential.low_rank
         columns = None if columns is None else math.sqrt(scale) * columns[:, self._dofs]
-        return self._linear.factor(values, columns=columns)
+        return self.linear.factor(values, columns=columns)

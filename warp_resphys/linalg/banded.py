@@ -9,7 +9,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import torch
 from scipy.linalg import cython_lapack
 from typing_extensions import override
@@ -87,19 +86,11 @@ class BandedSolver(LinearSolver):
         self.lapack = BandedCholesky(self.n, self.bandwidth, self.dtype)
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
-        bands = values.reshape(-1, self.n, self.bandwidth + 1)
-        kind, factorise = (_Cholesky, self._cholesky) if definite else (_LU, self._lu)
-        return kind(self, bands, factorise, idle, before)
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
+        return _Cholesky(self, values.reshape(-1, self.n, self.bandwidth + 1), self._cholesky, idle, before)
 
     def _cholesky(self, number: int, band: torch.Tensor) -> torch.Tensor | None:
         return band if self.lapack.factor(band) else None
-
-    def _lu(self, number: int, band: torch.Tensor) -> tuple[Any, Any] | None:
-        matrix, w = general_band(band.numpy()), self.bandwidth
-        (factorise,) = scipy.linalg.get_lapack_funcs(("gbtrf",), (matrix,))
-        lu, pivots, info = factorise(matrix, w, w, overwrite_ab=1)
-        return (lu, pivots) if info == 0 else None
 
 
 class _Cholesky(SeparateFactors):
@@ -122,30 +113,9 @@ class _Cholesky(SeparateFactors):
                 rows[own, start:end] = columns
 
 
-class _LU(SeparateFactors):
-    _solver: BandedSolver
-
-    @override
-    def _overwrite(self, factor: tuple[Any, Any], rows: torch.Tensor, exact: bool) -> None:
-        (lu, pivots), w = factor, self._solver.bandwidth
-        (solve,) = scipy.linalg.get_lapack_funcs(("gbtrs",), (lu,))
-        solved, _ = solve(lu, w, w, rows.numpy().T, pivots)
-        rows.copy_(torch.from_numpy(solved.T))
-
-
 def _blocks(i: Indices, j: Indices, n: int) -> list[tuple[int, int]]:
     """Returns the ranges of unknowns that no entry (i, j) of a matrix couples with others, as first and end."""
     reach = np.arange(n)
     np.maximum.at(reach, j.ravel(), i.ravel())
     ends = np.flatnonzero(np.maximum.accumulate(reach) == np.arange(n)) + 1
     return list(zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True))
-
-
-def general_band(band: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Converts (n, w + 1) lower symmetric band storage to LAPACK's general band storage with rows for pivoting."""
-    n, w = band.shape[0], band.shape[1] - 1
-    general = np.zeros((3 * w + 1, n), dtype=band.dtype, order="F")
-    general[2 * w :, :] = band.T
-    for k in range(1, w + 1):
-        general[2 * w - k, k:] = band[: n - k, k]
-    return general

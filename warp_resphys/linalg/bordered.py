@@ -9,11 +9,9 @@ A is banded, A^-1 B^T is computed once per factorisation, and S = C - B A^-1 B^T
 
     y = S^-1 (g - B A^-1 f),   x = A^-1 f - A^-1 B^T y.
 
-The matrix is positive definite if and only if A and S are. An indefinite one may have a singular A, so it goes to
-SuperLU, which pivots. `tests/linalg/test_linear_solver.py` compares with dense factorisations.
+The matrix is positive definite if and only if A and S are. `tests/linalg/test_linear_solver.py` compares with
+dense factorisations.
 """
-
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,7 +19,6 @@ from typing_extensions import override
 
 from .banded import BandedSolver
 from .linear_solver import Factor, Indices, LinearSolver, Mask
-from .sparse import SparseSolver
 
 _HUB = 4.0  # a hub has more than this many times the median number of neighbours
 _MOST_HUBS = 0.1  # share of the nodes
@@ -50,7 +47,6 @@ class BorderedSolver(LinearSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         border = hubs(rows, cols, n_nodes)
-        self._pattern = rows, cols, n_nodes
         own_rows, own_cols, number = banded_rest(rows, cols, n_nodes, border)
         self.band = BandedSolver(
             own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype, self.positions
@@ -65,7 +61,8 @@ class BorderedSolver(LinearSolver):
         r, c = self._entries(rows[~kept], cols[~kept])
         below = (place[rows[~kept]] >= 0)[:, None]
         hub = np.where(below, place[rows[~kept]][:, None], place[cols[~kept]][:, None]) * k + np.where(below, r, c) % k
-        self.address[~kept] = self.band.n_values + hub * n + np.where(below, c, r)
+        place = self.band.n_values + hub * n + np.where(below, c, r)
+        self.address[~kept] = np.where((rows == cols)[~kept, None] & (r < c), -1, place)
         self.n_values = self.band.n_values + len(border) * k * n
         self.order = np.concatenate([inside[self.band.order], border])
         unknowns = (np.concatenate([inside, border])[:, None] * k + np.arange(k)).ravel()
@@ -73,9 +70,7 @@ class BorderedSolver(LinearSolver):
         self.band_size = n - len(border) * k
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
-        if not definite:
-            return _Reordered(self, self._sparse.factor(self._to_sparse(values), definite=False))
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
         banded, border = values.split([self.band.n_values, self.n_values - self.band.n_values], -1)
         arrow = border.reshape(len(values), -1, self.n)[..., self._unknowns]  # (B, m, n) B and C
         cross, corner = arrow[..., : self.band_size].mT, arrow[..., self.band_size :].tril()
@@ -83,38 +78,6 @@ class BorderedSolver(LinearSolver):
         kept = before if isinstance(before, _Bordered) else None
         inner = self.band.factor(banded.clone(), idle=idle, before=None if kept is None else kept.inner)
         return _Bordered(self, inner, cross, corner, idle, kept)
-
-    @cached_property
-    def _sparse(self) -> SparseSolver:
-        rows, cols, n_nodes = self._pattern
-        return SparseSolver(rows, cols, n_nodes, self.block, self.device, self.dtype, self.positions)
-
-    def _to_sparse(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns the values (B, n_values) in the layout of the sparse solver."""
-        stored = self._sparse.address >= 0
-        out = values.new_zeros(len(values), self._sparse.n_values)
-        out[:, self._sparse.address[stored]] = values[:, self.address[stored]]
-        return out
-
-
-class _Reordered(Factor):
-    """A factor by another solver, for right-hand sides in this solver's order.
-
-    Args:
-        solver: the solver that has the order.
-        factor: the factor.
-    """
-
-    def __init__(self, solver: BorderedSolver, factor: Factor) -> None:
-        self._solver, self._factor, self.failed = solver, factor, factor.failed
-
-    @override
-    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        return self._factor.solve(rhs)
-
-    @override
-    def solve_in_place(self, columns: torch.Tensor) -> None:
-        columns.copy_(self.solve(columns[:, self._solver.places, None])[:, self._solver.dofs, 0])
 
 
 class _Bordered(Factor):

@@ -18,26 +18,21 @@ class DenseSolver(LinearSolver):
         self.n_values = self.n * self.n
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
-        factor = DenseFactor(values.reshape(-1, self.n, self.n), definite)
-        if idle is not None and isinstance(before, DenseFactor) and definite:
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
+        factor = DenseFactor(values.reshape(-1, self.n, self.n))
+        if idle is not None and isinstance(before, DenseFactor):
             factor.keep(before, idle)
         return factor
 
 
 class DenseFactor(Factor):
-    """Factors of symmetric matrices, from their lower triangles (B, n, n), which are not preserved."""
+    """Factors of symmetric matrices, from their lower triangles (B, n, n)."""
 
-    def __init__(self, lower: torch.Tensor, definite: bool) -> None:
-        self._definite = definite
-        if definite:
-            self._cholesky, info = torch.linalg.cholesky_ex(lower)
-        else:
-            full = lower.tril() + lower.tril(-1).mT
-            self._lu, self._pivots, info = torch.linalg.lu_factor_ex(full)
+    def __init__(self, lower: torch.Tensor) -> None:
+        self._cholesky, info = torch.linalg.cholesky_ex(lower)
         self.failed = info.cpu().numpy() != 0
         if self.failed.any():
-            (self._cholesky if definite else self._lu)[info != 0] = torch.nan
+            self._cholesky[info != 0] = torch.nan
 
     def keep(self, before: "DenseFactor", idle: torch.Tensor) -> None:
         """Replaces the Cholesky factors of idle matrices (B,) by those of an earlier factor."""
@@ -49,8 +44,5 @@ class DenseFactor(Factor):
         b, n, m = rhs.shape
         shared = len(self.failed) == 1 and b > 1
         columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
-        if self._definite:
-            solution = torch.cholesky_solve(columns, self._cholesky)
-        else:
-            solution = torch.linalg.lu_solve(self._lu, self._pivots, columns)
+        solution = torch.cholesky_solve(columns, self._cholesky)
         return solution.reshape(n, b, m).permute(1, 0, 2) if shared else solution

@@ -6,12 +6,14 @@ that one Warp kernel assembles for every layout. ``factor`` turns a batch of val
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
+import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
 from typing_extensions import override
@@ -85,6 +87,35 @@ class CorrectedFactor(Factor):
         self.factor.solve_in_place(columns)
         along = self.columns[:, self._order].mT @ columns[:, :, None]
         columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
+
+
+class PivotedFactor(Factor):
+    """Factors with those of SuperLU, which pivots, in the place of the ones that have failed.
+
+    Args:
+        solver: linear solver of the factors.
+        factor: the factors.
+        values: (B, n_values) the same matrices.
+    """
+
+    def __init__(self, solver: "LinearSolver", factor: Factor, values: torch.Tensor) -> None:
+        self._solver, self._factor, self.failed = solver, factor, factor.failed.copy()
+        self._pivoted: dict[int, Any] = {}
+        for number in np.flatnonzero(factor.failed).tolist():
+            with suppress(ValueError, RuntimeError):
+                self._pivoted[number] = sparse_lu(solver.matrix(values[number]), definite=False)
+                self.failed[number] = False
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        out = self._factor.solve(rhs)
+        for number, lu in self._pivoted.items():
+            out[number] = torch.as_tensor(lu.solve(rhs[number].double().cpu().numpy())).to(out)
+        return out
+
+    @override
+    def solve_in_place(self, columns: torch.Tensor) -> None:
+        columns.copy_(self.solve(columns[:, self._solver.places, None])[:, self._solver.dofs, 0])
 
 
 class SeparateFactors(Factor):
@@ -203,7 +234,7 @@ class LinearSolver(ABC):
         dtype: torch.dtype,
         positions: NDArray[np.float64] | None = None,
     ) -> None:
-        self.positions = positions
+        self.positions, self._pattern = positions, (rows, cols)
         self.n = n_nodes * block
         self.block = block
         self.device = device
@@ -223,17 +254,14 @@ class LinearSolver(ABC):
     def factor(
         self,
         values: torch.Tensor,
-        definite: bool = True,
         columns: torch.Tensor | None = None,
         idle: torch.Tensor | None = None,
         before: Factor | None = None,
     ) -> Factor:
-        """Factorises matrices A, or A + C C^T.
+        """Factorises positive definite matrices A, or A + C C^T; others are reported in ``failed``.
 
         Args:
             values: (B, n_values) entries at the solver's addresses, zero elsewhere; see `overwrites`.
-            definite: Cholesky, which reports matrices that are not positive definite in ``failed``; otherwise a pivoted
-                factorisation of any regular matrix.
             columns: (B, n, r) C.
             idle: (B,) matrices that keep their previous factor; without one, their solutions are undefined.
             before: the previous factor, which must not be used any more.
@@ -243,7 +271,7 @@ class LinearSolver(ABC):
             if columns is not None and idle is not None:
                 columns = torch.where(idle[:, None, None], kept.columns, columns)
             kept = kept.factor
-        factor = self._factorise(values, definite, idle, kept)
+        factor = self._factorise(values, idle, kept)
         return factor if columns is None else CorrectedFactor(factor, columns, self.dofs)
 
     def direction_factor(
@@ -254,10 +282,36 @@ class LinearSolver(ABC):
         before: Factor | None = None,
     ) -> Factor:
         """Returns a factor like `factor`, for directions and preconditioning: in float32 where that is faster."""
-        return self.factor(values, True, columns, idle, before)
+        return self.factor(values, columns, idle, before)
+
+    def pivoted(self, values: torch.Tensor, factor: Factor, columns: torch.Tensor | None = None) -> Factor:
+        """Returns a factor of any regular matrices, from one that has failed for some of them.
+
+        Args:
+            values: (B, n_values) entries, assembled anew.
+            factor: the factor of these.
+            columns: (B, n, r) C.
+        """
+        whole = PivotedFactor(self, factor.factor if isinstance(factor, CorrectedFactor) else factor, values)
+        return whole if columns is None else CorrectedFactor(whole, columns, self.dofs)
+
+    @cached_property
+    def both_triangles(self) -> tuple[Indices, Indices, Indices]:
+        """Row, column and place in the values of every entry of a matrix."""
+        i, j = self._entries(*self._pattern)
+        stored = self.address >= 0
+        i, j, place = i[stored], j[stored], self.address[stored].astype(np.int64)
+        off = i != j
+        return np.append(i, j[off]), np.append(j, i[off]), np.append(place, place[off])
+
+    def matrix(self, values: torch.Tensor) -> scipy.sparse.csc_array:
+        """Returns the matrix (n, n) of one environment from its values (n_values,)."""
+        row, column, place = self.both_triangles
+        data = values.detach().double().cpu().numpy()[place]
+        return scipy.sparse.csc_array((data, (row, column)), shape=(self.n, self.n))
 
     @abstractmethod
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
         """Returns the factor of the matrices A; `before` is None unless a matrix is idle."""
 
     @cached_property
@@ -275,6 +329,25 @@ class LinearSolver(ABC):
         """Returns the scalar row and column, (E, block^2) each, of every entry of every block."""
         r, c = np.divmod(np.arange(self.block**2), self.block)
         return rows[:, None] * self.block + r, cols[:, None] * self.block + c
+
+
+def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
+    """Returns SuperLU's factor of a symmetric matrix.
+
+    Raises:
+        ValueError: `definite` is set, but the matrix is not positive definite.
+        RuntimeError: the matrix is singular.
+    """
+    lu = scipy.sparse.linalg.splu(
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0 if definite else 1.0,
+        options={"SymmetricMode": definite},
+    )
+    # Without pivoting, a symmetric matrix is positive definite if and only if all pivots are positive.
+    if definite and not (lu.U.diagonal() > 0).all():
+        raise ValueError("a pivot is not positive")
+    return lu
 
 
 def numbered(groups: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .conjugate_gradients import Iterate, conjugate_gradients
-from .linear_solver import Factor, Indices, Mask, SeparateFactors
-from .sparse import SparseSolver, sparse_lu
+from .linear_solver import Factor, Indices, Mask, SeparateFactors, sparse_lu
+from .sparse import SparseSolver
 
 FloatArray = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class MultigridSolver(SparseSolver):
 
     `Factor.solve` is accurate to 1e-12; `Factor.solve_in_place`, which gives directions for a line search, to 1e-2
     unless there is a low-rank correction. A matrix whose coarsest level or diagonal blocks are not positive definite
-    counts as failed. With ``definite=False``, matrices get a sparse factor.
+    counts as failed.
     """
 
     iterates = True
@@ -47,7 +47,7 @@ class MultigridSolver(SparseSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         super()._lay_out(rows, cols, n_nodes)
-        numbers = self.matrix(torch.arange(1.0, len(self._rows) + 1.0, dtype=torch.float64))
+        numbers = self.matrix(torch.arange(1.0, self.n_values + 1.0, dtype=torch.float64))
         blocks = scipy.sparse.bsr_array(numbers, blocksize=(self.block, self.block))
         blocks.sort_indices()
         self._blocks = _Layout(blocks, self.device)
@@ -56,14 +56,11 @@ class MultigridSolver(SparseSolver):
         self._cycles: dict[tuple[int, int], _Cycle] = {}
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
-        if not definite:
-            return super()._factorise(values, definite, idle, before)
-        entries = self.mirrored(values).double()
-        return _Preconditioned(self, entries, partial(self._system, len(values)), idle, before)
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
+        return _Preconditioned(self, values.double(), partial(self._system, len(values)), idle, before)
 
     def _system(self, batch: int, number: int, entries: torch.Tensor) -> "_System | None":
-        """Returns an environment's system from its `mirrored` entries, or None if it is seen to be indefinite."""
+        """Returns an environment's system from its values (n_values,), or None if it is seen to be indefinite."""
         environment = (batch, number)
         if not bool(torch.isfinite(entries).all()):
             return None

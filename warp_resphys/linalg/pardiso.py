@@ -17,7 +17,7 @@ from .linear_solver import CorrectedFactor, Factor, Indices, LinearSolver, Mask,
 _ANALYSIS, _FACTOR, _SOLVE, _RELEASE = 11, 22, 33, -1  # phases
 _NO_MEMORY = -2  # error
 _PERTURBED = 13  # place of the number of pivots that were made larger
-_KINDS: Final = {True: 2, False: -2}  # of symmetric matrices: positive definite or not
+_DEFINITE: Final = 2  # kind of symmetric matrices that are positive definite
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -41,14 +41,14 @@ class PardisoSolver(LinearSolver):
         self.address[keep] = np.argsort(order)
         self.n_values = len(order)
         starts = np.searchsorted(row[order], np.arange(self.n + 1))
-        self._pattern = (starts.astype(np.int32), column[order].astype(np.int32))  # CSR of the upper triangle
+        self._rows = (starts.astype(np.int32), column[order].astype(np.int32))  # CSR of the upper triangle
         self._rooms: dict[tuple[object, ...], _Room] = {}
         self._needs_double: set[tuple[int, int]] = set()  # environments that once had no factor in float32
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
         def factorise(number: int, own: torch.Tensor) -> _System | None:
-            return self._system((len(values), number), own, definite)
+            return self._system((len(values), number), own)
 
         return _Systems(self, values, factorise, idle, before)
 
@@ -61,29 +61,29 @@ class PardisoSolver(LinearSolver):
         before: Factor | None = None,
     ) -> Factor:
         if columns is not None:  # Rounding errors along C would be amplified.
-            return self.factor(values, True, columns, idle, before)
+            return self.factor(values, columns, idle, before)
         kept = before.factor if isinstance(before, CorrectedFactor) else before
 
         def factorise(number: int, own: torch.Tensor) -> _System | None:
             environment = (len(values), number)
             if environment not in self._needs_double:
-                if system := self._system(environment, own.float(), True):
+                if system := self._system(environment, own.float()):
                     return system
                 if own.dtype == torch.float32:
                     return None
-            system = self._system(environment, own, True)
+            system = self._system(environment, own)
             if system is not None:
                 self._needs_double.add(environment)
             return system
 
         return _Systems(self, values, factorise, idle, None if idle is None else kept)
 
-    def _system(self, environment: tuple[int, int], own: torch.Tensor, definite: bool) -> "_System | None":
+    def _system(self, environment: tuple[int, int], own: torch.Tensor) -> "_System | None":
         """Returns the factorised matrix of an environment's values, or None if it has no factor."""
         values = own.detach().clone().numpy()
-        key = (*environment, definite, own.dtype)
+        key = (*environment, own.dtype)
         if key not in self._rooms:
-            self._rooms[key] = _Room(self._pattern, values, definite)
+            self._rooms[key] = _Room(self._rows, values)
         system = _System(self._rooms[key], values)
         return system if system.factorise() else None
 
@@ -122,20 +122,19 @@ class _Room:
 
     Args:
         pattern: starts (n + 1,) and columns (n_values,) of the upper triangle's rows.
-        values: (n_values,) of a matrix, for scaling and matching of indefinite ones.
-        definite: whether it is for Cholesky.
+        values: (n_values,) of a matrix.
 
     Attributes:
         stamp: number of factorisations.
     """
 
-    def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray, definite: bool) -> None:
-        self._pattern, self._kind, self.stamp = pattern, _KINDS[definite], 0
+    def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray) -> None:
+        self._pattern, self.stamp = pattern, 0
         self._threads = torch.get_num_threads()  # A factor by another number than the analysis may crash.
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
-        # Own options; METIS; solutions overwrite; pivots; scaling; matching; precision; from zero. Threads on two
-        # levels (23) gave wrong factors without an error up to oneMKL 2026.0, where one replaced another.
-        options = {0: 1, 1: 2, 5: 1, 9: 8, 10: not definite, 12: not definite, 27: values.dtype == np.float32, 34: 1}
+        # Own options; METIS; solutions overwrite; pivots; precision; from zero. Threads on two levels (23) gave wrong
+        # factors without an error up to oneMKL 2026.0, where one replaced another.
+        options = {0: 1, 1: 2, 5: 1, 9: 8, 27: values.dtype == np.float32, 34: 1}
         for place, value in options.items():
             self._options[place] = value
         self.call(_ANALYSIS, values)
@@ -147,7 +146,7 @@ class _Room:
     def factorise(self, values: FloatArray) -> bool:
         """Returns whether the matrix of values (n_values,) has a factor, without a pivot that was made larger."""
         self.stamp += 1
-        finite = np.isfinite(values.sum())  # It sees no NaN in an indefinite matrix.
+        finite = np.isfinite(values.sum())
         return bool(finite and self.call(_FACTOR, values) == 0 and self._options[_PERTURBED] == 0)
 
     def call(self, phase: int, values: FloatArray | None = None, right: FloatArray | None = None) -> int:
@@ -165,7 +164,7 @@ class _Room:
         unknowns, error = len(self._pattern[0]) - 1, ctypes.c_int32(0)
         count = 1 if right is None else right.size // unknowns
         room = None if right is None else np.empty_like(right)
-        *head, sides, silent = (ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, self._kind, phase, unknowns, count, 0))
+        *head, sides, silent = (ctypes.byref(ctypes.c_int32(n)) for n in (1, 1, _DEFINITE, phase, unknowns, count, 0))
         arrays = [self._internal, values, *self._pattern, self._options, right, room]
         internal, matrix, starts, columns, options, rhs, solution = (
             None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in arrays

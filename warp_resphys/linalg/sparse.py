@@ -1,61 +1,54 @@
 """Sparse Cholesky by CHOLMOD or SuperLU, for wide bodies, one environment at a time."""
 
+import ctypes
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from threading import Lock
+from typing import Any, Final
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 import torch
 from typing_extensions import override
 
-from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors
-from .quiet import without_warnings_of_cholmod
+from .linear_solver import Factor, Indices, LinearSolver, Mask, SeparateFactors, sparse_lu
 
 _COLUMNS = 128  # most right-hand sides per call of CHOLMOD on a GPU
+_STDOUT: Final = 1  # file descriptor, of the whole process
+_WARNING: Final = b"CHOLMOD warning"
+_printing: Final = Lock()
 
 
 class SparseSolver(LinearSolver):
-    """CHOLMOD by cholespy (CPU and CUDA); SciPy's SuperLU for indefinite matrices and without cholespy."""
+    """CHOLMOD by cholespy (CPU and CUDA), or SciPy's SuperLU without it."""
 
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         i, j = self._entries(rows, cols)
         keep = ~((rows == cols)[:, None] & (i < j))
         self.address = np.where(keep, (np.cumsum(keep) - 1).reshape(keep.shape), -1).astype(np.int32)
-        lower, upper = np.maximum(i, j)[keep], np.minimum(i, j)[keep]
-        self.n_values = len(lower)
-        self._off = lower != upper
-        self._rows, self._cols = np.append(lower, upper[self._off]), np.append(upper, lower[self._off])
-
-    def mirrored(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns the entries (B, E') of both triangles from values (B, n_values) of the lower one."""
-        return torch.cat([values, values[:, torch.as_tensor(self._off, device=values.device)]], dim=1)
-
-    def matrix(self, entries: torch.Tensor) -> scipy.sparse.csc_array:
-        """Returns the matrix (n, n) of one environment from its `mirrored` entries (E',)."""
-        data = entries.detach().double().cpu().numpy()
-        return scipy.sparse.csc_array((data, (self._rows, self._cols)), shape=(self.n, self.n))
+        self.n_values = int(keep.sum())
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
-        entries = self.mirrored(values)
-        cholespy = _cholespy() if definite else None
-        if cholespy is not None:
-            return _Cholmod(self, entries, partial(self._cholmod, cholespy), idle, before)
-        return _SuperLU(self, entries, partial(self._lu, definite), idle, before)
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
+        if (cholespy := _cholespy()) is not None:
+            return _Cholmod(self, values, partial(self._cholmod, cholespy), idle, before)
+        return _SuperLU(self, values, self._lu, idle, before)
 
-    def _lu(self, definite: bool, number: int, entries: torch.Tensor) -> Any:
+    def _lu(self, number: int, values: torch.Tensor) -> Any:
         try:
-            return sparse_lu(self.matrix(entries), definite)
+            return sparse_lu(self.matrix(values), definite=True)
         except (ValueError, RuntimeError):
             return None
 
-    def _cholmod(self, cholespy: Any, number: int, entries: torch.Tensor) -> Any:
-        i, j = (torch.as_tensor(x, dtype=torch.int32, device=self.device) for x in (self._rows, self._cols))
+    def _cholmod(self, cholespy: Any, number: int, values: torch.Tensor) -> Any:
+        row, column, place = (torch.as_tensor(x, device=self.device) for x in self.both_triangles)
+        entries = values.detach().double()[place]
         try:
-            with without_warnings_of_cholmod():
-                return cholespy.CholeskySolverD(self.n, i, j, entries.detach().double(), cholespy.MatrixType.COO)
+            with _without_warnings():
+                return cholespy.CholeskySolverD(self.n, row.int(), column.int(), entries, cholespy.MatrixType.COO)
         except (ValueError, RuntimeError):
             return None
 
@@ -76,25 +69,6 @@ class _Cholmod(SeparateFactors):
             part.copy_(solution.mT)
 
 
-def sparse_lu(matrix: scipy.sparse.csc_array, definite: bool) -> Any:
-    """Returns SuperLU's factor of a symmetric matrix.
-
-    Raises:
-        ValueError: `definite` is set, but the matrix is not positive definite.
-        RuntimeError: the matrix is singular.
-    """
-    lu = scipy.sparse.linalg.splu(
-        matrix,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0 if definite else 1.0,
-        options={"SymmetricMode": definite},
-    )
-    # Without pivoting, a symmetric matrix is positive definite if and only if all pivots are positive.
-    if definite and not (lu.U.diagonal() > 0).all():
-        raise ValueError("a pivot is not positive")
-    return lu
-
-
 def _cholespy() -> Any:
     """Returns the cholespy module, or None if it is not installed (wheels exist for some platforms only)."""
     try:
@@ -102,3 +76,29 @@ def _cholespy() -> Any:
     except ModuleNotFoundError:
         return None
     return cholespy
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Leaves out warnings that CHOLMOD prints by C, for which cholespy has no option; other output comes at the end.
+
+    Processes that are started meanwhile lose their output. On Windows, whose C libraries do not share their buffers,
+    nothing is left out.
+    """
+    if os.name == "nt":
+        yield
+        return
+    flush = ctypes.CDLL(None).fflush
+    with _printing, tempfile.TemporaryFile() as file:
+        flush(None)
+        before = os.dup(_STDOUT)
+        os.dup2(file.fileno(), _STDOUT)
+        try:
+            yield
+        finally:
+            flush(None)
+            os.dup2(before, _STDOUT)
+            os.close(before)
+            file.seek(0)
+            if kept := b"".join(line for line in file if not line.startswith(_WARNING)):
+                os.write(_STDOUT, kept)

@@ -11,15 +11,11 @@ from typing_extensions import override
 
 from ..kernels.modules import launch_stream, shareable
 from ..kernels.tiled_cholesky import BLOCK, TILE, tiled_kernels
-from .dense import DenseFactor
 from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth_reducing_order
 
 
 class TiledSolver(LinearSolver):
-    """Banded Cholesky in tiles (``kernels.tiled_cholesky``), in reverse Cuthill-McKee order, on any device.
-
-    With ``definite=False``, matrices that are not positive definite get a dense factor.
-    """
+    """Banded Cholesky in tiles (``kernels.tiled_cholesky``), in reverse Cuthill-McKee order, on any device."""
 
     overwrites = True
 
@@ -45,18 +41,13 @@ class TiledSolver(LinearSolver):
         self.kernels = tiled_kernels(self.scalar)
 
     @override
-    def _factorise(self, values: torch.Tensor, definite: bool, idle: Mask, before: Factor | None) -> Factor:
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
         values[:, self._padding] = 1.0
-        whole = None if definite else values.clone()
         active = torch.ones(len(values), device=values.device, dtype=torch.int32)
         if idle is not None:
             active.masked_fill_(idle, 0)
         self.launch(self.kernels.factor, (len(values),), active, values.view(-1, *self.shape))
-        factor = _TiledFactor(values, self)
-        if whole is None or not factor.failed.any():
-            return factor
-        rows = torch.as_tensor(factor.failed, device=values.device)
-        return _PartlyDense(factor, DenseFactor(self._dense(whole[rows]), definite=False), rows)
+        return _TiledFactor(values, self)
 
     def failed(self, values: torch.Tensor) -> NDArray[np.bool_]:
         """Returns (B,) whether a factor has a pivot that is not positive."""
@@ -94,17 +85,6 @@ class TiledSolver(LinearSolver):
         """Returns the recorded launch that overwrites (B, n) right-hand sides, in the solver's order."""
         return self._record(self.kernels.solve, (len(columns), 1), factors.view(-1, *self.shape), columns[:, None])
 
-    def _dense(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns the lower triangles (B, n, n)."""
-        i = np.arange(self.n)[:, None]
-        j = (i // TILE - self.width) * TILE + np.arange(self.shape[1])
-        inside = torch.as_tensor((j >= 0) & (j <= i), device=self.device)
-        dense = torch.zeros(len(values), self.n, self.n, device=self.device, dtype=self.dtype)
-        band = values.view(-1, *self.shape)[:, : self.n]
-        rows, columns = inside.nonzero(as_tuple=True)
-        dense[:, rows, torch.as_tensor(j, device=self.device)[inside]] = band[:, rows, columns]
-        return dense
-
 
 class _TiledFactor(Factor):
     def __init__(self, values: torch.Tensor, solver: TiledSolver) -> None:
@@ -125,25 +105,3 @@ class _TiledFactor(Factor):
 
     def _sweep(self, columns: torch.Tensor) -> None:
         self.solver.launch(self.solver.kernels.solve, columns.shape[:2], self._bands, columns)
-
-
-class _PartlyDense(Factor):
-    """A tiled factor, with dense factors for the matrices (B,) whose tiled factorisation failed."""
-
-    def __init__(self, factor: _TiledFactor, dense: DenseFactor, rows: torch.Tensor) -> None:
-        self._factor, self._dense, self._rows = factor, dense, rows
-        self._dofs, self._places = factor.solver.dofs, factor.solver.places
-        self.failed = np.zeros(len(rows), dtype=bool)
-        self.failed[rows.cpu().numpy()] = dense.failed
-
-    @override
-    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
-        solution = self._factor.solve(rhs)
-        solution[self._rows] = self._dense.solve(rhs[self._rows][:, self._dofs])[:, self._places]
-        return solution
-
-    @override
-    def solve_in_place(self, columns: torch.Tensor) -> None:
-        dense = self._dense.solve(columns[self._rows][:, :, None])[:, :, 0]
-        self._factor.solve_in_place(columns)
-        columns[self._rows] = dense

@@ -6,26 +6,97 @@ values v, a law gives
     e(l, v),   tension t = de/dl,   slope dt/dl,   and dt/dv,
 
 so that the stress is w t u and the tangent w (slope u u^T + t / l (1 - u u^T)), which has a negative eigenvalue only
-for a negative tension. The origin o is zero, or the first three values of a law tied to a given point.
+for a negative tension. The origin o is zero, or for a string the first three values.
 """
 
 import functools
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import warp as wp
 
 from .modules import named_module
-from .points import line_at
-from .values import value_reader
+from .points import line_at, value_reader
 
-ZERO = wp.float64(0.0)
+ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
+SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
+QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
+
+thread_values = wp.types.vector(1, wp.float64)  # k
+string_values = wp.types.vector(5, wp.float64)  # position of the point that it is tied to [m], k [N/m], L [m]
+muscle_values = wp.types.vector(3, wp.float64)  # sigma, c, k
+
+
+@wp.func
+def thread_pull(strain: wp.float64, toe: wp.float64):
+    """Returns energy s, force and slope of a thread of stiffness one: zero in compression, linear beyond the toe."""
+    energy = ZERO
+    force = ZERO
+    slope = ZERO
+    if strain > toe:
+        force = strain - HALF * toe
+        energy = HALF * force * force + TWENTY_FOURTH * toe * toe
+        slope = ONE
+    elif strain > ZERO:
+        slope = strain / toe
+        force = HALF * strain * slope
+        energy = SIXTH * strain * strain * slope
+    return energy, force, slope
+
+
+@wp.func
+def muscle_pull(strain: wp.float64, toe: wp.float64):
+    """Returns energy s, force and slope of a fibre of stiffness one; the slope rises as 3 t^2 - 2 t^3 over the toe.
+
+    Smoother than `thread_pull`, with the same force beyond the toe: a solid has fibres at every strain, and derivatives
+    are compared with differences over all of them.
+    """
+    energy = ZERO
+    force = ZERO
+    slope = ZERO
+    t = strain / toe
+    if t > ONE:
+        force = strain - HALF * toe
+        energy = HALF * force * force + FORTIETH * toe * toe
+        slope = ONE
+    elif t > ZERO:
+        slope = t * t * (THREE - TWO * t)
+        force = toe * t * t * t * (ONE - HALF * t)
+        energy = toe * toe * t * t * t * t * (QUARTER - TENTH * t)
+    return energy, force, slope
+
+
+@wp.func
+def thread_tension(length: wp.float64, toe: wp.float64, v: thread_values):
+    """Tension-only thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a short toe."""
+    energy, force, slope = thread_pull(length - ONE, toe)
+    return v[0] * energy, v[0] * force, v[0] * slope, thread_values(force)
+
+
+@wp.func
+def string_tension(length: wp.float64, toe: wp.float64, v: string_values):
+    """Tension-only spring from a given point, ``k s(l - L)``."""
+    energy, force, slope = thread_pull(length - v[4], toe)
+    by_values = string_values(ZERO, ZERO, ZERO, force, -v[3] * slope)
+    return v[3] * energy, v[3] * force, v[3] * slope, by_values
+
+
+@wp.func
+def muscle_tension(length: wp.float64, toe: wp.float64, v: muscle_values):
+    """Contractile fibre, ``sigma l + k s(l - 1 + c)``: active stress, and a spring shortened by a contraction."""
+    energy, force, slope = muscle_pull(length - ONE + v[1], toe)
+    by_values = muscle_values(ONE, v[2] * slope, force)
+    return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values
+
+
+LAWS = {"thread": thread_tension, "string": string_tension, "muscle": muscle_tension}  # e, t, dt/dl and dt/dv
 
 
 @functools.cache
-def axial_kernels(law: ModuleType) -> SimpleNamespace:
-    """Returns the kernels of one of ``kernels.laws``."""
-    module = named_module(f"axial.{law.NAME}")
-    vector, tension, tied = law.values, law.tension, law.TIED
+def axial_kernels(law: str) -> SimpleNamespace:
+    """Returns the kernels of one of `LAWS`."""
+    module = named_module(f"axial.{law}")
+    tension, tied = LAWS[law], law == "string"
+    vector = tension.input_types["v"]
     read_values = value_reader(vector)
 
     @wp.func(module=module)
@@ -44,7 +115,7 @@ def axial_kernels(law: ModuleType) -> SimpleNamespace:
         nodes: wp.array2d[int],
         operators: wp.array2d[wp.float64],  # (P, K)
         weights: wp.array[wp.float64],  # (P) w
-        addresses: wp.array[wp.uint64],  # see `values`
+        addresses: wp.array[wp.uint64],  # see `points.value_reader`
         sizes: wp.array[int],
         places: wp.array2d[int],
         toe: wp.float64,  # elongation at which the law reaches its full stiffness

@@ -7,6 +7,7 @@ sum_a g_a x_a, such as a fibre or a position. The stress has the shape of the ar
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -44,6 +45,27 @@ def green_strain(f: wp.mat33d) -> wp.mat33d:
     """E = (F^T F - I) / 2."""
     e = HALF * (wp.transpose(f) * f)
     return e - wp.mat33d(HALF, ZERO, ZERO, ZERO, HALF, ZERO, ZERO, ZERO, HALF)
+
+
+@functools.cache
+def value_reader(vector: Any) -> Any:
+    """Returns the function that reads the values at point p of environment b into a vector type.
+
+    Its arguments are the addresses of float64 arrays (B, size), their sizes, and the column of each value at each point
+    (n, P), so that kernels take any number of values without further arguments or copies.
+    """
+
+    @wp.func(module=named_module(f"values.{vector._length_}"))
+    def read_values(
+        addresses: wp.array[wp.uint64], sizes: wp.array[int], places: wp.array2d[int], b: int, p: int
+    ) -> vector:
+        values = vector()
+        for k in range(places.shape[0]):
+            row = wp.array(ptr=addresses[k], shape=((b + 1) * sizes[k],), dtype=wp.float64)
+            values[k] = row[b * sizes[k] + places[k, p]]
+        return values
+
+    return read_values
 
 
 @functools.cache

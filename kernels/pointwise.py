@@ -21,8 +21,7 @@ import warp as wp
 
 from .matrices import symmetric_eigen
 from .modules import named_module
-from .points import deformation_gradient, line_at
-from .values import value_reader
+from .points import deformation_gradient, line_at, value_reader
 
 STEP = wp.constant(wp.float64(3e-4))  # of differences, over the size of f
 OFFSETS, SHARES = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0)), wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
@@ -106,7 +105,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
         nodes: wp.array2d[int],
         operators: wp.array2d[operator],
         weights: wp.array[wp.float64],  # (P) w
-        addresses: wp.array[wp.uint64],  # see `values`
+        addresses: wp.array[wp.uint64],  # see `points.value_reader`
         sizes: wp.array[int],
         places: wp.array2d[int],
         size: wp.float64,  # of f

@@ -9,7 +9,7 @@ The guide before each segment adds the friction of `bristle`, which depends on t
 
 import warp as wp
 
-from .laws.thread import pull as thread_pull
+from .axial import thread_pull
 from .points import deformation_gradient
 
 wp.set_module_options({"enable_backward": False})

@@ -10,8 +10,8 @@ q_f = l_f^2 - 1, and <x> = max(x, 0). With the singular values s_i of F and a wh
     S_n = sum_i s_i^n - 3 - n j + n / 2 j^2  for n > 0,     sum_{i < k} (s_i s_k)^-n - 3 + 2 n j  for n < 0
 
 (Ogden, Proceedings of the Royal Society A 326, 1972: for J = 1 they are his). s(x) = max(x, 0)^2 / 2 is smoothed over
-a toe (`kernels.laws.muscle`); its strain is less by the slack, as fibres are wavy. W is integrated at the points of the
-shape rule, U at those of the volume rule.
+a toe (`kernels.axial.muscle_pull`); its strain is less by the slack, as fibres are wavy. W is integrated at the points
+of the shape rule, U at those of the volume rule.
 
 All terms and their derivatives vanish at rest, and stay finite where elements invert. a, S_n for n > 0, and l_f are
 convex in (F, J), b and the other S_n in (cof F, J). a, b and l_f are not negative, so that their powers are convex too,
@@ -27,10 +27,9 @@ import functools
 
 import warp as wp
 
-from ..laws.muscle import pull
-from ..matrices import cofactor, polar_rotation, signed_svd
+from ..axial import muscle_pull
+from ..matrices import SMALLEST_STRETCH_SUM, cofactor, polar_rotation, signed_svd, spectral_blocks
 from ..modules import named_module
-from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
 from . import corotated, mooney_rivlin
 from .density import Law
 
@@ -221,7 +220,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
         if q <= ZERO:
             return m[first + 4] * wp.vec3d(q * q, TWO * q, TWO)
         stretch = wp.sqrt(ONE + q)
-        energy, force, slope = pull(stretch - ONE - m[first], m[first + 1])
+        energy, force, slope = muscle_pull(stretch - ONE - m[first], m[first + 1])
         by_q = HALF / stretch * force
         cubic = m[first + 3] * q
         w = wp.vec3d(cubic * q * q, THREE * cubic * q, SIX * cubic)
@@ -296,7 +295,7 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
             taut = wp.max(q, ZERO)
             stretch = wp.sqrt(ONE + taut)
             toe = m[at + 4]
-            _energy, force, slope = pull(stretch - ONE - m[at + 3], toe)
+            _energy, force, slope = muscle_pull(stretch - ONE - m[at + 3], toe)
             lengthened = HALF / stretch * change
             t = wp.clamp((stretch - ONE - m[at + 3]) / toe, ZERO, ONE)
             result[at + 3] = -m[at + 5] * slope * lengthened

@@ -2,19 +2,144 @@
 
 The energy of projective dynamics (Bouaziz et al. 2014). A pure dilation ``F = (1 + e) I`` lies ``sqrt(3) e`` from D but
 has the trace ``3 e``: for small strains the second term is that of linear elasticity with a third of its lambda.
+
+F - D is normal to the surface det D = 1 at D, F - D = m cof(D) (Bouaziz et al. 2014, section 5.2). With F = R U and
+D = R V, both V and U = V + m V^-1 are functions of C = F^T F, and their invariants t and i obey
+
+    i_1 = t_1 + m t_2
+    i_2 = t_2 + m (t_1 t_2 - 3) + m^2 t_1
+    J   = 1 + m (t_2^2 - 2 t_1) + m^2 (t_1^2 - 2 t_2) + m^3 .
+
+As V^2 = U V - m I, the theorem of Cayley and Hamilton for V gives
+
+    V^-1 = (m U + (1 - m t_1) I)^-1 (U^2 - t_1 U + (t_2 - m) I)
+
+so that F - D = m F U^-1 V^-1 is a polynomial in C, whose coefficients need a few numbers and no loop over matrices.
+U follows from C as in `kernels.lanes`.
 """
 
 import warp as wp
 
-from ..matrices import polar_rotation, signed_svd
-from ..spectral import SMALLEST_STRETCH_SUM, spectral_blocks
-from ..unimodular import unimodular_offset
+from ..matrices import (
+    HALLEY_ITERATIONS,
+    HALLEY_TOLERANCE,
+    LARGEST_TRACE,
+    NEWTON_TOLERANCE,
+    SINGULAR,
+    SMALLEST_STRETCH_SUM,
+    cofactor,
+    polar_rotation,
+    signed_svd,
+    spectral_blocks,
+)
 
 NAME, LAME = "corotated", ((1.0, 0.0), (0.0, 1.0 / 3.0))
 LANES = True  # `kernels.lanes` has the shape term
+UPDATE_TOLERANCE = wp.float64(1.0e-30)  # squared norm of the last projection's update, which converges linearly
+NEARLY_A_LINE = wp.float64(1.0e-3)
+LARGEST_GROWTH = wp.float64(0.4)  # |J - 1| up to which Newton's iteration converges, and to the nearest D
+NEWTON_ITERATIONS, PROJECTIONS = 8, 60
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
+THREE, FOUR, EIGHT, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
 
 moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
+
+
+@wp.func
+def trace_of_stretch(c1: wp.float64, c2: wp.float64, j: wp.float64):
+    """Returns the trace of U, and whether the iteration converged (`kernels.lanes`)."""
+    i = HALF * (c1 + THREE)
+    change = ONE
+    for _ in range(HALLEY_ITERATIONS):
+        q = i * i - c1
+        value, slope = q * q - EIGHT * j * i - FOUR * c2, FOUR * i * q - EIGHT * j
+        step = TWO * value * slope / (TWO * slope * slope - value * (TWELVE * i * i - FOUR * c1))
+        i -= step
+        change = step * step
+        if change < HALLEY_TOLERANCE:
+            break
+    return i, change < HALLEY_TOLERANCE
+
+
+@wp.func
+def multiplier(i1: wp.float64, i2: wp.float64, growth: wp.float64):
+    """Returns m, t_2 and whether the iteration converged, for J = 1 + growth."""
+    m = growth / (i2 * i2 - TWO * i1 * (ONE + growth))  # to first order: that is |cof U|^2
+    t2 = i2 - m * (i1 * i2 - THREE)
+    change = ONE
+    for _ in range(NEWTON_ITERATIONS):
+        t1 = i1 - m * t2
+        p, a, b = t1 * t2 - THREE, t2 * t2 - TWO * t1, t1 * t1 - TWO * t2
+        first = t2 + m * (p + m * t1) - i2
+        second = m * (a + m * (b + m)) - growth
+        # derivatives by m and t_2, with t_1 = i_1 - m t_2
+        first_m = p + TWO * m * t1 - m * t2 * (t2 + m)
+        first_t = ONE + m * (t1 - m * (t2 + m))
+        second_m = a + m * (TWO * (b + t2) + m * (THREE - TWO * t1 * t2))
+        second_t = TWO * m * (t2 - m * m * t1)
+        scale = ONE / (first_t * second_m - first_m * second_t)
+        down = scale * (first * second_m - second * first_m)
+        back = scale * (second * first_t - first * second_t)
+        t2 -= down
+        m -= back
+        change = down * down + back * back
+        if change < NEWTON_TOLERANCE:
+            break
+    return m, t2, change < NEWTON_TOLERANCE
+
+
+@wp.func
+def projected(f: wp.mat33d) -> wp.mat33d:
+    """Returns D by successive projection of F on the tangent plane of {det D = 1} at the last D.
+
+    The start is F, or the rotation of F if F is nearly a line or a point and its own tangent plane is undefined. For an
+    inverted F the result may be another stationary point.
+    """
+    d = f
+    c = cofactor(f)
+    if wp.ddot(c, c) < NEARLY_A_LINE:
+        d = polar_rotation(f)
+    for _ in range(PROJECTIONS):
+        c = cofactor(d)
+        offset = wp.ddot(c, d - f) - (wp.ddot(c, d) / THREE - ONE)
+        step = (f - d) + (offset / (wp.ddot(c, c) + SINGULAR)) * c
+        d += step
+        update = wp.ddot(step, step)
+        if update < UPDATE_TOLERANCE:
+            break
+    return d
+
+
+@wp.func
+def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
+    """Returns F - D."""
+    j, c = wp.determinant(f), wp.transpose(f) * f
+    c1 = wp.trace(c)
+    if wp.abs(j - ONE) < LARGEST_GROWTH and c1 < LARGEST_TRACE:
+        c2 = c[0, 0] * c[1, 1] - c[0, 1] * c[0, 1]
+        c2 += c[0, 0] * c[2, 2] - c[0, 2] * c[0, 2] + c[1, 1] * c[2, 2] - c[1, 2] * c[1, 2]
+        i1, has_trace = trace_of_stretch(c1, c2, j)
+        i2 = HALF * (i1 * i1 - c1)
+        m, t2, converged = multiplier(i1, i2, j - ONE)
+        if has_trace and converged:
+            # (m U + d I)^-1 = (q_2 U^2 + q_1 U + q_0 I) / n; w_k: coefficients of U^k in its product with the others
+            t1 = i1 - m * t2
+            d, e = ONE - m * t1, t2 - m
+            q2, q1 = m * m, -m * (i1 * m + d)
+            q0 = i2 * q2 + d * (i1 * m + d)
+            n = d * d * d + m * (i1 * d * d + m * (i2 * d + m * j))
+            w0, w1, w2, w3 = q0 * e, q1 * e - q0 * t1, q2 * e - q1 * t1 + q0, q1 - q2 * t1
+            # by U^3 = i_1 U^2 - i_2 U + J I, V^-1 = (y_0 I + y_1 U + y_2 C) / n
+            g = i1 * i2 - j
+            bend = i1 * i1 - i2
+            y0, y1, y2 = w0 + w3 * j + q2 * i1 * j, w1 - w3 * i2 - q2 * g, w2 + w3 * i1 + q2 * bend
+            # by J U^-1 = C - i_1 U + i_2 I and g U = bend C - C^2 + i_1 J I
+            k = y0 / j
+            u = (y2 - k * i1) / g
+            x = m / n * (y1 + k * i2 + u * i1 * j)
+            s = f * c
+            return x * f + (m / n * (k + u * bend)) * s - (m / n * u) * (s * c)
+    return f - projected(f)
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """``-mu J_m / 2 ln(1 - x) + lambda / 2 (J - 1)^2``, x = (I1 - 3 - 2 (J - 1) + (J - 1)^2) / J_m.
 
-The rubber of Gent (Rubber Chemistry and Technology 69, 1996), made compressible like `stable_neo_hookean`, which is its
-limit for large J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu.
+The rubber of Gent (Rubber Chemistry and Technology 69, 1996), made compressible like the stable neo-Hookean material
+(`mooney_rivlin`), which is its limit for large J_m. The values are mu, J_m and the bulk modulus lambda + 2/3 mu.
 """
 
 import warp as wp

@@ -2,14 +2,14 @@
 
 The rubber of Mooney (1940) and Rivlin (1948), with I1 = ||F||^2, I2 = ||cof F||^2 and J = det F, made compressible by
 polynomials of J for which the rest shape is free of stress and the first two terms have no volume stiffness at small
-strains: there the material is linear elasticity with mu = 2 (c10 + c01) and lambda. With c01 = 0 it is
-`stable_neo_hookean`; like that it stays finite where elements invert.
+strains: there the material is linear elasticity with mu = 2 (c10 + c01) and lambda. It stays finite where
+elements invert. With c01 = 0 it is the stable neo-Hookean material of Smith, de Goes and Kim (2018) without its
+logarithm, and with lambda shifted by mu so that small strains give exactly linear elasticity.
 """
 
 import warp as wp
 
-from ..matrices import cofactor, signed_svd
-from ..spectral import spectral_blocks
+from ..matrices import cofactor, signed_svd, spectral_blocks
 
 NAME, LAME = "mooney_rivlin", ((2.0, 0.0), (2.0, 0.0), (0.0, 1.0))
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
@@ -31,10 +31,12 @@ def response(f: wp.mat33d, m: moduli):
     cof = cofactor(f)
     jac = wp.determinant(f)
     change = jac - ONE
-    energy = m[0] * (first - THREE - TWO * change + change * change)
-    energy += m[1] * (wp.ddot(cof, cof) - THREE - FOUR * change) + HALF * m[2] * change * change
-    stress = TWO * (m[0] + m[1] * first) * f - (TWO * m[1]) * (f * (wp.transpose(f) * f))
-    return energy, stress + volume_slope(m, jac) * cof
+    energy = m[0] * (first - THREE - TWO * change + change * change) + HALF * m[2] * change * change
+    stress = TWO * m[0] * f + volume_slope(m, jac) * cof
+    if m[1] != ZERO:
+        energy += m[1] * (wp.ddot(cof, cof) - THREE - FOUR * change)
+        stress += (TWO * m[1]) * (first * f - f * (wp.transpose(f) * f))
+    return energy, stress
 
 
 @wp.func
@@ -86,27 +88,34 @@ def write_tangent(
     out: wp.array[wp.mat33d],
 ):
     """Writes the blocks of dP/dF by the equation above; the arguments are those of `principal_tangent`."""
-    square = wp.ddot(f, f)
     columns = wp.transpose(f)
-    left = f * columns
     normals = wp.transpose(cofactor(f))
     for k in range(3):
         for n in range(k + 1):
             block = curvature * wp.outer(normals[k], normals[n])
-            block += (FOUR * second) * wp.outer(columns[k], columns[n])
-            block -= (TWO * second) * wp.outer(columns[n], columns[k])
-            same = -TWO * second * wp.dot(columns[k], columns[n])
             if k == n:
-                block -= (TWO * second) * left
-                same += TWO * first + TWO * second * square
+                block[0, 0] += TWO * first
+                block[1, 1] += TWO * first
+                block[2, 2] += TWO * first
             elif k - n == 1:
                 block += slope * wp.skew(columns[3 - k - n])
             else:
                 block -= slope * wp.skew(columns[1])
-            block[0, 0] += same
-            block[1, 1] += same
-            block[2, 2] += same
             out[(k * (k + 1)) / 2 + n] = block
+    if second != ZERO:
+        square, left = wp.ddot(f, f), f * columns
+        for k in range(3):
+            for n in range(k + 1):
+                block = (FOUR * second) * wp.outer(columns[k], columns[n])
+                block -= (TWO * second) * wp.outer(columns[n], columns[k])
+                same = -TWO * second * wp.dot(columns[k], columns[n])
+                if k == n:
+                    block -= (TWO * second) * left
+                    same += TWO * second * square
+                block[0, 0] += same
+                block[1, 1] += same
+                block[2, 2] += same
+                out[(k * (k + 1)) / 2 + n] += block
 
 
 @wp.func

@@ -59,7 +59,8 @@ def unit_potential(
     viscous = torch.as_tensor(viscosity, **where).expand(count, 2)
     strain = torch.as_tensor(np.zeros((count, 3, 3)) if reference is None else reference, **where)[:, None]
     sizes = {"shape": shape, "volume": volume}
-    stiffness = torch.stack([full(sizes[rule], 1) for rule in MATERIALS[model].rules], dim=-1)
+    moduli = [0.5 * shape, 0.0, volume] if "hookean" in model else [sizes[rule] for rule in MATERIALS[model].rules]
+    stiffness = torch.stack([full(modulus, 1) for modulus in moduli], dim=-1)
     values = {"stiffness": stiffness, "viscosity": viscous, "strain_offset": viscous[0, 0] * strain}
     values["dilation_offset"] = viscous[0, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
     potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), values))

@@ -4,8 +4,8 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
+from warp_resphys.kernels.materials.corotated import unimodular_offset
 from warp_resphys.kernels.matrices import cofactor, polar_rotation, signed_svd, symmetric_eigen
-from warp_resphys.kernels.unimodular import unimodular_offset
 
 wp.set_module_options({"enable_backward": False})
 RANDOM = np.random.default_rng(0)

@@ -6,7 +6,7 @@ import sys
 import pytest
 import warp as wp
 
-from warp_resphys.kernels.messages import QuietLogger
+from warp_resphys.kernels import QuietLogger
 
 SCRIPT = """
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices

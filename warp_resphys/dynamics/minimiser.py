@@ -9,10 +9,9 @@ import warp as wp
 
 from ..energies.launcher import CapturedGraph, issue, warp_view
 from ..energies.potential import IncrementalPotential
-from ..kernels import feasibility, rounding
+from ..kernels import line_search
 from ..kernels import minimisation as kernels
 from ..kernels.lbfgs import lbfgs_kernels
-from ..kernels.line_search import accept_kernel
 from ..linalg.tiled import TiledSolver
 from .hessian import ExactHessian, HessianApproximation
 from .recorded_factors import RecordedFactors
@@ -109,7 +108,7 @@ class Minimiser:
         set_direction = p.record_blocks(own.set_direction, b, [*shared, right], [])
         inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation]
         inputs += [warp_view(hessian.clamped, wp.bool), search, progress, pairs, history]
-        accept = p.record_blocks(accept_kernel(scalar), b, inputs, [])
+        accept = p.record_blocks(line_search.accept_kernel(scalar), b, inputs, [])
         counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
         evaluate = [*p.evaluation, accept, summarise]
@@ -119,9 +118,9 @@ class Minimiser:
         self._first_trial = p.capture(*first_trial, *evaluate)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
         kept, drawn = warp_view(p.zeros(n, 3), wp.vec3d), p.upload(signs, wp.vec3d)
-        perturb = p.record_blocks(rounding.perturb, b, [progress, drawn, search.positions], [kept])
+        perturb = p.record_blocks(line_search.perturb, b, [progress, drawn, search.positions], [kept])
         compared = [progress, kept, evaluation.residual, search, history]
-        check = p.record_blocks(rounding.check_rounding, b, compared, [])
+        check = p.record_blocks(line_search.check_rounding, b, compared, [])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
         self._parts = SimpleNamespace(begin=start, set_direction=first_trial, evaluate=evaluate)
         self._loop: CapturedGraph | None = None
@@ -134,10 +133,10 @@ class Minimiser:
         if feasible is None:
             return [], []
         share = warp_view(p.zeros(), wp.float64)
-        allow = p.record(feasibility.allow_all, (p.batch,), [], [share])
+        allow = p.record(kernels.allow_all, (p.batch,), [], [share])
         given, free = warp_view(feasible, wp.vec3d), warp_view(p.free_mask, wp.float64)
-        start = p.record(feasibility.shorten_start, (p.batch, p.n_vertices), [share, free, given, search], [])
-        step = p.record_blocks(feasibility.shorten_step, p.batch, [progress, share, search], [])
+        start = p.record(kernels.shorten_start, (p.batch, p.n_vertices), [share, free, given, search], [])
+        step = p.record_blocks(kernels.shorten_step, p.batch, [progress, share, search], [])
         return (
             [allow, *p.bounds(given, search.positions, share), start],
             [allow, *p.bounds(search.origin, search.positions, share), step],

@@ -16,7 +16,6 @@ from typing_extensions import override
 
 from ..io.errors import InputError, MeshError
 from ..kernels.axial import axial_kernels
-from ..kernels.laws import thread as law
 from ..mesh.chambers import Chamber, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
@@ -118,7 +117,7 @@ class Fibres(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
         shapes = {"fibre_stiffness": (self.count,)}
-        return FibreTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
+        return FibreTerm(launcher, sets, axial_kernels("thread"), shapes, self.count, extra=[wp.float64(self.toe)])
 
 
 class FibreTerm(ReadingTerm):

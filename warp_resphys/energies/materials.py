@@ -26,7 +26,7 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels.materials import corotated, gent, mooney_rivlin, stable_neo_hookean
+from ..kernels.materials import corotated, gent, mooney_rivlin
 from ..kernels.materials.convex import ISOTROPIC, convex_law
 from ..kernels.materials.density import density_law
 from ..stepping.quantity import Parameter, Quantity
@@ -198,7 +198,15 @@ class StableNeoHookean(_Hookean):
     """A neo-Hookean material, finite for inverted elements, and linear elasticity at small strains."""
 
     model = "stable_neo_hookean"
-    law = stable_neo_hookean
+    law = mooney_rivlin
+    rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
+    curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
+
+    @override
+    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns c10, c01 = 0 and lambda."""
+        mu, bulk = super().moduli(constants)
+        return 0.5 * mu, torch.zeros_like(mu), bulk
 
 
 @dataclass(frozen=True)

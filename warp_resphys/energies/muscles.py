@@ -5,7 +5,7 @@ At a point with the fibre direction a the stretch is lambda = |F a|, and the ene
     sigma lambda + k s(lambda - 1 + c),     tension  t = sigma + k s'(lambda - 1 + c)   [Pa of the rest shape],
 
 with an active stress sigma, and a tension-only fibre of stiffness k shortened by an active contraction c; s(e) is
-max(e, 0)^2 / 2, smoothed over a short strain (`kernels.laws.muscle`). A negative stress pushes, like an inflated
+max(e, 0)^2 / 2, smoothed over a short strain (`kernels.axial.muscle_pull`). A negative stress pushes, like an inflated
 chamber whose walls are not modelled. Without inputs the fibres are a reinforcement that stiffens the solid in tension
 (Spencer, Continuum Theory of the Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
 """
@@ -23,7 +23,6 @@ from typing_extensions import override
 from ..fem.elements import physical_gradients
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
-from ..kernels.laws import muscle as law
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PointSet, Values, value_of
@@ -156,7 +155,7 @@ class Muscles(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MuscleTerm":
         shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
-        return MuscleTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
+        return MuscleTerm(launcher, sets, axial_kernels("muscle"), shapes, self.count, extra=[wp.float64(self.toe)])
 
 
 class MuscleTerm(ReadingTerm):

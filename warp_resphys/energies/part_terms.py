@@ -54,7 +54,7 @@ class PartTerm(Term):
 
 
 class ReadingTerm(PartTerm):
-    """A term whose kernels read any number of values at each point (``kernels.values``).
+    """A term whose kernels read any number of values at each point (``kernels.points.value_reader``).
 
     Args:
         launcher: launcher of the potential.

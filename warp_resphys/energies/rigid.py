@@ -25,8 +25,7 @@ from ..fem.body import Body
 from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, physical_gradients
 from ..fem.rigid import Rigid
-from ..kernels import point_inertia as kernels
-from ..kernels.rigid_parts import straighten
+from ..kernels import rigid as kernels
 from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
@@ -192,7 +191,7 @@ class RigidityTerm(SolidTerm):
     def improve_start(self, positions: Any) -> None:
         (s,), own = self.sets, self.launcher
         inputs = [s.nodes, s.gradients, self._centre, self._arms]
-        own.launch(own.record(straighten, (own.batch, 1), inputs, [positions]))
+        own.launch(own.record(kernels.straighten, (own.batch, 1), inputs, [positions]))
 
 
 class BoundRigidity(BoundEnergy):

@@ -7,7 +7,7 @@ be eliminated, which leaves a tension-only spring from a to y for the body,
 
     E(a) = k s(|a - y| - L),     k = M / (1 + c M),     M = m / h^2,
 
-with s(e) = max(e, 0)^2 / 2, smoothed over a short distance (`kernels.laws.thread`), and moves the mass to
+with s(e) = max(e, 0)^2 / 2, smoothed over a short distance (`kernels.axial.thread_pull`), and moves the mass to
 
     p = y + (k / M) s'(|a - y| - L) (a - y) / |a - y| .
 
@@ -27,7 +27,6 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
-from ..kernels.laws import string as law
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
@@ -43,7 +42,7 @@ PAYLOAD = Quantity(
 
 
 def thread_pull(elongation: torch.Tensor, toe: float) -> torch.Tensor:
-    """Returns the force of a thread of stiffness one [m], as the kernels have it (`kernels.laws.thread.pull`)."""
+    """Returns the force of a thread of stiffness one [m], as the kernels have it (`kernels.axial.thread_pull`)."""
     return torch.where(elongation > toe, elongation - 0.5 * toe, 0.5 * elongation.clamp_min(0.0) ** 2 / toe)
 
 
@@ -112,7 +111,7 @@ class Strings(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
         shapes = {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
-        return StringTerm(launcher, sets, axial_kernels(law), shapes, self.count, extra=[wp.float64(self.toe)])
+        return StringTerm(launcher, sets, axial_kernels("string"), shapes, self.count, extra=[wp.float64(self.toe)])
 
     @override
     def bind(self, site: EnergySite) -> "BoundStrings":

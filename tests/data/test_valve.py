@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.jumps import mask_repeats
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import valve_opening
@@ -17,6 +16,7 @@ from warp_resphys.data.recordings.segment import (
     SEGMENT_NOMINAL,
     TIP_LABELS,
     convert_segment,
+    mask_repeats,
     read_published_segment,
 )
 from warp_resphys.io.errors import DataFileError

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from warp_resphys.data.recordings.quality import quality_table
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
@@ -20,7 +21,6 @@ from warp_resphys.report.sections import (
     against,
     horizon_table,
     published_growth,
-    quality_rows,
     residual_table,
     scale_table,
 )
@@ -174,8 +174,8 @@ class TestIdentification:
 
 def test_rows_of_markers_that_were_never_seen():
     marker = {"label": "A", "seen": 0.0, "gaps": 1, "longest_gap_frames": 9, "masked_frames": 9, "jumps": []}
-    (row,) = quality_rows({"markers": [{**marker, "noise_mm": None, "drift_mm": None}]})
-    assert [row.head, *(cell.text for cell in row.cells)] == ["A", "0.0 %", "1", "9", "9", "0", "", ""]
+    table = quality_table([{**marker, "noise_mm": None, "drift_mm": None}])
+    assert table == {"A": ["0.0 %", "1", "9", "9", "0", "", ""]}
     table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
     assert table.columns == ["A", "B", "Root mean square"]
     assert table.rows[0].cells == [Cell(NONE), Cell("0.50"), Cell("0.50")]

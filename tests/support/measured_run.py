@@ -77,7 +77,6 @@ def describe_recordings(trials, tracked, reference, rng, release=61.3):
                 "jumps": [{"frame": 80, "mm": 0.31}] if label == first_standing else [],
                 "noise_mm": 0.0071,
                 "drift_mm": 0.02 if label in reference else None,
-                "reach_mm": 7.0,
             }
             for label in labels
         ]
@@ -86,10 +85,8 @@ def describe_recordings(trials, tracked, reference, rng, release=61.3):
             "rate_hz": 100.0,
             "frames": 300,
             "release_frame": release,
-            "held_frames": [10, 58],
             "longest_gap_filled": 5,
             "markers": rows,
-            "swaps": [],
             "warnings": [f"{first_standing} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
         }
         residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))

@@ -113,7 +113,7 @@ class Driven:
 class Recordings:
     """Quality of the recordings, and their registration on the body."""
 
-    quality: Mapping[str, Any]  # By trial, as `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
+    quality: Mapping[str, Any]  # By trial, the content of `warp_resphys.data.recordings.quality.Quality`.
     residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
     drawn: str  # Name of the trial that fits worst, which is drawn.
     labels: tuple[str, ...]  # Of its M markers.

@@ -6,6 +6,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
 
+from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from ..stepping.quantity import Quantity
@@ -261,31 +262,15 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
         f"Gaps of up to {longest} frames are filled. Longer ones, given in frames, are masked: they do not count in "
         "losses and errors."
     )
-    columns = ["Seen", "Gaps", "Longest", "Masked", "Jumps", "Noise [mm]", "Drift [mm]"]
     tables = []
     for trial, result in quality.items():
         release = result["release_frame"]
         summary = f"{trial}: {result['frames']} frames at {result['rate_hz']:g} Hz"
         summary += "" if release is None else f", released in frame {release:.1f}"
-        tables.append(PageTable("Marker", columns, quality_rows(result), "", summary, len(quality) == 1))
+        rows = [Row(label, [*map(Cell, cells)]) for label, cells in quality_table(result["markers"]).items()]
+        tables.append(PageTable("Marker", [*QUALITY_COLUMNS], rows, "", summary, len(quality) == 1))
     listed = Items(warnings) if warnings else Text("No warnings.")
     return Part("Quality of the recordings", [listed, *tables, Text(note, note=True)])
-
-
-def quality_rows(quality: Mapping[str, Any]) -> list[Row]:
-    """Return a row for each marker: share seen, gaps, longest gap, masked frames, jumps, noise, drift."""
-    rows = []
-    for marker in quality["markers"]:
-        jumps, noise, drift = (marker[key] for key in ("jumps", "noise_mm", "drift_mm"))
-        texts = [
-            NONE if marker["seen"] is None else f"{100.0 * marker['seen']:.1f} %",
-            *(str(marker[key]) for key in ("gaps", "longest_gap_frames", "masked_frames")),
-            f"{len(jumps)}" + (f" ({max(jump['mm'] for jump in jumps):.2f} mm)" if jumps else ""),
-            "" if noise is None else f"{noise:.4f}",
-            "" if drift is None else f"{drift:.3f}",
-        ]
-        rows.append(Row(marker["label"], [Cell(text) for text in texts]))
-    return rows
 
 
 def training_section(data: RunReport, canvas: Canvas) -> Part | None:

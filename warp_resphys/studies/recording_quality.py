@@ -1,6 +1,6 @@
 """Quality of a recording as a table and a picture: occlusions, jumps, noise and drift of its markers."""
 
-from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..data.recordings.bag import Bag
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import (
-    BaseMotion,
+    QUALITY_COLUMNS,
     MarkerQuality,
     Quality,
     check_base,
@@ -81,7 +81,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
     where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
     """
     several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
-    bridged = fill_gaps(recording.select(several), result.longest_gap, mask_long=True)
+    bridged = fill_gaps(recording.select(several), result.longest_gap_filled, mask_long=True)
     still = {marker.label for marker in result.markers if marker.still}
     panels = [*("xyz" if len(still) < len(recording.labels) else ""), *(["still"] if still else [])]
     heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]
@@ -97,11 +97,11 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
             axes.yaxis.set_major_locator(MaxNLocator(4))
             titles = {"x": "Markers, from their median position", "still": "Markers that should not move"}
             axes.set_title(titles.get(panel, ""))
-            if result.release is not None:
-                release = result.release.frame / result.rate
-                axes.axvline(release, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
+            if result.release_frame is not None:
+                released = result.release_frame / result.rate_hz
+                axes.axvline(released, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
         _draw_seen(last, recording, bridged, result)
-        last.set_xlabel("time [s]; dashed: release" if result.release is not None else "time [s]")
+        last.set_xlabel("time [s]; dashed: release" if result.release_frame is not None else "time [s]")
         last.set_xlim(0.0, len(recording.positions) / recording.rate)
         handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
         columns = min(len(handles), _LEGEND_COLUMNS)
@@ -140,20 +140,41 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     still, longest_gap = settings.still, settings.longest_gap
     if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
-    file = settings.recording
-    configured = file.arguments()
-    recording = read_recording(str(file.path), *configured)
+    configured = settings.recording.arguments()
+    recording = read_recording(str(settings.recording.path), *configured)
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
     trials = [recording, *(read_recording(path, *configured) for path in settings.compare_with)]
     motions = compare_base(trials, still) if len(trials) > 1 else []
     figure = recording_quality(recording, result)
-    write_json(folder / "quality.json", {**result.to_plain(), "base": [_plain(motion, still) for motion in motions]})
+    base = [
+        {
+            "source": motion.source,
+            "shift_mm": dict(zip(still, _MILLI * motion.shift, strict=True)),
+            "distortion_mm": dict(zip(still, _MILLI * motion.distortion, strict=True)),
+        }
+        for motion in motions
+    ]
+    write_json(folder / "quality.json", {**asdict(result), "base": base})
     with atomic_path(folder / "quality.png") as partial:
         save_png(figure, partial)
     if len(trials) > 1:
         check_base(trials, still, largest_distortion=settings.largest_distortion)
-    return _text(result, motions)
+    table = quality_table(asdict(result)["markers"])
+    heads = ["marker", *(column.lower() for column in QUALITY_COLUMNS)]
+    lines = [aligned([heads, *([label, *cells] for label, cells in table.items())])]
+    seconds = result.frames / result.rate_hz
+    lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate_hz:g} Hz")
+    if release is not None:
+        held = release.rest
+        lines.append(f"Released in frame {release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
+    lines += result.warnings
+    for motion in motions:
+        lines.append(
+            f"{motion.source}: the base is shifted by up to {_MILLI * motion.shift.max():.2f} mm; its markers moved by "
+            f"up to {_MILLI * motion.distortion.max():.2f} mm relative to each other."
+        )
+    return "\n".join(lines)
 
 
 def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:
@@ -180,28 +201,3 @@ def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Qua
     handles: list[Artist] = [Patch(color=colour, label=name) for name, colour in _STATES.items()]
     handles.append(axes.plot([], [], "|", color=TONES["ink"].light, markersize=6, label="jump")[0])
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
-
-
-def _text(result: Quality, motions: Sequence[BaseMotion]) -> str:
-    """The table with a column for each quantity, then release, warnings and motion of the base."""
-    lines = [aligned(quality_table(result))]
-    seconds = result.frames / result.rate
-    lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate:g} Hz")
-    if result.release is not None:
-        held = result.release.rest
-        lines.append(f"Released in frame {result.release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
-    lines += result.warnings
-    for motion in motions:
-        lines.append(
-            f"{motion.source}: the base is shifted by up to {_MILLI * motion.shift.max():.2f} mm; its markers moved by "
-            f"up to {_MILLI * motion.distortion.max():.2f} mm relative to each other."
-        )
-    return "\n".join(lines)
-
-
-def _plain(motion: BaseMotion, labels: Sequence[str]) -> dict[str, Any]:
-    return {
-        "source": motion.source,
-        "shift_mm": dict(zip(labels, _MILLI * motion.shift, strict=True)),
-        "distortion_mm": dict(zip(labels, _MILLI * motion.distortion, strict=True)),
-    }

@@ -1,27 +1,42 @@
-"""Quality of a recording: occlusions, jumps, noise, and drift of markers that should stand still."""
+"""Quality of a recording: occlusions, jumps, exchanged labels, noise, and drift of markers that should stand still."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.spatial.distance import cdist
 
 from ...io.errors import DataFileError, InputError, listed
-from .jumps import LEAST_JUMP, Jump, Swap, find_jumps, find_swaps
-from .recording import FloatArray, Recording, runs
+from .recording import FloatArray, Recording, bridged, runs
 from .release import Release
 
-_LEAST_MOTION = 5e-4  # [m]
+LEAST_JUMP = 2e-4  # [m]
 _MILLI = 1e3
+# Of jumps and exchanged labels:
+_TIMES_USUAL = 8.0  # Least ratio of a jump and the median of the steps around it.
+_USUAL_FRAMES = 21
+_SHARE_OF_LARGEST = 0.75  # Excludes the residual of 4/6 that a jump of 1 leaves in the steps beside it.
+_NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
+_RELEASE_FRAMES = 1.5  # around the release, in which a jerk of a marker is no jump
+_TAKEN_OVER = 0.25  # of the marker's displacement: largest distance from the other marker's place
+# Of motion, noise and drift:
+_LEAST_MOTION = 5e-4  # [m]
 _NOISE_FRAMES = 25
 _LEAST_NOISE_FRAMES = 10
 _QUIET_QUARTILE = 25.0
 _DRIFT_PART = 0.1  # of the frames, at either end
-_MUCH_DRIFT = 2e-4  # [m]
-_RELEASE_FRAMES = 1.5  # around the release, in which a jerk of a marker is no jump
+_MUCH_DRIFT_MM = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Jump:
+    """A step of a single marker."""
+
+    frame: int  # The first frame after the jump
+    mm: float  # part of the step that neither its neighbours in time nor the other markers explain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,81 +47,41 @@ class MarkerQuality:
     still: bool  # Whether it should not move
     seen: float  # Share of the frames in which it was seen
     gaps: int  # Number of occlusions
-    longest_gap: int  # The longest of them, in frames
-    masked: int  # Frames in gaps that are too long to be filled, or at either end
-    jumps: tuple[Jump, ...]  # Its jumps, in the order of time
-    noise: float  # [m] standard deviation of one coordinate, from third differences in the quietest parts
-    drift: float | None  # [m] between the median places in the first and last tenth of the frames; None if it may move
-    reach: float  # [m] largest distance from its median position
-
-    @property
-    def largest_jump(self) -> Jump | None:
-        """The largest jump, if there is one."""
-        return max(self.jumps, key=lambda jump: jump.size, default=None)
-
-
-@dataclasses.dataclass(frozen=True)
-class Quality:
-    """Quality of a recording."""
-
-    source: Path
-    rate: float  # Frames a second [Hz]
-    frames: int
-    release: Release | None  # Release of the body, if known
-    markers: tuple[MarkerQuality, ...]  # One entry for every marker
-    swaps: tuple[Swap, ...]  # Markers at the place of another one
-    longest_gap: int  # The longest occlusion that counts as short, in frames
+    longest_gap_frames: int
+    masked_frames: int  # in gaps that are too long to be filled, or at either end
+    jumps: tuple[Jump, ...]  # in the order of time
+    noise_mm: float  # standard deviation of one coordinate, see `noise_level`
+    drift_mm: float | None  # between the median places in the first and last tenth of the frames; None if it may move
 
     @property
     def warnings(self) -> list[str]:
         """Warnings for the user, one sentence each."""
-        warnings = [
-            f"From frame {swap.frame} on, {swap.label} stands where {swap.other} was: check the labels."
-            for swap in self.swaps
-        ]
-        for marker in self.markers:
-            if marker.masked:
-                warnings.append(
-                    f"{marker.label} is hidden for up to {marker.longest_gap} frames; {marker.masked} frames are "
-                    "masked."
-                )
-            if largest := marker.largest_jump:
-                often = "once," if len(marker.jumps) == 1 else f"{len(marker.jumps)} times, farthest"
-                warnings.append(
-                    f"{marker.label} jumps {often} by {_MILLI * largest.size:.2f} mm, in frame {largest.frame}."
-                )
-            if marker.drift is not None and marker.drift > max(_MUCH_DRIFT, 5.0 * marker.noise):
-                warnings.append(f"{marker.label} should not move and drifts by {_MILLI * marker.drift:.2f} mm.")
+        warnings = []
+        if self.masked_frames:
+            warnings.append(
+                f"{self.label} is hidden for up to {self.longest_gap_frames} frames; {self.masked_frames} frames are "
+                "masked."
+            )
+        if self.jumps:
+            largest = max(self.jumps, key=lambda jump: jump.mm)
+            often = "once," if len(self.jumps) == 1 else f"{len(self.jumps)} times, farthest"
+            warnings.append(f"{self.label} jumps {often} by {largest.mm:.2f} mm, in frame {largest.frame}.")
+        if self.drift_mm is not None and self.drift_mm > max(_MUCH_DRIFT_MM, 5.0 * self.noise_mm):
+            warnings.append(f"{self.label} should not move and drifts by {self.drift_mm:.2f} mm.")
         return warnings
 
-    def to_plain(self) -> dict[str, Any]:
-        """Returns the content of quality.json, with lengths in millimetres."""
-        markers = [
-            {
-                "label": marker.label,
-                "still": marker.still,
-                "seen": marker.seen,
-                "gaps": marker.gaps,
-                "longest_gap_frames": marker.longest_gap,
-                "masked_frames": marker.masked,
-                "jumps": [{"frame": jump.frame, "mm": _MILLI * jump.size} for jump in marker.jumps],
-                "noise_mm": _MILLI * marker.noise,
-                "drift_mm": None if marker.drift is None else _MILLI * marker.drift,
-                "reach_mm": _MILLI * marker.reach,
-            }
-            for marker in self.markers
-        ]
-        return {
-            "source": self.source,
-            "rate_hz": self.rate,
-            "frames": self.frames,
-            "release_frame": None if self.release is None else self.release.frame,
-            "held_frames": None if self.release is None else list(self.release.rest),
-            "longest_gap_filled": self.longest_gap,
-            "markers": markers,
-            "swaps": [dataclasses.asdict(swap) for swap in self.swaps],
-            "warnings": self.warnings,
-        }
+
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """Quality of a recording, the content of quality.json."""
+
+    source: Path
+    rate_hz: float
+    frames: int
+    release_frame: float | None  # Release of the body, if known
+    longest_gap_filled: int  # The longest occlusion that counts as short, in frames
+    markers: tuple[MarkerQuality, ...]
+    warnings: tuple[str, ...]  # for the user, one sentence each
 
 
 def quality(
@@ -130,37 +105,48 @@ def quality(
         DataFileError: A marker that should not move is not in the recording.
     """
     recording.select(still)
-    jumps = [
-        jump
-        for jump in find_jumps(recording, least_jump)
-        if release is None or jump.label in still or abs(jump.frame - release.frame) > _RELEASE_FRAMES
-    ]
-    noise = noise_level(recording)
-    markers = []
+    noise, jumps, markers = noise_level(recording), find_jumps(recording, least_jump), []
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
-        hidden = runs(~seen)
-        lengths = [stop - start for start, stop in hidden]
+        if release is not None and label not in still:
+            jumps[label] = [jump for jump in jumps[label] if abs(jump.frame - release.frame) > _RELEASE_FRAMES]
+        hidden, frames = [stop - start for start, stop in runs(~seen)], len(seen)
         masked = [
-            stop - start for start, stop in hidden if stop - start > longest_gap or start == 0 or stop == len(seen)
+            stop - start for start, stop in runs(~seen) if stop - start > longest_gap or start == 0 or stop == frames
         ]
-        path = recording.positions[seen, column]
-        markers.append(
-            MarkerQuality(
-                label=label,
-                still=label in still,
-                seen=float(seen.mean()),
-                gaps=len(hidden),
-                longest_gap=max(lengths, default=0),
-                masked=sum(masked),
-                jumps=tuple(jump for jump in jumps if jump.label == label),
-                noise=float(noise[column]),
-                drift=_drift(path) if label in still else None,
-                reach=float(np.linalg.norm(path - np.median(path, axis=0), axis=1).max()) if len(path) else np.nan,
-            )
-        )
-    swaps = tuple(find_swaps(recording, jumps))
-    frames = len(recording.positions)
-    return Quality(recording.source, recording.rate, frames, release, tuple(markers), swaps, longest_gap)
+        path, drift = recording.positions[seen, column], None
+        if label in still:
+            part = max(1, round(_DRIFT_PART * len(path)))
+            ends = [np.median(own, axis=0) for own in (path[:part], path[-part:])] if len(path) else [np.nan, np.nan]
+            drift = _MILLI * float(np.linalg.norm(ends[1] - ends[0]))
+        counts = (len(hidden), max(hidden, default=0), sum(masked), tuple(jumps[label]))
+        noise_mm = _MILLI * float(noise[column])
+        markers.append(MarkerQuality(label, label in still, float(seen.mean()), *counts, noise_mm, drift))
+    warnings = [
+        f"From frame {frame} on, {label} stands where {other} was: check the labels."
+        for label, other, frame in find_swaps(recording, jumps)
+    ]
+    warnings += [warning for marker in markers for warning in marker.warnings]
+    released = None if release is None else release.frame
+    of_file = (recording.source, recording.rate, len(recording.positions), released)
+    return Quality(*of_file, longest_gap, tuple(markers), tuple(warnings))
+
+
+QUALITY_COLUMNS = ("Seen", "Gaps", "Longest", "Masked", "Jumps", "Noise [mm]", "Drift [mm]")
+
+
+def quality_table(markers: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Returns the cells of `QUALITY_COLUMNS` by marker, from the markers in the content of quality.json."""
+    return {
+        marker["label"]: [
+            f"{100.0 * marker['seen']:.1f} %",
+            *(str(marker[key]) for key in ("gaps", "longest_gap_frames", "masked_frames")),
+            f"{len(marker['jumps'])}"
+            + (f" ({max(jump['mm'] for jump in marker['jumps']):.2f} mm)" if marker["jumps"] else ""),
+            "" if marker["noise_mm"] is None or np.isnan(marker["noise_mm"]) else f"{marker['noise_mm']:.4f}",
+            "" if marker["drift_mm"] is None else f"{marker['drift_mm']:.3f}",
+        ]
+        for marker in markers
+    }
 
 
 def noise_level(recording: Recording) -> FloatArray:
@@ -181,17 +167,61 @@ def noise_level(recording: Recording) -> FloatArray:
     return noise
 
 
-def quality_table(result: Quality) -> list[list[str]]:
-    """Returns rows of text with a header; lengths in millimetres."""
-    header = ["marker", "seen", "gaps", "longest", "masked", "jumps", "largest [mm]", "noise [mm]", "drift [mm]"]
-    rows = [header]
-    for marker in result.markers:
-        counts = map(str, (marker.gaps, marker.longest_gap, marker.masked, len(marker.jumps)))
-        jump = f"{_MILLI * marker.largest_jump.size:.2f}" if marker.largest_jump else ""
-        noise = f"{_MILLI * marker.noise:.4f}" if np.isfinite(marker.noise) else ""
-        drift = "" if marker.drift is None else f"{_MILLI * marker.drift:.3f}"
-        rows.append([marker.label, f"{100.0 * marker.seen:.1f} %", *counts, jump, noise, drift])
-    return rows
+def find_jumps(recording: Recording, least: float = LEAST_JUMP) -> dict[str, list[Jump]]:
+    """Finds steps between two frames that neither the marker's own motion nor that of another marker explains.
+
+    A step is predicted from the two steps on either side by a cubic, which is exact for a motion that is smooth over
+    six frames. Its residual is compared with the residuals of all other markers, since a body that is released or hits
+    something jerks as a whole; the smallest difference counts. It is a jump if it is larger than `least` and larger
+    than eight times its median over 21 frames. Gaps are interpolated by a spline.
+    """
+    jumps: dict[str, list[Jump]] = {label: [] for label in recording.labels}
+    if len(recording.positions) < 6:
+        return jumps
+    positions = np.zeros_like(recording.positions)
+    for column, known in enumerate(recording.seen.T):
+        if np.count_nonzero(known) > 1:
+            positions[:, column] = bridged(recording, column, np.arange(len(positions)))
+    steps = np.diff(positions, axis=0)
+    padded = np.pad(steps, ((2, 2), (0, 0), (0, 0)), mode="reflect")
+    beside = (padded[:-4], padded[1:-3], padded[3:-1], padded[4:])
+    residual = steps - sum(weight * step for weight, step in zip(_NEIGHBOURS, beside, strict=True))
+    size = np.linalg.norm(residual, axis=2)  # (T-1, M) [m] part of the steps that is neither smooth nor shared
+    for column in range(len(recording.labels)):
+        others = np.linalg.norm(np.delete(residual, column, axis=1) - residual[:, column, None], axis=2)
+        size[:, column] = np.minimum(size[:, column], others.min(axis=1, initial=np.inf))
+    usual = median_filter(size, size=(_USUAL_FRAMES, 1), mode="nearest")
+    largest = maximum_filter1d(size, 5, axis=0, mode="nearest")
+    is_jump = (size > least) & (size > _TIMES_USUAL * usual) & (size >= _SHARE_OF_LARGEST * largest)
+    for at, column in np.argwhere(is_jump):
+        jumps[recording.labels[column]].append(Jump(int(at) + 1, _MILLI * float(size[at, column])))
+    return jumps
+
+
+def find_swaps(recording: Recording, jumps: Mapping[str, Sequence[Jump]]) -> list[tuple[str, str, int]]:
+    """Finds markers that appear at the last place of another marker after a jump or an occlusion.
+
+    Returns:
+        The marker, the other marker, and the first frame at its place.
+    """
+    seen = recording.seen
+    last_seen = np.maximum.accumulate(np.where(seen, np.arange(len(seen))[:, None], -1), axis=0)  # (T, M)
+    swaps = []
+    for column, label in enumerate(recording.labels):
+        frames = {jump.frame for jump in jumps[label]}
+        frames |= {stop for start, stop in runs(~seen[:, column]) if start > 0 and stop < len(seen)}
+        for frame in sorted(frames):
+            before = last_seen[frame - 1]  # (M,)
+            if not seen[frame, column] or before[column] < 0:
+                continue
+            here = recording.positions[frame, column]
+            moved = np.linalg.norm(here - recording.positions[before[column], column])
+            distance = np.linalg.norm(here - recording.positions[before, np.arange(len(before))], axis=1)
+            distance[(before < 0) | (np.arange(len(before)) == column)] = np.inf
+            nearest = int(np.argmin(distance))
+            if distance[nearest] < _TAKEN_OVER * moved and moved > 5.0 * LEAST_JUMP:
+                swaps.append((label, recording.labels[nearest], frame))
+    return swaps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,14 +230,8 @@ class BaseMotion:
 
     source: Path
     shift: FloatArray  # (M,) [m] distances of the markers from their places in the first recording
-    changes: FloatArray  # (M, M) [m] changes of the distances between every two markers
-
-    @property
-    def distortion(self) -> FloatArray:
-        """Median change of a marker's distances to the other ones, (M,) [m]."""
-        count = len(self.changes)
-        others = self.changes[~np.eye(count, dtype=np.bool_)].reshape(count, count - 1)
-        return np.asarray(np.median(others, axis=1))
+    distortion: FloatArray  # (M,) [m] median change of a marker's distances to the other ones
+    largest: float  # [m] largest change of a distance between two markers
 
 
 def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
@@ -218,21 +242,26 @@ def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list
 
     Raises:
         DataFileError: A marker is missing or never seen in a recording.
+        InputError: There are fewer than two markers to compare.
     """
-    places = []
+    if len(labels) < 2:
+        raise InputError(f"The base has {len(labels)} markers: name two or more that sit on the clamp.")
+    motions, first = list[BaseMotion](), None
     for recording in recordings:
         base = recording.select(labels)
-        absent = [label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()]
-        if absent:
+        if absent := [label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()]:
             raise DataFileError(
                 f"{recording.source}: {listed(absent)} is never seen; leave it out of the base markers."
             )
-        places.append(np.nanmedian(base.positions, axis=0))
-    distances = [cdist(place, place) for place in places]
-    return [
-        BaseMotion(recording.source, np.linalg.norm(place - places[0], axis=1), np.abs(between - distances[0]))
-        for recording, place, between in zip(recordings[1:], places[1:], distances[1:], strict=True)
-    ]
+        place = np.nanmedian(base.positions, axis=0)
+        if first is None:
+            first = place
+            continue
+        changes = np.abs(cdist(place, place) - cdist(first, first))[~np.eye(len(labels), dtype=np.bool_)]
+        distortion = np.median(changes.reshape(len(labels), -1), axis=1)
+        shift = np.linalg.norm(place - first, axis=1)
+        motions.append(BaseMotion(recording.source, shift, distortion, float(changes.max())))
+    return motions
 
 
 def check_base(
@@ -242,23 +271,19 @@ def check_base(
     largest_distortion: float = 1e-3,
     largest_shift: float | None = None,
 ) -> None:
-    """Checks that no marker on the base of a set-up was moved between trials.
+    """Checks that no marker on the base of a set-up was moved between trials, see `compare_base`.
 
-    The distance between two markers may change by `largest_distortion` [m]. A marker may be `largest_shift` [m] from
-    its place in the first recording; anywhere if None, for recordings that are registered separately.
+    The distance between two markers may change by `largest_distortion` [m]. A marker may be `largest_shift` [m]
+    from its place in the first recording; anywhere if None, for recordings that are registered separately.
 
     Raises:
-        DataFileError: A marker moved, is missing or is never seen.
-        InputError: There are fewer than two markers to compare.
+        DataFileError: A marker moved.
     """
-    if len(labels) < 2:
-        raise InputError(f"The base has {len(labels)} markers: name two or more that sit on the clamp.")
     for motion in compare_base(recordings, labels):
         worst = int(np.argmax(motion.distortion))
-        largest = motion.changes.max()
-        if largest > largest_distortion:
+        if motion.largest > largest_distortion:
             raise DataFileError(
-                f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * largest:.2f} mm "
+                f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * motion.largest:.2f} mm "
                 f"against the other base markers since {recordings[0].source}; put it back, check the unit, leave "
                 f"it out, or raise the limit of {_MILLI * largest_distortion:g} mm."
             )
@@ -290,20 +315,3 @@ def check_motion(recording: Recording, labels: Sequence[str]) -> None:
             f"{len(recording.positions) / recording.rate:.3g} s that count: follow markers that move, or leave the "
             "recording out."
         )
-
-
-def check_passive(recording: Recording) -> None:
-    """Checks that a recording has no actuation, which would be ignored; raises DataFileError."""
-    if recording.actuation is not None:
-        raise DataFileError(
-            f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which nothing here "
-            "uses: take an experiment with pressures (data.kind: pressure), or leave it out of the file."
-        )
-
-
-def _drift(path: FloatArray) -> float:
-    """Distance [m] between the median positions of the first and the last tenth of (T, 3)."""
-    if not len(path):
-        return float("nan")
-    part = max(1, round(_DRIFT_PART * len(path)))
-    return float(np.linalg.norm(np.median(path[-part:], axis=0) - np.median(path[:part], axis=0)))

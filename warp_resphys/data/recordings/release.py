@@ -95,7 +95,7 @@ def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
     of up to their number. A slow drift, such as that of a leaking valve, is not counted as the opening.
 
     Frames in which a followed marker was not seen are ignored. Repeated frames should be masked before
-    (`jumps.mask_repeats`).
+    (`segment.mask_repeats`).
 
     Returns:
         The time [s], on the recording's own clock (`Recording.time`).

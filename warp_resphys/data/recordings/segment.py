@@ -13,7 +13,6 @@ import numpy as np
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
 from .arrays import numbers, write_recording
-from .jumps import mask_repeats
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 from .release import valve_opening
 
@@ -73,6 +72,18 @@ def convert_segment(source: str | Path, folder: str | Path) -> None:
     for mbar, recording in read_published_segment(source).items():
         attributes = {"pressure_mbar": mbar, "valve_opening_s": -recording.start}
         write_recording(Path(folder) / f"segment_{mbar:03d}.h5", recording, attributes)
+
+
+def mask_repeats(recording: Recording) -> Recording:
+    """Masks frames (NaN) in which all seen markers have exactly their positions in the frame before.
+
+    Measured positions always differ by their noise. Equal ones come from a stream that was read faster than it was
+    updated.
+    """
+    positions = recording.positions
+    equal = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
+    repeated = np.concatenate([[False], equal.all(axis=(1, 2))])
+    return replace(recording, positions=np.where(repeated[:, None, None], np.nan, positions))
 
 
 def _trial(raw: RawRecording, mbar: float, path: Path) -> Recording:

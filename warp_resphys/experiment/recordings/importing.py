@@ -7,7 +7,7 @@ step. Driven bodies are resampled to the time steps, during which inputs are con
 
 import logging
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -370,7 +370,7 @@ def _write_quality(
         labels = trial.raw.labels
         raw = replace(trial.raw, labels=owners(labels), positions=as_markers(trial.raw.positions, labels))
         measured = quality(raw, reference if trial.base is None else [], trial.release, longest_gap=gap)
-        qualities[name] = measured.to_plain()
+        qualities[name] = asdict(measured)
         if trial.settings.is_released:
             for warning in measured.warnings:
                 log.warning("%s: %s", measured.source.name, warning)

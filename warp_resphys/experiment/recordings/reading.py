@@ -13,7 +13,6 @@ from ...data.assignment import assign
 from ...data.marker_view import MarkerView
 from ...data.obstacle_motion import recorded
 from ...data.recordings.bag import Bag
-from ...data.recordings.quality import check_passive
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
 from ...data.recordings.text import Table
@@ -161,7 +160,12 @@ class Reader:
                 raise InputError(
                     f"data.trials.{trial.name}.inputs is set, but the body has no chambers, tendons or muscles."
                 )
-            check_passive(recording)
+            if recording.actuation is not None:
+                raise DataFileError(
+                    f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which "
+                    "nothing here uses: take an experiment with pressures (/recordings: pressure), or leave it out of "
+                    "the file."
+                )
         elif trial.inputs is not None:
             frames = np.arange(len(recording.positions)) + recording.start * recording.rate
             share = 1.0 if trial.onset is None else np.clip(frames - trial.onset * recording.rate, 0.0, 1.0)

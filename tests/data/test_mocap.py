@@ -4,7 +4,6 @@ import ezc3d
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.c3d import read_raw_c3d
 from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
@@ -37,11 +36,6 @@ def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
     assert recording.labels == ("a", "b", "c")
     assert recording.rate == 200.0
     np.testing.assert_allclose(recording.positions, 1e-3 * trajectory, rtol=1e-6, atol=1e-9)
-    raw = read_raw_c3d(tmp_path / "small.c3d")
-    assert (raw.unit, raw.rate, list(raw.labels)) == ("mm", 200.0, ["a", "b", "c"])
-    np.testing.assert_allclose(raw.positions[0], trajectory[0], rtol=1e-6)
-    picked = recording.select(["c", "a"])
-    np.testing.assert_array_equal(picked.positions, recording.positions[:, [2, 0]])
 
 
 def test_missing_and_foreign_files(tmp_path):
@@ -61,7 +55,7 @@ def test_truncated_file(tmp_path, trajectory, part):
     cut = tmp_path / "cut.c3d"
     cut.write_bytes(content[: int(part * len(content))])
     with pytest.raises(DataFileError, match="truncated"):
-        read_raw_c3d(cut)
+        read_recording(cut)
 
 
 @pytest.mark.parametrize(

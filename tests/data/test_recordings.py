@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.recordings.arrays import write_recording
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.reading import read_recording, write_recording
 from warp_resphys.data.recordings.text import Table
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError

@@ -18,8 +18,7 @@ from support.configured import check, composed, settings
 from support.main_job import IN_RUN, run, without_reports
 from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
-from warp_resphys.data.recordings.arrays import write_recording
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.reading import read_recording, write_recording
 from warp_resphys.experiment import learn, reconstruct
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment

@@ -18,7 +18,7 @@ from typing_extensions import override
 
 from ..data.actuation import InputSequences, InputWaves
 from ..data.base_motion import in_frame, rigid
-from ..data.recordings.arrays import write_recording
+from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
 from ..data.rigid import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes

@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ..data.recordings.arrays import write_recording
 from ..data.recordings.bag import is_bag
-from ..data.recordings.reading import READERS, read_recording
+from ..data.recordings.reading import READERS, read_recording, write_recording
 from ..io.errors import DataFileError, InputError, listed
 from ..io.settings import Many, Settings, Word
 from .recording_quality import RecordingFile

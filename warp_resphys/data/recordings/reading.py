@@ -1,25 +1,25 @@
-"""Reader of recordings in all supported formats."""
+"""Recordings in files: C3D, NumPy archives and HDF5; other modules read text and bags (docs/recordings.md)."""
 
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...io.decoding import Arrays, DecodingError, decode
 from ...io.errors import DataFileError, InputError
-from .arrays import read_raw_hdf5, read_raw_npz
+from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from .bag import SUFFIXES, Bag, is_bag, read_raw_bag, topics_of
-from .c3d import read_raw_c3d
-from .recording import RawRecording, Recording, to_recording
+from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
 from .text import Table, read_raw_text
 
-READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {
-    ".c3d": read_raw_c3d,
-    ".csv": read_raw_text,
-    ".tsv": read_raw_text,
-    ".txt": read_raw_text,
-    ".npz": read_raw_npz,
-    ".h5": read_raw_hdf5,
-    ".hdf5": read_raw_hdf5,
-}
+_KIND = "recording"
+_UNITS = {"positions": "units", "actuation": "actuation_units"}
+_NAMES = ("positions", "labels", "rate_hz", "actuation", "rest", "base", "start", "quaternions", *_UNITS.values())
+_C3D_MAGIC = 0x50
+_BIG_ENDIAN_PROCESSOR = 86
 
 
 def read_recording(
@@ -59,3 +59,135 @@ def read_recording(
     if bag is None:
         raise InputError(f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has {topics_of(path)}.")
     return to_recording(read_raw_bag(path, bag), path, units, bag.rate or rate, labels)
+
+
+def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
+    """Writes the HDF5 layout, in metres; `read_recording` returns the same recording.
+
+    Attributes are further properties of the trial, such as a load. Missing folders are created.
+
+    Raises:
+        DataFileError: The file cannot be written.
+    """
+    known = {"labels": list(recording.labels), "rate_hz": recording.rate, "start": recording.start}
+    with atomic_hdf5(path, _KIND, {**(attributes or {}), **known, "source": recording.source.name}) as file:
+        create(file, "positions", recording.positions, units="m")
+        if recording.rest is not None:
+            create(file, "rest", recording.rest, units="m")
+        if recording.actuation is not None:
+            create(file, "actuation", recording.actuation, units="1")
+        if recording.base is not None:
+            quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
+            create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
+
+
+def numbers(arrays: Arrays, name: str, path: Path) -> FloatArray:
+    """Returns an array of a file; raises DataFileError if it is missing or does not hold numbers."""
+    if name not in arrays:
+        raise DataFileError(
+            f"{path} has no array '{name}'; it has {', '.join(arrays) or 'none'}: check the path, or see "
+            "docs/recordings.md."
+        )
+    if arrays[name].dtype.kind not in "fiu":
+        raise DataFileError(f"{path}: '{name}' does not hold numbers (it is {arrays[name].dtype}); save numbers there.")
+    return np.asarray(arrays[name], dtype=np.float64)
+
+
+def _read_npz(path: Path) -> RawRecording:
+    """Reads a NumPy archive without unpickling."""
+    arrays = read_arrays(path, _NAMES)
+    if "" in arrays:
+        raise DataFileError(f"{path} is a single array, not an archive: save it with numpy.savez.")
+    return _assembled(arrays, path)
+
+
+def _read_hdf5(path: Path) -> RawRecording:
+    """Reads an HDF5 file of any origin: every name of the layout may be a dataset or an attribute of the root."""
+    try:
+        path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
+        arrays = decode("h5py", path, "format", "kind", *_NAMES)
+    except (OSError, DecodingError) as error:
+        raise hdf5_error(path, error) from error
+    kind = _word(arrays, "kind")
+    if _word(arrays, "format") == FORMAT and kind != _KIND:
+        raise DataFileError(f"{path} holds '{kind}' where '{_KIND}' is needed: check the path.")
+    for name, unit in _UNITS.items():
+        if f"{name}.units" in arrays:
+            arrays[unit] = arrays[f"{name}.units"]
+    return _assembled(arrays, path)
+
+
+def _assembled(arrays: Arrays, path: Path) -> RawRecording:
+    """Returns the recording of arrays of the layout, by name."""
+    words = ("labels", *_UNITS.values())
+    found = {name: numbers(arrays, name, path) for name in _NAMES if name in arrays and name not in words}
+    for name in ("rate_hz", "start"):
+        if name in found and found[name].size != 1:
+            raise DataFileError(f"{path}: '{name}' has the shape {found[name].shape}; it must be one number.")
+    unit = _word(arrays, "actuation_units") or "1"
+    if "actuation" in found:
+        if unit not in SI_PER_ACTUATION_UNIT:
+            raise DataFileError(
+                f"{path} gives its actuation in '{unit}': give it in one of {', '.join(SI_PER_ACTUATION_UNIT)}."
+            )
+        with np.errstate(over="ignore"):
+            found["actuation"] = found["actuation"] * SI_PER_ACTUATION_UNIT[unit]
+    return RawRecording(
+        positions=numbers(arrays, "positions", path),
+        labels=[_text(label) for label in np.ravel(arrays["labels"])] if "labels" in arrays else None,
+        unit=_word(arrays, "units") or "m",
+        rate=found["rate_hz"].item() if "rate_hz" in found else None,
+        actuation=found.get("actuation"),
+        rest=found.get("rest"),
+        base=found.get("base"),
+        start=found["start"].item() if "start" in found else 0.0,
+        turns=found.get("quaternions"),
+    )
+
+
+def _word(arrays: Arrays, name: str) -> str | None:
+    return _text(arrays[name].item()) if name in arrays and arrays[name].size == 1 else None
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _read_c3d(path: Path) -> RawRecording:
+    """Reads the markers of a C3D file, decoded by ezc3d in a process of its own."""
+    try:
+        content = path.read_bytes()
+        if len(content) < 2 or content[1] != _C3D_MAGIC:
+            raise DataFileError(f"{path} is not a C3D file: give a motion-capture recording in C3D format.")
+        processor_at = (content[0] - 1) * 512 + 3
+        if len(content) < 512 or content[0] == 0 or len(content) <= processor_at:
+            raise DataFileError(f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again.")
+        arrays = decode("ezc3d", path)
+    except OSError as error:
+        raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
+    except DecodingError as error:
+        raise DataFileError(f"{path} cannot be decoded ({error}): copy or export it again.") from error
+    points = arrays["points"]
+    if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
+        raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
+    order = ">" if content[processor_at] == _BIG_ENDIAN_PROCESSOR else "<"
+    first, last = struct.unpack_from(order + "2H", content, 6)
+    if points.shape[2] < last - first + 1:  # The decoder silently corrects the header.
+        raise DataFileError(
+            f"{path} is truncated: it holds {points.shape[2]} of the {last - first + 1} frames that its header "
+            "declares; copy or export it again."
+        )
+    return RawRecording(
+        positions=points[:3].transpose(2, 1, 0),
+        labels=arrays["labels"][: points.shape[1]].tolist(),
+        unit=str(arrays["units"][0]).strip() if arrays["units"].size else None,
+        rate=float(arrays["rate"][0]) if arrays["rate"].size else None,
+    )
+
+
+READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {
+    ".c3d": _read_c3d,
+    **dict.fromkeys((".csv", ".tsv", ".txt"), read_raw_text),
+    ".npz": _read_npz,
+    **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
+}

@@ -12,22 +12,20 @@ import numpy as np
 
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
-from .arrays import numbers, write_recording
+from .reading import numbers, write_recording
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 from .release import valve_opening
 
-LENGTH: Final = 0.1  # [m]
 # Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
 SEGMENT_NOMINAL: Final = np.array(
     [
-        *((-0.0505, -0.0205, 0.102), (-0.0305, -0.0505, 0.102), (-0.0105, 0.0505, 0.102), (-0.0505, 0.0235, 0.102)),
-        *((-0.0096, -0.0265, 0.0), (-0.0096, 0.0265, 0.0), (-0.0282, 0.0, 0.0)),
+        *((-0.0505, -0.0205, 0.002), (-0.0305, -0.0505, 0.002), (-0.0105, 0.0505, 0.002), (-0.0505, 0.0235, 0.002)),
+        *((-0.0096, -0.0265, -0.1), (-0.0096, 0.0265, -0.1), (-0.0282, 0.0, -0.1)),
     ]
-) - np.array([0.0, 0.0, LENGTH])
+)
 CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
 SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)
-_LARGEST_PRESSURE: Final = 1e5  # mbar
 MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # index of the recorded marker of every label
 
 
@@ -45,22 +43,23 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
             shapes; two trials have the same pressure; or the valve's opening is not found.
     """
     path = Path(path)
-    arrays = read_arrays(path)
+    arrays, recordings = read_arrays(path), dict[int, Recording]()
     pressure, markers, rate = (numbers(arrays, name, path) for name in ("pressure_mbar", "markers", "rate_hz"))
     if markers.ndim != 4 or markers.shape[2:] != (7, 3) or pressure.shape != markers.shape[:1] or rate.size != 1:
         raise DataFileError(
             f"{path}: markers {markers.shape}, pressure_mbar {pressure.shape} and rate_hz {rate.shape} must have the "
             "shapes (trials, frames, 7, 3), (trials,) and (): check the path."
         )
-    if not (np.abs(pressure) <= _LARGEST_PRESSURE).all():
-        raise DataFileError(f"{path}: 'pressure_mbar' must be finite, and at most {_LARGEST_PRESSURE:g} mbar.")
-    names = np.rint(pressure).astype(int).tolist()
-    if len(set(names)) != len(names):
-        raise DataFileError(f"{path}: two trials have the same pressure, to a mbar; give each trial its own.")
-    return {
-        name: _trial(RawRecording(frames[:, list(MARKERS)], SEGMENT_LABELS, "m", rate.item()), mbar, path)
-        for name, mbar, frames in zip(names, pressure.tolist(), markers, strict=True)
-    }
+    if not np.isfinite(pressure).all() or len({*np.rint(pressure).tolist()}) < len(pressure):
+        raise DataFileError(f"{path}: 'pressure_mbar' is not finite, or two trials have the same pressure, to a mbar.")
+    for mbar, frames in zip(pressure.tolist(), markers[:, :, list(MARKERS)], strict=True):
+        recording = mask_repeats(to_recording(RawRecording(frames, SEGMENT_LABELS, "m", rate.item()), path))
+        recording = replace(recording, start=-valve_opening(recording, TIP_LABELS))
+        opened = recording.time >= 0.0
+        step = np.where(opened, mbar * SI_PER_ACTUATION_UNIT["mbar"], 0.0)[:, None]  # (T, 1) [Pa]
+        rest = np.nanmedian(recording.positions[~opened], axis=0)
+        recordings[round(mbar)] = replace(recording, actuation=step, rest=rest)
+    return recordings
 
 
 def convert_segment(source: str | Path, folder: str | Path) -> None:
@@ -84,12 +83,3 @@ def mask_repeats(recording: Recording) -> Recording:
     equal = (positions[1:] == positions[:-1]) | (np.isnan(positions[1:]) & np.isnan(positions[:-1]))
     repeated = np.concatenate([[False], equal.all(axis=(1, 2))])
     return replace(recording, positions=np.where(repeated[:, None, None], np.nan, positions))
-
-
-def _trial(raw: RawRecording, mbar: float, path: Path) -> Recording:
-    recording = mask_repeats(to_recording(raw, path))
-    recording = replace(recording, start=-valve_opening(recording, TIP_LABELS))
-    open_ = recording.time >= 0.0
-    step = np.where(open_, mbar * SI_PER_ACTUATION_UNIT["mbar"], 0.0)[:, None]  # (T, 1) [Pa]
-    rest = np.nanmedian(recording.positions[~open_], axis=0)
-    return replace(recording, actuation=step, rest=rest)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.assignment import assign
+from warp_resphys.data.registration import assign
 from warp_resphys.io.errors import DataFileError, InputError
 
 NAMES = ("a", "b", "c", "d", "base")

@@ -196,7 +196,7 @@ def test_known_axes_leave_a_shift_that_one_marker_determines():
 
 def test_axes_that_do_not_fit():
     points, rotation = shifted(["y", "-x", "z"])
-    with pytest.raises(DataFileError, match=r"swing.c3d: .* given: '[A-Z].*' is .* mm off, the median is"):
+    with pytest.raises(DataFileError, match=r"swing.c3d: .* with the axes that are given: '[A-Z].*' is .* mm off"):
         register_markers(points, NOMINAL, NAMES, source=SOURCE, rotation=axes_rotation(["z", "x", "y"]))
     with pytest.raises(DataFileError, match="registration needs one marker at rest, but 0 are left to it"):
         register_markers(points * np.nan, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
@@ -232,7 +232,7 @@ class TestWithAKnownVertical:
         with pytest.raises(InputError, match=r"'B0', 'B1' lie above one another to within 4\.0 mm"):
             self.register(np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.3]]))
         pair = np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]])
-        with pytest.raises(DataFileError, match="mm off where the vertical and 'B0', 'B1' tell how the body stands"):
+        with pytest.raises(DataFileError, match=r"with the vertical that is given: 'B[01]' is 20\.0 mm off"):
             register_markers(pair * 1.2, pair, ["B0", "B1"], source=SOURCE, vertical=(self.UP, self.UP))
         hidden = np.array([[0.1, 0.0, 0.0], [np.nan] * 3])
         with pytest.raises(DataFileError, match="registration needs two markers at rest, but 1 are left"):

@@ -1,26 +1,34 @@
-"""Rigid registration: the motion from measured markers to their nominal places on a body, and its residual.
+"""Rigid registration of markers: the motion from measured markers to their nominal places on a body, and their names.
 
-Points are (M, 3) [m].
+Points are (M, 3) [m]. Markers without names are matched with their nominal places by the motion and the pairs with the
+least sum of squares. The best pairs for a motion are those of the Hungarian method (Kuhn, Naval Research Logistics
+Quarterly 2 (1955) 83); the candidate motions carry a few markers, the anchors, onto their nominal places.
 """
 
-import dataclasses
-from collections.abc import Sequence
-from itertools import combinations
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
 from math import comb
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from ..io.errors import DataFileError, InputError, listed
-from .rigid import BoolArray, FloatArray, RigidTransform, fit, root_mean_square
+from .rigid import BoolArray, FloatArray, RigidTransform, fit, fitted, root_mean_square
+
+IntArray = NDArray[np.int64]
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried in the search for outliers.
+_REFINEMENTS = 3  # of an assignment
+_CLEAR = 1.3  # least ratio of the residual of the next best pairs and that of the best
+_LEAST = 1e-4  # m: smaller residuals of pairs count as this one
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Registration:
     """Measured markers in the frame of the body."""
 
@@ -75,90 +83,104 @@ def register_markers(
             f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
             "be (markers, 3)."
         )
-    turned = None if rotation is None else np.asarray(rotation, dtype=np.float64)
-    least = 1 if turned is not None else 3 if vertical is None else 2
-    used = _used(a, names, use, source, least)
-    if turned is not None:
-        near, motion = _shifted(a, b, used, turned, largest_residual)
-        if not 2 * np.count_nonzero(near) > np.count_nonzero(used):
-            off = np.linalg.norm(motion.apply(a) - b, axis=1)
-            farthest = int(np.where(used, off, 0.0).argmax())
-            raise DataFileError(
-                f"{source}: the markers at rest do not fit their nominal positions to "
-                f"{_MILLI * largest_residual:.1f} mm with the axes that are given: {names[farthest]!r} is "
-                f"{_MILLI * off[farthest]:.1f} mm off, the median is {_MILLI * np.median(off[used]):.1f} mm; check the "
-                "axes, and the markers' names, nominal positions and unit, or name those that stand where they should "
-                "in markers.register_with."
-            )
-        return _registration(a, b, names, motion, used, near)
-    if vertical is not None and _distance_from_line(b[used]) <= largest_residual:
-        motion = _upright(a[used], b[used], vertical, largest_residual, listed(_pick(names, used)))
-        off = np.linalg.norm(motion.apply(a[used]) - b[used], axis=1)
-        if off.max() > largest_residual:
-            raise DataFileError(
-                f"{source}: {_pick(names, used)[int(off.argmax())]!r} is {_MILLI * off.max():.1f} mm off where the "
-                f"vertical and {listed(_pick(names, used))} tell how the body stands: check their nominal positions, "
-                "the unit and data.up."
-            )
-        return _registration(a, b, names, motion, used, used)
-    if _distance_from_line(b[used]) <= largest_residual:
-        raise InputError(
-            f"The nominal positions of {listed(_pick(names, used))} lie on one line to within "
-            f"{_MILLI * largest_residual:.1f} mm, so that the rotation about it is open: register with another marker."
-        )
-    fitted = _consensus(a, b, used, largest_residual)
-    if fitted is None:
+    if unknown := [name for name in use or () if name not in names]:
+        raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
+    wanted = np.array([use is None or name in use for name in names], dtype=bool)
+    seen = np.isfinite(a).all(axis=1)
+    used, count = np.flatnonzero(wanted & seen), np.count_nonzero(wanted & seen)
+    least = 1 if rotation is not None else 3 if vertical is None else 2
+    if count < least:
+        needed = ["one marker", "two markers", "three markers"][least - 1]
         raise DataFileError(
-            f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm: "
-            f"{_worst(a, b, used, names)}; check its name, its nominal position and the unit."
+            f"{source}: registration needs {needed} at rest, but {count} are left to it; not seen: "
+            f"{listed(_pick(names, wanted & ~seen))}."
         )
-    motion, _ = fit(a[fitted], b[fitted], np.ones(np.count_nonzero(fitted)))
-    return _registration(a, b, names, motion, used, fitted)
+    fewest, turned, known = max(4, count // 2 + 1), None, ""
+    if rotation is not None:
+        fewest, turned, known = count // 2 + 1, np.asarray(rotation, dtype=np.float64), " with the axes that are given"
+    elif _distance_from_line(b[used]) <= largest_residual:
+        if vertical is None:
+            raise InputError(
+                f"The nominal positions of {listed(_pick(names, wanted & seen))} lie on one line to within "
+                f"{_MILLI * largest_residual:.1f} mm, so that the rotation about it is open: register with another "
+                "marker."
+            )
+        if (turned := _upright(a[used], b[used], vertical, largest_residual)) is None:
+            raise InputError(
+                f"{listed(_pick(names, wanted & seen))} lie above one another to within "
+                f"{_MILLI * largest_residual:.1f} mm, so that the vertical does not tell how the body is turned: "
+                "register with another marker."
+            )
+        fewest, known = count, " with the vertical that is given"
+    best = _consensus(a, b, used, fewest, turned, largest_residual)
+    if best is None:
+        raise DataFileError(
+            f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm"
+            f"{known}: {_worst(a, b, used, turned, names)}; check its name, its nominal position, the unit and the "
+            "axes, or name those that stand where they should in markers.register_with."
+        )
+    rows, motion = best
+    moved, inliers = motion.apply(a), np.isin(np.arange(len(names)), rows)
+    outliers = tuple(_pick(names, wanted & seen & ~inliers))
+    residual = np.linalg.norm(moved - b, axis=1)
+    return Registration(tuple(names), motion, moved, residual, inliers, outliers, root_mean_square((moved - b)[rows]))
 
 
-def _registration(
-    a: FloatArray, b: FloatArray, names: Sequence[str], motion: RigidTransform, used: BoolArray, fitted: BoolArray
-) -> Registration:
-    moved = motion.apply(a)
-    outliers = tuple(_pick(names, used & ~fitted))
-    rms = root_mean_square((moved - b)[fitted])
-    return Registration(tuple(names), motion, moved, np.linalg.norm(moved - b, axis=1), fitted, outliers, rms)
-
-
-def _shifted(
-    a: FloatArray, b: FloatArray, used: BoolArray, rotation: FloatArray, largest_residual: float
-) -> tuple[BoolArray, RigidTransform]:
-    """Largest set (M,) of used markers that one translation fits after the rotation, and the motion.
-
-    A set has the markers close to the translation of one marker; of two sets of one size, the better fit is taken.
-    """
-    shifts = b - a @ rotation.T
-    sets = [
-        used & (np.linalg.norm(shifts - shifts[one], axis=1) <= 2.0 * largest_residual) for one in np.flatnonzero(used)
-    ]
-    misfits = [float(np.square(shifts[near] - shifts[near].mean(axis=0)).sum(axis=1).mean()) for near in sets]
-    best = max(range(len(sets)), key=lambda row: (np.count_nonzero(sets[row]), -misfits[row]))
-    shift = shifts[sets[best]].mean(axis=0)
-    near = used & (np.linalg.norm(shifts - shift, axis=1) <= largest_residual)
-    return near, RigidTransform(rotation, shifts[near].mean(axis=0) if near.any() else shift)
-
-
-def _upright(
-    a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike], least: float, names: str
-) -> RigidTransform:
-    """Least-squares motion from points a to points b (M, 3) that maps one vertical to the other."""
+def _upright(a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike], least: float) -> FloatArray | None:
+    """Rotation (3, 3) that maps one vertical to the other and fits points a to b; None if b lie above one another."""
     up_measured, up = (np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis) for axis in vertical)
     tilt, _ = Rotation.align_vectors(up[None], up_measured[None])
     tilted, nominal = tilt.apply(a - a.mean(axis=0)), b - b.mean(axis=0)
     level = nominal - np.outer(nominal @ up, up)
     if np.linalg.norm(level, axis=1).max() <= least:
-        raise InputError(
-            f"{names} lie above one another to within {_MILLI * least:.1f} mm, so that the vertical does not tell how "
-            "the body is turned: register with another marker."
-        )
+        return None
     angle = np.arctan2(np.sum(np.cross(tilted, level) @ up), np.sum(tilted * level))
-    rotation = (Rotation.from_rotvec(angle * up) * tilt).as_matrix()
-    return RigidTransform(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
+    return np.asarray((Rotation.from_rotvec(angle * up) * tilt).as_matrix())
+
+
+def _consensus(
+    a: FloatArray, b: FloatArray, used: IntArray, fewest: int, rotation: FloatArray | None, largest_residual: float
+) -> tuple[IntArray, RigidTransform] | None:
+    """Largest set of used markers, at least the fewest, that fit one motion, and the motion; None without one."""
+    tried = 0
+    for count in range(len(used), min(fewest, len(used)) - 1, -1):
+        tried += comb(len(used), count)
+        if tried > _MOST_FITS:
+            return None
+        fits = list[tuple[float, IntArray, RigidTransform]]()
+        for rows in map(np.array, combinations(used, count)):
+            if rotation is None and _distance_from_line(b[rows]) <= largest_residual:
+                continue
+            motion = fitted(a[rows], b[rows], rotation)
+            squares = np.square(motion.apply(a[rows]) - b[rows]).sum(axis=1)  # [m²]
+            if squares.max() <= largest_residual**2:
+                fits.append((float(squares.sum()), rows, motion))
+        if fits:
+            return min(fits, key=lambda one: one[0])[1:]
+    return None
+
+
+def _worst(a: FloatArray, b: FloatArray, used: IntArray, rotation: FloatArray | None, names: Sequence[str]) -> str:
+    """Describes the marker without which the others fit best, and its residual."""
+    few = len(used) <= 3
+    fits: list[tuple[float, float, str]] = []
+    for marker in used:
+        others = used if few else used[used != marker]
+        off = np.linalg.norm(fitted(a[others], b[others], rotation).apply(a) - b, axis=1)
+        fits.append((float(np.sqrt(np.mean(off[others] ** 2))), -float(off[marker]), names[marker]))
+    rms, off_worst, worst = min(fits)
+    of_whom = f"all {['', 'one', 'two', 'three'][len(used)]}" if few else "the others"
+    return f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({of_whom}: {_MILLI * rms:.1f} mm root mean square)"
+
+
+def _distance_from_line(points: FloatArray) -> float:
+    """Root mean square distance [m] of points (N, 3) from their best-fitting line."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(np.sqrt(np.sum(spread[1:] ** 2) / len(points)))
+
+
+def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:
+    return [name for name, here in zip(names, chosen, strict=True) if here]
 
 
 def axes_rotation(axes: Sequence[str]) -> FloatArray:
@@ -182,69 +204,128 @@ def axes_rotation(axes: Sequence[str]) -> FloatArray:
     return rotation
 
 
-def _used(
-    measured: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path, least: int
-) -> BoolArray:
-    """Which markers are fitted, (M,): those in `use` that were seen; at least `least`."""
-    unknown = [name for name in use or () if name not in names]
-    if unknown:
-        raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
-    wanted = np.array([use is None or name in use for name in names], dtype=bool)
-    seen = np.isfinite(measured).all(axis=1)
-    if np.count_nonzero(wanted & seen) < least:
-        needed = {1: "one marker", 2: "two markers", 3: "three markers"}[least]
-        raise DataFileError(
-            f"{source}: registration needs {needed} at rest, but {np.count_nonzero(wanted & seen)} are left to "
-            f"it; not seen: {listed(_pick(names, wanted & ~seen))}."
+@dataclass(frozen=True)
+class Assignment:
+    """Named markers."""
+
+    columns: IntArray  # (M,) index of the measured marker of every name
+    transform: RigidTransform  # from the frame of the recording to that of the body
+    rms: float  # root mean square distance of the pairs [m]
+    next_rms: float  # root mean square distance of the next best pairs [m]
+
+
+def assign(
+    seen: ArrayLike,
+    expected: ArrayLike,
+    names: Sequence[str],
+    *,
+    source: str | Path,
+    anchors: Sequence[int] | None = None,
+    rotation: FloatArray | None = None,
+) -> Assignment:
+    """Assigns names to measured markers.
+
+    Args:
+        seen: (S, 3) measured markers in the frame of the recording [m], NaN for one that was not seen; markers in
+            excess of the names stay without a name.
+        expected: (M, 3) nominal places of the named markers, in the frame of the body [m].
+        names: M names.
+        source: of the recording, for messages.
+        anchors: indices of the names at their nominal places, which determine the motion: those on the clamp, for a
+            bent body; all if None.
+        rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one anchor is enough;
+            otherwise it takes three that are not on a line.
+
+    Raises:
+        InputError: arrays of wrong shapes, or too few anchors.
+        DataFileError: fewer markers than names, or other pairs with a similar residual.
+    """
+    points, places = np.asarray(seen, dtype=np.float64), np.asarray(expected, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or places.shape != (len(names), 3) or not np.isfinite(places).all():
+        raise InputError(
+            f"{len(names)} markers are named, with places {places.shape} and {points.shape} seen: both must be "
+            "(markers, 3), and the places finite."
         )
-    return np.asarray(wanted & seen)
+    visible = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(visible) < len(names):
+        raise DataFileError(
+            f"{source} shows {len(visible)} markers, and {len(names)} are configured ({listed(names)}): leave out "
+            "of the configuration those that it does not have."
+        )
+    points, fixed = points[visible], np.arange(len(names)) if anchors is None else np.asarray(anchors, dtype=np.int64)
+    fits: dict[tuple[int, ...], tuple[float, RigidTransform]] = {}
+    for motion in _motions(points, places, fixed, rotation):
+        pairs = _pairs(motion.apply(points), places)
+        for _ in range(_REFINEMENTS):
+            motion = fitted(points[pairs[fixed]], places[fixed], rotation)
+            before, pairs = pairs, _pairs(motion.apply(points), places)
+            if (pairs == before).all():
+                break
+        for candidate in _best_and_next(motion.apply(points), places, pairs):
+            residual = root_mean_square(motion.apply(points[candidate]) - places)
+            if tuple(candidate) not in fits or residual < fits[tuple(candidate)][0]:
+                fits[tuple(candidate)] = residual, motion
+    if not fits:
+        raise DataFileError(f"{source}: no three of its markers stand as those of the configuration do: check these.")
+    (best, (rms, motion)), *others = sorted(fits.items(), key=lambda fit: fit[1][0])
+    next_rms = others[0][1][0] if others else np.inf
+    if next_rms < _CLEAR * max(rms, _LEAST):
+        moved = [name for name, a, b in zip(names, best, others[0][0], strict=True) if a != b]
+        by_column = dict(zip(visible[list(best)].tolist(), names, strict=True))
+        labels = [by_column.get(column, f"other_{column + 1}") for column in range(len(np.asarray(seen)))]
+        raise DataFileError(
+            f"{source}: which of its markers is which is not clear: they fit to {_MILLI * rms:.1f} mm, and to "
+            f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; correct their places in the "
+            f"configuration or, if the first is right, give the recording labels: [{', '.join(labels)}]."
+        )
+    return Assignment(visible[list(best)], motion, rms, next_rms)
 
 
-def _consensus(a: FloatArray, b: FloatArray, used: BoolArray, largest_residual: float) -> BoolArray | None:
-    """Largest set (M,) of used markers that fit one motion, or None."""
-    members = np.flatnonzero(used)
-    count = len(members)
-    tried = 0
-    for left_out in range(max(0, count - max(4, count // 2 + 1)) + 1):
-        tried += comb(count, left_out)
-        if tried > _MOST_FITS:
-            return None
-        kept = np.ones((comb(count, left_out), count), dtype=bool)
-        for row, without in enumerate(combinations(range(count), left_out)):
-            kept[row, list(without)] = False
-        motion, on_a_line = fit(a[members], b[members], kept.astype(np.float64))
-        squares = np.square(motion.apply(a[members]) - b[members]).sum(axis=-1) * kept  # (sets, markers) [m²]
-        fits_all = (squares.max(axis=1) <= largest_residual**2) & ~on_a_line
-        fits_all &= np.array([_distance_from_line(b[members[row]]) > largest_residual for row in kept])
-        if fits_all.any():
-            chosen = np.zeros_like(used)
-            chosen[members[kept[np.argmin(np.where(fits_all, squares.sum(axis=1), np.inf))]]] = True
-            return chosen
-    return None
+def _motions(
+    points: FloatArray, places: FloatArray, anchors: IntArray, rotation: FloatArray | None
+) -> Iterator[RigidTransform]:
+    """Motions that carry one marker, if the rotation is known, or three markers onto anchors."""
+    if not len(anchors):
+        raise InputError("markers are named by those that stand still: configure one at least (markers.reference).")
+    if rotation is not None:
+        for point in points:
+            yield RigidTransform(rotation, places[anchors[0]] - rotation @ point)
+        return
+    if len(anchors) < 3:
+        raise InputError(
+            f"{len(anchors)} markers stand still, and it takes three to find how the recording is turned: configure "
+            "more (markers.reference), or data.axes."
+        )
+    corners = np.array(max(permutations(anchors.tolist(), 3), key=lambda three: _area(places[list(three)])))
+    wanted = places[corners]
+    for three in permutations(range(len(points)), 3):
+        motion, on_a_line = fit(points[list(three)], wanted, np.ones(3))
+        off = motion.apply(points[list(three)]) - wanted
+        if not on_a_line and root_mean_square(off) < 0.1 * np.sqrt(_area(wanted)):
+            yield motion
 
 
-def _distance_from_line(points: FloatArray) -> float:
-    """Root mean square distance [m] of points (N, 3) from their best-fitting line."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(np.sqrt(np.sum(spread[1:] ** 2) / len(points)))
+def _area(corners: FloatArray) -> float:
+    return float(0.5 * np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])))
 
 
-def _worst(a: FloatArray, b: FloatArray, used: BoolArray, names: Sequence[str]) -> str:
-    """Describes the marker without which the others fit best, and its residual."""
-    members = np.flatnonzero(used).tolist()
-    three = len(members) == 3
-    fits: list[tuple[float, float, str]] = []
-    for marker in members:
-        others = [member for member in members if three or member != marker]
-        motion, _ = fit(a[others], b[others], np.ones(len(others)))
-        off = np.linalg.norm(motion.apply(a) - b, axis=1)
-        fits.append((float(np.sqrt(np.mean(off[others] ** 2))), -float(off[marker]), names[marker]))
-    rms, off_worst, worst = min(fits)
-    return (
-        f"'{worst}' is {-_MILLI * off_worst:.1f} mm off ({'all three' if three else 'the others'}: "
-        f"{_MILLI * rms:.1f} mm root mean square)"
-    )
+def _squares(points: FloatArray, places: FloatArray) -> FloatArray:
+    """Squared distances (M, S) between places and points."""
+    return np.asarray(np.square(places[:, None] - points[None]).sum(axis=2))
 
 
-def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:
-    return [name for name, here in zip(names, chosen, strict=True) if here]
+def _pairs(points: FloatArray, places: FloatArray) -> IntArray:
+    """Index (M,) of the point that is assigned to a place."""
+    return np.asarray(linear_sum_assignment(_squares(points, places))[1])
+
+
+def _best_and_next(points: FloatArray, places: FloatArray, pairs: IntArray) -> Iterator[IntArray]:
+    """Yields the best pairs, then the best pairs without one of them, for every pair."""
+    yield pairs
+    squares = _squares(points, places)
+    for place, point in enumerate(pairs):
+        forbidden = squares.copy()
+        forbidden[place, point] = 1e6 * (1.0 + squares.max())
+        other = linear_sum_assignment(forbidden)[1]
+        if other[place] != point:
+            yield np.asarray(other)

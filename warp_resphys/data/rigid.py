@@ -59,6 +59,13 @@ def fit(a: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[RigidTransfo
     return RigidTransform(rotation, translation), singular[..., 1] <= 1e-9 * singular[..., 0]
 
 
+def fitted(a: FloatArray, b: FloatArray, rotation: FloatArray | None = None) -> RigidTransform:
+    """Fits the rigid motion from points a to points b (N, 3), perhaps with a known rotation, by least squares."""
+    if rotation is None:
+        return fit(a, b, np.ones(len(a)))[0]
+    return RigidTransform(rotation, (b - a @ rotation.T).mean(axis=0))
+
+
 def root_mean_square(residual: FloatArray) -> float:
     """Root of the mean squared length of vectors (..., 3)."""
     return float(np.sqrt(np.mean(np.sum(np.square(residual), axis=-1))))

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.assignment import assign
 from ...data.marker_view import MarkerView
 from ...data.obstacle_motion import recorded
 from ...data.recordings.bag import Bag
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
 from ...data.recordings.text import Table
-from ...data.registration import axes_rotation
+from ...data.registration import assign, axes_rotation
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...dynamics.simulator import Simulator
 from ...io.errors import DataFileError, InputError, listed

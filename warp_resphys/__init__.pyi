@@ -2,6 +2,7 @@
 from .control.reduced_twin import reduced_twin as reduced_twin
 from .data.camera import CameraMarkers as CameraMarkers
 from .data.camera import Lens as Lens
+from .data.camera import PlacedCamera as PlacedCamera
 from .data.markers import Markers as Markers
 from .data.markers import bind_markers as bind_markers
 from .data.observation import Observation as Observation
@@ -73,7 +74,6 @@ from .mesh.readers import read_surfaces as read_surfaces
 from .mesh.readers import write_mesh as write_mesh
 from .mesh.rod import rod as rod
 from .mesh.tetrahedra import fill_surface as fill_surface
-from .pictures.camera import PlacedCamera as PlacedCamera
 from .pictures.clouds import Cloud as Cloud
 from .pictures.misfit import PictureMisfit as PictureMisfit
 from .pictures.motion import ReleasedForce as ReleasedForce

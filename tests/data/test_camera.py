@@ -1,4 +1,6 @@
-"""Markers in the pictures of a camera: the pinhole's equation, its derivative, and Young's modulus from pixels."""
+"""Cameras: the pinhole's equation, corrections, derivatives, points from depths, and Young's modulus from pixels."""
+
+import math
 
 import numpy as np
 import pytest
@@ -6,8 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
-from warp_resphys.data.camera import CameraMarkers, Lens
+from warp_resphys.data.camera import CORRECTIONS, CameraMarkers, Lens, PlacedCamera
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.stepping.rotations import rotations
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 TIP = wr.select_vertices(MESH, x=0.1)
@@ -18,9 +21,10 @@ TURN = Rotation.from_euler("xyz", [90.0, 20.0, 5.0], degrees=True).as_matrix()
 SHIFT = np.array([-0.05, 0.02, 0.4])  # m: the camera stands 0.4 m away
 
 
-def camera(markers=MARKERS):
-    intrinsic = np.array([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]])
-    return CameraMarkers(markers, torch.as_tensor(intrinsic @ np.column_stack([TURN, SHIFT])))
+def camera(turn=TURN, shift=SHIFT):
+    intrinsic = torch.tensor([[FOCAL, 0.0, CENTRE[0]], [0.0, FOCAL, CENTRE[1]], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    pose = np.block([[turn, shift[:, None]], [np.zeros(3), 1.0]])
+    return CameraMarkers(MARKERS, PlacedCamera(Lens(intrinsic), torch.as_tensor(pose)))
 
 
 def beam(youngs_modulus):
@@ -64,8 +68,7 @@ def test_youngs_modulus_is_recovered_from_pixels():
 def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
     # The camera looks from the middle of the beam along it: the markers at the tip are in front, the other is behind.
     looks = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    matrix = np.diag([FOCAL, FOCAL, 1.0]) @ np.column_stack([looks, -looks @ [0.08, 0.01, 0.0]])
-    sees, at = CameraMarkers(MARKERS, torch.as_tensor(matrix)), torch.as_tensor(MESH.vertices)[None]
+    sees, at = camera(looks, -looks @ [0.08, 0.01, 0.0]), torch.as_tensor(MESH.vertices)[None]
     q = at.clone().requires_grad_(True)
     shown = sees(q)
     assert shown.isnan().any(-1)[0].tolist() == [False, True, False]
@@ -75,8 +78,11 @@ def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
 
 
 def test_bad_input_is_named():
-    with pytest.raises(wr.InputError, match=r"matrix has shape \(3, 3\)"):
-        CameraMarkers(MARKERS, torch.eye(3))
+    lens, pose = Lens(torch.eye(3)), torch.eye(4)
+    with pytest.raises(InputError, match=r"shape \(3, 4\)"):
+        PlacedCamera(lens, pose[:3])
+    with pytest.raises(InputError, match="no rotation with a shift"):
+        PlacedCamera(lens, pose * torch.tensor([[-1.0], [1.0], [1.0], [1.0]]))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
         wr.ObservedMotion(torch.zeros(3, 1, 3, 3), observation=camera())
 
@@ -134,7 +140,7 @@ def test_rays_are_the_inverse_of_pixels():
     ("text", "error", "words"),
     [
         ("a: 1", DataFileError, "has no camera_matrix of nine numbers"),
-        ("camera_matrix: {data: [a]}", DataFileError, "give its numbers"),
+        ("camera_matrix: {data: [a]}", DataFileError, "is no YAML with numbers"),
         ("[", DataFileError, "is no YAML"),
         ("camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]", InputError, "give k1, k2, p1, p2"),
     ],
@@ -145,3 +151,65 @@ def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
         Lens.read(tmp_path / "camera.yaml")
     with pytest.raises(DataFileError, match="Cannot read"):
         Lens.read(tmp_path / "none.yaml")
+
+
+MATRIX = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+LENS = Lens(MATRIX, torch.tensor([-0.12, 0.05, 1e-3, -2e-3], dtype=torch.float64))
+POSE = torch.eye(4, dtype=torch.float64)
+POSE[:3, :3] = rotations(torch.tensor([2.9, 0.2, -0.1], dtype=torch.float64))
+POSE[:3, 3] = torch.tensor([0.02, -0.01, 0.5])
+MIDDLE = torch.tensor([0.05, 0.0, 0.01], dtype=torch.float64)
+PLACED = PlacedCamera(LENS, POSE, MIDDLE)
+POINTS = 0.08 * torch.as_tensor(np.random.default_rng(0).normal(size=(7, 3)))
+MOVED = {
+    "camera_shift_2": 0.01,
+    "camera_turn_1": 0.2,
+    "camera_turn_3": -0.1,
+    "focal_factor": 1.05,
+    "principal_point_1": 8.0,
+}
+
+
+def test_derivatives_by_motions_and_corrections_are_those_of_differences():
+    corrections = PLACED.corrections(MOVED)
+    tangents = torch.as_tensor(np.random.default_rng(1).normal(size=(3, 7, 3)))
+    slopes = PLACED.derivative(POINTS, corrections, tangents)
+    step = 1e-6
+    for number in range(3):
+        ends = [PLACED.pixels(POINTS + by * tangents[number], corrections) for by in (step, -step)]
+        assert torch.allclose(slopes[number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5)
+    for number in range(len(CORRECTIONS)):
+        by = step * torch.eye(len(CORRECTIONS), dtype=torch.float64)[number]
+        ends = [PLACED.pixels(POINTS, corrections + sign * by) for sign in (1.0, -1.0)]
+        assert torch.allclose(slopes[3 + number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5)
+
+
+def test_corrections_mean_what_their_names_say():
+    """In words of a pinhole camera without distortion that looks along the scene's axes."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 0.5
+    camera = PlacedCamera(Lens(MATRIX), pose, MIDDLE)
+    point = MIDDLE + torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
+    plain = camera.pixels(point, camera.corrections({}))
+    assert plain.tolist() == pytest.approx([320.0 + 900.0 * 0.15 / 0.51, 240.0])
+    shifted = camera.pixels(point, camera.corrections({"camera_shift_1": 0.01, "camera_shift_3": -0.01}))
+    assert shifted.tolist() == pytest.approx([320.0 + 900.0 * 0.16 / 0.5, 240.0])
+    # A quarter turn about z takes the point from x to y of the turn's centre.
+    turned = camera.pixels(point, camera.corrections({"camera_turn_3": math.pi / 2.0}))
+    assert turned.tolist() == pytest.approx([320.0 + 900.0 * 0.05 / 0.51, 240.0 + 880.0 * 0.1 / 0.51])
+    lens = camera.pixels(point, camera.corrections({"focal_factor": 1.1, "principal_point_2": 5.0}))
+    assert lens.tolist() == pytest.approx([320.0 + 990.0 * 0.15 / 0.51, 245.0])
+
+
+def test_located_points_are_those_that_are_seen():
+    """From pixels and depths through a distorted lens, and from the axes of a scan, with derivatives."""
+    corrections = PLACED.corrections(MOVED)
+    depth = PLACED.seen_from(POINTS, corrections)[:, 2:]
+    measured = torch.cat([PLACED.pixels(POINTS, corrections), depth], 1)
+    scanner = PlacedCamera(None, POSE, MIDDLE)
+    for camera, own in ((PLACED, measured), (scanner, scanner.seen_from(POINTS, corrections))):
+        assert torch.allclose(camera.located(own, corrections), POINTS, atol=1e-9)
+        slopes = camera.located_by(own, corrections)
+        for number, by in enumerate(1e-6 * torch.eye(len(CORRECTIONS), dtype=torch.float64)):
+            ends = [camera.located(own, corrections + sign * by) for sign in (1.0, -1.0)]
+            assert torch.allclose(slopes[number], (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-8)

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 import warp_resphys as wr
 from support.command_line import outcome, refusal
 from support.main_job import IN_RUN
-from warp_resphys.data.camera import Lens
+from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.experiment.pictures.laboratory import depth_image, noisy_mask
 from warp_resphys.mesh.mesh import boundary_triangles, box_tetrahedra
-from warp_resphys.pictures.camera import PlacedCamera
 from warp_resphys.pictures.outlines import ClosedSurface
 
 QUIET = ["hydra/job_logging=none", "hydra/hydra_logging=none"]

@@ -9,12 +9,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
-from warp_resphys.data.camera import Lens
+from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
 from warp_resphys.experiment.pictures.laboratory import depth_image
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
-from warp_resphys.pictures.camera import PLACES, PlacedCamera
 from warp_resphys.pictures.clouds import Cloud, distances_of
 from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface

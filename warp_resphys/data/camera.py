@@ -1,23 +1,27 @@
-r"""Pixels of markers in the image of a calibrated camera, as an observation.
+r"""Cameras: lens, place up to corrections, and the pixels of markers as an observation.
 
-A point x of the body's frame is seen at (u, v), where (u w, v w, w) = P (x, 1) and P = K [R | t] is the camera's matrix
-(Hartley and Zisserman, Multiple View Geometry, 2nd edition, eq. 6.8). w is the depth in front of the camera. Depth
-along the line of sight is not measured: with one camera, motion towards it appears only as a change of size.
+A body's point X [m] is seen at the pixel p = lens(M (R (X - c) + c + t)): M is the given pose of the camera, from the
+axes of the scene to its own (x right, y down, z forward), R = exp([w]x) a small turn about a point c of the body's
+clamp, and t a shift, by which the body stands elsewhere before the camera than assumed. A turn of the camera by w about
+c, and a shift, are the same as those of the body, so that R and t stand for errors of both. The same equation, solved
+for X, takes pixels with a depth back to the scene, and without a lens the points of a scan, of whose axes M is the
+pose. Depth along the line of sight is not measured: with one camera, motion towards it appears as a change of size.
 
 A `Lens` moves the point (x, y) = (X / Z, Y / Z) of the image at distance one, with r^2 = x^2 + y^2, to
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
     y' = y (same) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-(Brown 1966, with OpenCV's names), which K takes to pixels.
+(Brown 1966, with OpenCV's names), which the matrix K takes to pixels (Hartley and Zisserman, Multiple View Geometry,
+2nd edition, eq. 6.8). Its focal lengths are corrected by a factor, its principal point by a shift.
 
-`tests/data/test_camera.py` compares it with a camera of closed form and identifies Young's modulus from its pixels.
+`tests/data/test_camera.py` compares with a camera of closed form and with differences, and identifies Young's modulus.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 import torch
@@ -25,9 +29,17 @@ import yaml
 from typing_extensions import override
 
 from ..io.errors import DataFileError, InputError
+from ..stepping.rotations import rotations
 from .markers import Markers
 from .observation import Observation
 
+SHIFTS: Final = ("camera_shift_1", "camera_shift_2", "camera_shift_3")  # m
+TURNS: Final = ("camera_turn_1", "camera_turn_2", "camera_turn_3")  # rad
+FOCAL: Final = "focal_factor"
+PRINCIPAL: Final = ("principal_point_1", "principal_point_2")  # px
+PLACES: Final = (*SHIFTS, *TURNS)
+CORRECTIONS: Final = (*PLACES, FOCAL, *PRINCIPAL)
+_NEUTRAL: Final = (0.0,) * 6 + (1.0, 0.0, 0.0)
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 _COUNTS = (0, 4, 5, 8)  # of the coefficients of a lens
@@ -75,33 +87,30 @@ class Lens:
         lines = [line.replace("!!opencv-matrix", "") for line in text.splitlines() if not line.startswith("%YAML")]
         try:
             content = yaml.safe_load("\n".join(lines))
-        except yaml.YAMLError as error:
+            matrix, distortion = (_numbers(content, names) for names in (_MATRIX, _DISTORTION))
+        except (yaml.YAMLError, TypeError, ValueError) as error:
             raise DataFileError(
-                f"{path} is no YAML ({str(error).splitlines()[0]}); export the calibration again."
+                f"{path} is no YAML with numbers ({str(error).splitlines()[0]}); export the calibration again."
             ) from error
-        matrix, distortion = (_numbers(content, names, path) for names in (_MATRIX, _DISTORTION))
         if matrix is None or len(matrix) != 9:
             raise DataFileError(f"{path} has no camera_matrix of nine numbers: give a calibration by OpenCV or ROS.")
-        coefficients = None if distortion is None else torch.as_tensor(distortion)
-        return cls(torch.as_tensor(matrix).reshape(3, 3), coefficients)
+        return cls(matrix.reshape(3, 3), distortion)
 
     def pixels(self, points: torch.Tensor) -> torch.Tensor:
-        """Returns pixels (..., 2) of points (..., 3) in the axes of the camera: x right, y down, z forward [m]."""
-        flat = points[..., :2] / points[..., 2:]
+        """Returns pixels (..., 2) of points (..., 3) in the axes of the camera [m], NaN behind the camera."""
+        in_front = points[..., 2:] > 0.0
+        flat = points[..., :2] / torch.where(in_front, points[..., 2:], 1.0)
         if self.distortion is not None and len(self.distortion):
             k = torch.nn.functional.pad(self.distortion.to(points), (0, 8 - len(self.distortion)))
             (x, y), square = flat.unbind(-1), flat.square().sum(-1)
             up, down = (1.0 + square * (a + square * (b + square * c)) for a, b, c in (k[[0, 1, 4]], k[[5, 6, 7]]))
             radial, twice = up / down, 2.0 * x * y
-            flat = torch.stack(
-                [
-                    radial * x + k[2] * twice + k[3] * (square + 2.0 * x.square()),
-                    radial * y + k[2] * (square + 2.0 * y.square()) + k[3] * twice,
-                ],
-                -1,
-            )
+            moved_x = radial * x + k[2] * twice + k[3] * (square + 2.0 * x.square())
+            moved_y = radial * y + k[2] * (square + 2.0 * y.square()) + k[3] * twice
+            flat = torch.stack([moved_x, moved_y], -1)
         intrinsic = self.matrix.to(points)
-        return flat @ intrinsic[:2, :2].mT + intrinsic[:2, 2]
+        pixels = flat @ intrinsic[:2, :2].mT + intrinsic[:2, 2]
+        return torch.where(in_front, pixels, torch.nan)  # A NaN of its own would spread through the gradient.
 
     def rays(self, pixels: torch.Tensor) -> torch.Tensor:
         """Returns the points (..., 3) of depth one in the axes of the camera that are seen at pixels (..., 2).
@@ -122,55 +131,131 @@ def _at_one(flat: torch.Tensor) -> torch.Tensor:
     return torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
 
 
-def _numbers(content: Any, names: tuple[str, ...], path: str | Path) -> "np.ndarray[Any, np.dtype[np.float64]] | None":
-    """The first of some entries of a calibration, as a flat array; None without any."""
-    if not isinstance(content, Mapping):
-        return None
-    value = next((content[name] for name in names if name in content), None)
+def _numbers(content: Any, names: tuple[str, ...]) -> torch.Tensor | None:
+    """The first of some entries of a calibration, as a flat tensor; None without any."""
+    known = content if isinstance(content, Mapping) else {}
+    value = next((known[name] for name in names if name in known), None)
     value = value.get("data") if isinstance(value, Mapping) else value
-    if value is None:
-        return None
-    try:
-        return np.array(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        raise DataFileError(f"{path}: {names[0]} is {value!r}: give its numbers.") from None
+    return None if value is None else torch.as_tensor(np.array(value, dtype=np.float64).ravel())
+
+
+@dataclass(frozen=True)
+class PlacedCamera:
+    """A lens, its pose, and the point about which the body may be turned (equations in the module's docstring).
+
+    Raises:
+        InputError: a pose of another shape, or one that is no rigid motion.
+    """
+
+    lens: Lens | None  # None for the axes of a scan, which has no pictures
+    pose: torch.Tensor  # (4, 4) M, from the scene's axes to those of the camera or scan [-, m]
+    centre: torch.Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) c [m]
+
+    def __post_init__(self) -> None:
+        """Converts arrays, and checks the pose."""
+        for name in ("pose", "centre"):
+            object.__setattr__(self, name, torch.as_tensor(getattr(self, name), dtype=torch.float64))
+        if self.pose.shape != (4, 4):
+            raise InputError(f"the pose of a camera has shape {tuple(self.pose.shape)}: world_to_camera is (4, 4).")
+        turn = self.pose[:3, :3]
+        if not torch.allclose(turn @ turn.mT, torch.eye(3).to(turn), atol=1e-3) or torch.det(turn) < 0.0:
+            raise InputError(
+                "the pose of a camera is no rotation with a shift (world_to_camera, row-major, right-handed): check "
+                "its rows."
+            )
+
+    def to(self, like: torch.Tensor) -> Self:
+        """Returns the camera on the device of a tensor."""
+        return replace(self, pose=self.pose.to(like.device), centre=self.centre.to(like.device))
+
+    @staticmethod
+    def corrections(values: Mapping[str, float]) -> torch.Tensor:
+        """(9,) corrections in the order of `CORRECTIONS`, from their values by name; none for those left out."""
+        pairs = zip(CORRECTIONS, _NEUTRAL, strict=True)
+        return torch.tensor([values.get(name, neutral) for name, neutral in pairs], dtype=torch.float64)
+
+    def seen_from(self, points: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
+        """Returns points (..., 3) of the scene in the axes of the camera, with corrections (9,) or (..., 9) [m]."""
+        away = (rotations(corrections[..., 3:6]) @ (points - self.centre)[..., None])[..., 0]
+        return (away + self.centre + corrections[..., :3]) @ self.pose[:3, :3].mT + self.pose[:3, 3]
+
+    def _seen_through(self) -> tuple[Lens, torch.Tensor]:
+        """The lens, and its principal point (2,) [px]."""
+        assert self.lens is not None
+        return self.lens, self.lens.matrix[:2, 2].to(self.pose)
+
+    def pixels(self, points: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
+        """Returns pixels (..., 2) of points (..., 3) [m], with corrections (9,) or (..., 9); NaN behind the camera."""
+        lens, middle = self._seen_through()
+        seen = lens.pixels(self.seen_from(points, corrections))
+        return middle + corrections[..., 7:] + corrections[..., 6:7] * (seen - middle)
+
+    def located(self, measured: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
+        """Returns points (..., 3) in the axes of the scene [m], with corrections (9,) or (..., 9).
+
+        Args:
+            measured: (..., 3) pixels and depths along the axis of the lens [px, px, m]; without a lens, points in the
+                axes of the scan [m].
+            corrections: see above.
+        """
+        away = measured
+        if self.lens is not None:
+            lens, middle = self._seen_through()
+            rays = lens.rays(middle + (measured[..., :2] - middle - corrections[..., 7:]) / corrections[..., 6:7])
+            away = rays * measured[..., 2:]
+        away = (away - self.pose[:3, 3]) @ self.pose[:3, :3] - self.centre - corrections[..., :3]
+        return (rotations(corrections[..., 3:6]).mT @ away[..., None])[..., 0] + self.centre
+
+    def millimetres(self, corrections: torch.Tensor) -> float:
+        """Length that a pixel shows at a depth of 1 m, with corrections (9,) [mm]."""
+        return 1e3 / float(corrections[6] * self._seen_through()[0].matrix[:2, :2].diagonal().mean())
+
+    def derivative(self, points: torch.Tensor, corrections: torch.Tensor, tangents: torch.Tensor) -> torch.Tensor:
+        """Returns derivatives (K + 9, P, 2) of the pixels of points (P, 3), by K motions and by the corrections [px].
+
+        Args:
+            points: (P, 3) [m].
+            corrections: (9,).
+            tangents: (K, P, 3) motions of the points by K parameters [m].
+        """
+        turn, (lens, middle), seen = (
+            rotations(corrections[3:6]),
+            self._seen_through(),
+            self.seen_from(points, corrections),
+        )
+        by_place = corrections[6] * jacobians(lens.pixels, seen)[0] @ self.pose[:3, :3]
+        turned = torch.autograd.functional.jacobian(rotations, corrections[3:6])  # (3, 3, 3)
+        by_turn = by_place @ torch.einsum("ijk,pj->pik", turned, points - self.centre)
+        by_scale, by_shift = (lens.pixels(seen) - middle)[..., None], torch.eye(2).to(points).expand(len(points), 2, 2)
+        by_corrections = torch.cat([by_place, by_turn, by_scale, by_shift], -1)
+        return torch.cat([torch.einsum("pij,kpj->kpi", by_place @ turn, tangents), by_corrections.permute(2, 0, 1)])
+
+    def located_by(self, measured: torch.Tensor, corrections: torch.Tensor) -> torch.Tensor:
+        """Returns derivatives (9, P, 3) of located points (P, 3) by the corrections (9,) [m]."""
+        return jacobians(self.located, measured, corrections.expand(len(measured), -1))[1].permute(2, 0, 1)
+
+
+def jacobians(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> list[torch.Tensor]:
+    """Jacobians (P, D, C) of a function (P, D) of P rows by each of its inputs (P, C)."""
+    with torch.enable_grad():
+        own = [values.detach().clone().requires_grad_() for values in inputs]
+        result = function(*own)
+        rows = [torch.autograd.grad(column.sum(), own, retain_graph=True) for column in result.unbind(-1)]
+    return [torch.stack(parts, 1) for parts in zip(*rows, strict=True)]
 
 
 @dataclass(frozen=True)
 class CameraMarkers(Observation):
-    """Projections of markers in a pinhole camera, (B, M, 2) [px].
-
-    Raises:
-        InputError: a matrix of another shape.
-    """
+    """Projections of markers in a camera, (B, M, 2) [px]."""
 
     unit: ClassVar[str] = "px"
     dimension: ClassVar[int] = 2
 
     markers: Markers
-    matrix: torch.Tensor  # (3, 4) P, from the body's frame [m] to homogeneous pixels; with a lens, to the camera's axes
-    lens: Lens | None = None  # then the matrix is the pose [R | t] of the body's frame [-, m]
-
-    def __post_init__(self) -> None:
-        """Checks the matrix."""
-        if self.matrix.shape != (3, 4):
-            raise InputError(f"matrix has shape {tuple(self.matrix.shape)}: a camera's matrix K [R | t] is (3, 4).")
+    camera: PlacedCamera  # in the body's frame
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns pixels (B, M, 2), NaN for a marker behind the camera."""
-        rays = self.markers(positions) @ self.matrix[:, :3].mT + self.matrix[:, 3]
-        return projected(rays, self.lens)
-
-
-def projected(rays: torch.Tensor, lens: Lens | None) -> torch.Tensor:
-    """Returns pixels (..., 2), NaN behind the camera.
-
-    Args:
-        rays: (..., 3) homogeneous pixels; with a lens, points in the axes of the camera [m].
-        lens: of the camera.
-    """
-    in_front = rays[..., 2:] > 0.0
-    rays = torch.cat([rays[..., :2], torch.where(in_front, rays[..., 2:], 1.0)], -1)
-    pixels = rays[..., :2] / rays[..., 2:] if lens is None else lens.pixels(rays)
-    return torch.where(in_front, pixels, torch.nan)  # A NaN of its own would spread through the gradient.
+        corrections = self.camera.corrections({}).to(positions.device)
+        return self.camera.pixels(self.markers(positions).double(), corrections).to(positions)

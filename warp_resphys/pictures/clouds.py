@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from ..data.camera import PlacedCamera
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_of, closest_points
-from .camera import PlacedCamera
 from .outlines import FloatArray, IntArray, Mask
 
 _STRAY: Final = 1.0  # % of the points that may lie far away in a direction, when their extent is measured

@@ -22,12 +22,12 @@ import torch
 from scipy.spatial import cKDTree
 from typing_extensions import override
 
+from ..data.camera import CORRECTIONS, PlacedCamera
 from ..io.errors import ConvergenceError, InputError
 from ..learning.bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
 from ..learning.bounds import Bounds
 from ..learning.parameters import split_name
 from ..learning.uncertainty import Linearised
-from .camera import CORRECTIONS, PlacedCamera
 from .motion import RELEASE_DELAY, derivatives_at_own_times
 from .seen import Photo, SeenPose, Shape
 

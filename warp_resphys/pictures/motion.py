@@ -22,6 +22,7 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..data.camera import jacobians
 from ..data.observation import WHOLE_STATE
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
@@ -29,7 +30,6 @@ from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
 from ..learning.replay import Replay, Start, sample
 from ..stepping.inputs import Inputs
-from .camera import jacobians
 from .outlines import FloatArray, IntArray
 
 RELEASE_DELAY: Final = "release_delay"  # s

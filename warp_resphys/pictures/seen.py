@@ -9,13 +9,13 @@ import numpy as np
 import shapely
 import torch
 
+from ..data.camera import CORRECTIONS, PLACES, PlacedCamera
 from ..data.observation import Observation
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
-from .camera import CORRECTIONS, PLACES, PlacedCamera
 from .clouds import Cloud, CloudDistances, distances_of
 from .motion import OF_RELEASE, ReleasedForce, at_own_times
 from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within

@@ -7,11 +7,11 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...data.camera import PlacedCamera
 from ...data.markers import bind_markers
 from ...io.atomic import atomic_path
 from ...io.files import write_json
 from ...io.stages import StageContext
-from ...pictures.camera import PlacedCamera
 from ...pictures.outlines import ClosedSurface
 from ...pictures.seen import Photo, SeenPose
 from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...data.camera import Lens
+from ...data.camera import Lens, PlacedCamera
 from ...data.markers import bind_markers
 from ...fem.body import Body
 from ...io.atomic import atomic_path, digest
@@ -21,7 +21,6 @@ from ...io.files import atomic_hdf5, create, read_array, read_hdf5
 from ...io.stages import StageContext
 from ...mesh.mesh import Mesh, quadratic, select_vertices
 from ...mesh.readers import METRES, read_mesh
-from ...pictures.camera import PlacedCamera
 from ...pictures.clouds import Cloud
 from ...pictures.motion import ReleasedForce
 from ...pictures.outlines import ClosedSurface, Outline

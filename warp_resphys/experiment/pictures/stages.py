@@ -17,6 +17,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.law_files import LAW_FORMAT, unit_of
 from ...io.errors import InputError
 from ...io.files import atomic_hdf5, create, read_json, write_json
@@ -25,7 +26,6 @@ from ...io.stages import Stage, StageContext, package_versions, resources_used
 from ...learning.bounds import Bounds
 from ...learning.identification import ParameterSearch
 from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
-from ...pictures.camera import CORRECTIONS, PlacedCamera
 from ...pictures.misfit import PictureMisfit, values_of
 from ...pictures.motion import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape

@@ -87,7 +87,7 @@ def register_markers(
         raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
     wanted = np.array([use is None or name in use for name in names], dtype=bool)
     seen = np.isfinite(a).all(axis=1)
-    used, count = np.flatnonzero(wanted & seen), np.count_nonzero(wanted & seen)
+    used, count = np.flatnonzero(wanted & seen), int(np.count_nonzero(wanted & seen))
     least = 1 if rotation is not None else 3 if vertical is None else 2
     if count < least:
         needed = ["one marker", "two markers", "three markers"][least - 1]

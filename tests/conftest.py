@@ -120,7 +120,7 @@ def kept_renderers():
 @contextlib.contextmanager
 def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
     """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
-    packed, start, close = render.packed, render.Renderer._start, render.Renderer.close
+    frames, start, close = render.Renderer.frames, render.Renderer._start, render.Renderer.close
 
     def started(self: render.Renderer) -> None:
         if kept_renderers:
@@ -137,11 +137,11 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
         else:
             close(self)
 
-    def coarse(scene: render.RenderScene) -> bytes:
-        return packed(replace(scene, size=[side // 8 * 2 for side in scene.size]))
+    def coarse(self: render.Renderer, scene: render.RenderScene) -> Iterator[render.Pixels]:
+        return frames(self, replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "packed", coarse)
+        patch.setattr(render.Renderer, "frames", coarse)
         patch.setattr(render.Renderer, "_start", started)
         patch.setattr(render.Renderer, "close", closed)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))

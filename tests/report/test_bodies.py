@@ -29,8 +29,7 @@ def motion(frames=3, model="simulation"):
 
 def halves(scene):
     """(F, 2, H, W, 4) of each frame the two views."""
-    (frames,) = render.draw(scene)
-    return np.stack(np.split(frames.astype(int), 2, axis=2), axis=1)
+    return np.stack(np.split(render.draw(scene).astype(int), 2, axis=2), axis=1)
 
 
 @pytest.mark.usefixtures("can_draw")

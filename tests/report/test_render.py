@@ -1,6 +1,5 @@
 """Pictures of bodies: what is drawn where, in which colours, and what is said where nothing can be drawn."""
 
-import subprocess
 import sys
 
 import matplotlib.colors
@@ -9,7 +8,7 @@ import pytest
 
 from support.scenes import MARGIN, SHADE, TOWARDS_VIEWER, body_scene
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles, box_hexahedra, box_tetrahedra
-from warp_resphys.report import render, render_process
+from warp_resphys.report import render
 from warp_resphys.report.bodies import sharp_edges
 
 MESHES = {
@@ -38,7 +37,7 @@ def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh) -> None:
     # Each visible face has one colour, in the share of the picture that it covers.
     faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
     covered = {normal: area * float(np.dot(normal, VIEWER)) for normal, area in faces.items()}
-    ((picture,),) = render.draw(body_scene(mesh, views=2))
+    (picture,) = render.draw(body_scene(mesh, views=2))
     pictures = np.split(picture / 255.0, 2, axis=1)
     for pixels in pictures:
         for normal, area in covered.items():
@@ -56,7 +55,7 @@ def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh) -> None:
 @pytest.mark.usefixtures("can_draw")
 def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
     mesh = box_hexahedra(divisions=(3, 1, 1))
-    ((pixels,),) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)))
+    (pixels,) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)))
     pixels = pixels / 255.0
     assert share(pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
 
@@ -101,27 +100,16 @@ def test_one_process_draws_scene_after_scene():
     small = body_scene(mesh)
     wide = body_scene(mesh, views=2)
     with render.Renderer() as renderer:
-        (first,), (both,) = render.draw(small, wide, renderer=renderer)
+        first, both = (render.draw(scene, renderer)[0] for scene in (small, wide))
         process = renderer._process
-        ((again,),) = render.draw(small, renderer=renderer)
+        (again,) = render.draw(small, renderer)
         assert renderer._process is process
         renderer.close()
-        ((restarted,),) = render.draw(small, renderer=renderer)
+        (restarted,) = render.draw(small, renderer)
     assert process.poll() is not None
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(first, restarted)
     assert both.shape[1] == 2 * first.shape[1]
-
-
-@pytest.mark.usefixtures("can_draw")
-def test_the_program_answers_with_the_size_and_the_pixels_of_every_frame():
-    mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = body_scene(mesh)
-    program = [sys.executable, "-m", render_process.__name__]
-    out = subprocess.run(program, input=2 * render.packed(scene), capture_output=True, check=True).stdout
-    ((pixels,),) = render.draw(scene)
-    answer = np.array(pixels.shape, "<u4").tobytes() + pixels.tobytes() + bytes(12)
-    assert out == 2 * answer
 
 
 @pytest.mark.usefixtures("can_draw")

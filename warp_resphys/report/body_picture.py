@@ -106,7 +106,7 @@ def draw_mesh(
     half = np.maximum(half, _NARROWEST * half.max())
     size = picture_size(half, _LONGER_SIDE)
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
+    (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
     labels = [
         f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
         for chamber in summary.chambers
@@ -148,7 +148,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
     away = seen & (np.linalg.norm(markers - recordings.nominal, axis=1) > _RING * radius)
     layers = _registered(recordings, fixed, away, radius, max(1.0, size[1] / 900.0))
     views = [View(layers, axes, focus, half[1]) for axes, (focus, _) in zip(turned, frames, strict=True)]
-    ((picture,),) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
+    (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
     none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
     handles = [
         Line2D([], [], **none, color=MEASURED, label="measured"),

@@ -37,7 +37,7 @@ def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, F
     if motion is None:
         return {}
     renderer = Renderer()
-    started: dict[str, Future[Any]] = {"pictures": pool.submit(lambda: draw(motion.scene(), renderer=renderer)[0])}
+    started: dict[str, Future[Any]] = {"pictures": pool.submit(draw, motion.scene(), renderer)}
     # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
     if data.sees_markers and len(motion.times) > 1:
         started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film(), renderer)

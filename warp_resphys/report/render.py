@@ -1,15 +1,13 @@
 """Pictures and films of bodies: scenes, their views, and the process that draws them with pyvista, off screen.
 
 Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate process only,
-`warp_resphys.report.render_process`, which reads scenes and returns frames through pipes.
+`warp_resphys.report.render_process`, which reads scenes and returns frames through pipes of this process alone.
 """
 
-import io
-import json
 import logging
 import os
+import pickle
 import signal
-import struct
 import subprocess
 import sys
 import threading
@@ -17,7 +15,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final
@@ -235,23 +233,17 @@ class Renderer:
         timer.start()
         try:
             assert self._process.stdin is not None
-            self._process.stdin.write(packed(scene))
+            assert self._process.stdout is not None
+            pickle.dump(scene, self._process.stdin)
             self._process.stdin.flush()
-            while any(shape := struct.unpack("<3I", self._read(12))):
-                yield np.frombuffer(self._read(int(np.prod(shape))), np.uint8).reshape(shape)
-        except (BrokenPipeError, EOFError):
+            while (frame := pickle.load(self._process.stdout)) is not None:
+                yield frame
+        except (BrokenPipeError, EOFError, pickle.UnpicklingError):
             reason = self._reason(late=time.monotonic() >= end)
             self.close()
             raise _failure(reason) from None
         finally:
             timer.cancel()
-
-    def _read(self, count: int) -> bytes:
-        assert self._process.stdout is not None
-        content = self._process.stdout.read(count)
-        if len(content) < count:
-            raise EOFError
-        return content
 
     def _reason(self, *, late: bool) -> str:
         """Why the process has ended."""
@@ -274,21 +266,18 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
                 pipe.close()
 
 
-def draw(*scenes: RenderScene, renderer: Renderer | None = None) -> list[Pixels]:
-    """Draw scenes in one process, as its start takes longer than most pictures.
+def draw(scene: RenderScene, renderer: Renderer | None = None) -> Pixels:
+    """Return the frames (F, H, V * W, 3 | 4) of a scene, as from `Renderer.frames`.
 
     Args:
-        scenes: In this order.
-        renderer: Process that draws further scenes later, in place of a new one that ends with these.
-
-    Returns:
-        Frames (F, H, V * W, 3 | 4) of each scene, as from `Renderer.frames`.
+        scene: What is drawn.
+        renderer: Process that draws further scenes later, in place of a new one that ends with this scene.
 
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
     with Renderer() if renderer is None else nullcontext(renderer) as used:
-        return [np.stack(list(used.frames(scene))) for scene in scenes]
+        return np.stack(list(used.frames(scene)))
 
 
 def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None) -> None:
@@ -334,21 +323,6 @@ def pace(times: FloatArray, slower: float) -> tuple[IntArray, float]:
     step = float(np.median(np.diff(times)))
     every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
     return np.arange(0, len(times), every), 1.0 / (slower * step * every)
-
-
-def packed(scene: RenderScene) -> bytes:
-    """Return a scene as bytes: the length, then an archive of its arrays and of JSON that refers to them by name."""
-    arrays: dict[str, Any] = {}
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            arrays[f"array_{id(value)}"] = value
-            return f"array_{id(value)}"
-        return vars(value) if is_dataclass(value) else value.item()
-
-    spec, content = json.dumps(scene, default=plain), io.BytesIO()
-    np.savez(content, spec=np.array(spec), **arrays)
-    return struct.pack("<Q", content.tell()) + content.getvalue()
 
 
 def _failure(reason: str) -> DrawingError:

@@ -1,21 +1,18 @@
 """The program of the process that `warp_resphys.report.render.Renderer` starts: draws scenes with pyvista.
 
-It reads scenes from stdin, packed by `render.packed`, until stdin is closed. It writes shape and pixels of every frame
-to stdout, and a shape of zeros after each scene.
+It reads scenes from stdin until that is closed, and writes the pixels of every frame to stdout, and None after each
+scene.
 """
 
-import io
-import json
 import os
-import struct
+import pickle
 import sys
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 
-from .render import INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Pixels
+from .render import INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Layer, Pixels, RenderScene
 
 _FAR: Final = 20.0  # Distance of the eye, in half heights of the view.
 _PEELS: Final = 12  # Sorted layers of translucent surfaces.
@@ -26,31 +23,14 @@ _RING_WIDTH: Final = 2.5  # [px]
 
 def main() -> None:
     """Draw scenes until there are no more."""
-    source = sys.stdin.buffer
     target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Keeps messages of VTK out of the frames.
     drawer = _Drawer()
-    while (scene := _read(source)) is not None:
-        for frame in drawer.frames(scene):
-            target.write(struct.pack("<3I", *frame.shape))
-            target.write(frame.tobytes())
-        target.write(bytes(12))
+    while sys.stdin.buffer.peek(1):
+        for frame in drawer.frames(pickle.load(sys.stdin.buffer)):
+            pickle.dump(np.ascontiguousarray(frame), target)
+        pickle.dump(None, target)
         target.flush()
-
-
-def _read(source: BinaryIO) -> Any:
-    """The next scene; None at the end."""
-    head = source.read(8)
-    if not head:
-        return None
-    content = io.BytesIO(source.read(*struct.unpack("<Q", head)))
-    with np.load(content, allow_pickle=False) as held:
-        arrays = dict(held)
-
-    def named(plain: dict[str, Any]) -> SimpleNamespace:
-        return SimpleNamespace(**{key: arrays.get(str(value), value) for key, value in plain.items()})
-
-    return json.loads(str(arrays.pop("spec")), object_hook=named)
 
 
 class _Drawer:
@@ -60,7 +40,7 @@ class _Drawer:
         self._layout: tuple[Any, ...] = ()
         self._plotter: Any = None
 
-    def _window(self, scene: Any) -> Any:
+    def _window(self, scene: RenderScene) -> Any:
         """An empty window with a light."""
         import pyvista
 
@@ -82,7 +62,7 @@ class _Drawer:
         self._plotter.add_light(pyvista.Light(**light))
         return self._plotter
 
-    def frames(self, scene: Any) -> Iterator[Pixels]:
+    def frames(self, scene: RenderScene) -> Iterator[Pixels]:
         """Yields the pixels (H, V * W, 3 | 4) of each frame."""
         plotter, layers = self._window(scene), []
         plotter.suppress_rendering = True  # A reused window would render after each added object.
@@ -121,7 +101,7 @@ def _at(values: FloatArray, frame: int) -> Any:
 class _DrawnLayer:
     """A layer in the current view, with corners or centres at its points (1 | F, P, 3)."""
 
-    def __init__(self, plotter: Any, layer: Any, axes: FloatArray) -> None:
+    def __init__(self, plotter: Any, layer: Layer, axes: FloatArray) -> None:
         points = layer.points if layer.points.ndim == 3 else layer.points[None]
         self.points = points + layer.shift * axes[2]
         self.around: FloatArray | None = None  # (Q, 3) of a ball or ring around its centre.
@@ -156,7 +136,7 @@ class _DrawnLayer:
             self.mesh.points = self._places(frame)
 
 
-def _mesh(layer: Any, points: FloatArray, cells: Any) -> Any:
+def _mesh(layer: Layer, points: FloatArray, cells: Any) -> Any:
     """The pyvista object of a layer."""
     import pyvista
 
@@ -184,7 +164,7 @@ def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
     return radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1]), np.stack([count, np.roll(count, -1)], axis=1)
 
 
-def _add_texts(plotter: Any, scene: Any) -> Any:
+def _add_texts(plotter: Any, scene: RenderScene) -> Any:
     """Adds time and legends at the top, where controls of players do not hide them, and returns the time."""
     top = scene.size[1] - 32
     for column, view in enumerate(scene.views):

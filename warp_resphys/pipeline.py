@@ -68,8 +68,8 @@ from .io.stages import Stage, StageContext, package_versions, resources_used, ru
 from .learning.metrics import summarise_folds
 from .report.control_section import controller_name
 from .report.data import errors_by_load, other_trials, trial_errors
-from .report.law_section import shapes_table
 from .report.page import number_text, ratio_text
+from .report.sections import shapes_table
 from .report.verdict import known_errors, standings, verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings

@@ -8,14 +8,33 @@ import pytest
 from matplotlib.figure import Figure
 
 from warp_resphys.energies.pressure import PRESSURE
-from warp_resphys.report import figures, learning_figures, motion_figures
-from warp_resphys.report.data import Driven, FollowedPath
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report import figures
+from warp_resphys.report.body_section import body_section, input_sequences, marker_paths
+from warp_resphys.report.control_section import followed_paths
+from warp_resphys.report.data import Driven, FollowedPath, TrialResults
+from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.figures import CHAMBER_COLOURS, TONES, use_logarithm
-from warp_resphys.report.motion_sections import input_sequences
+from warp_resphys.report.identification_section import loss_histories
+from warp_resphys.report.motion_section import _tip_figure
+from warp_resphys.report.training_section import training_curves
 
 TIMES = np.arange(20) * 0.01
 MEASURED = np.zeros((20, 1, 3))
 MEASURED[:, 0, 2] = 0.01 * np.sin(30.0 * TIMES)
+CANVAS = SimpleNamespace(figure=lambda name, figure, alt, caption: figure, attempt=lambda file, draw: [])
+
+
+def trials_of(target, positions, times=TIMES, labels=("A",)):
+    """One trial of some models, whose markers begin at zero."""
+    shown = {model: q[None] for model, q in positions.items()}
+    zeros = np.zeros(target.shape[1:])
+    return TrialResults(("a",), labels, ("released",), times[None], target[None], shown, zeros, zeros, 0.01)
+
+
+def paths_of(positions, target=MEASURED, times=TIMES, bands=(), driven=None):
+    trials = trials_of(target, positions, times)
+    return marker_paths(trials, 0, [0], [*positions], trials.bound, dict(bands), driven)
 
 
 @pytest.mark.parametrize(
@@ -39,8 +58,11 @@ def test_a_logarithmic_axis_has_enough_labels(errors, labels):
 
 def test_lines_have_their_style_in_every_panel_and_none_hides_another():
     still = np.zeros((20, 3))
-    paths = {"target": np.sin(still + np.arange(20)[:, None]), "regression": still, "sysid": still, "resphys": still}
-    motion, distance = motion_figures.tip_displacement(paths, 0.01).axes
+    models = {model: still[:, None] for model in ("regression", "sysid", "resphys")}
+    trials = trials_of(np.sin(still + np.arange(20)[:, None])[:, None], models)
+    body = SimpleNamespace(tip=[0], mesh=SimpleNamespace(vertices=np.zeros((1, 3))))
+    (figure,) = _tip_figure(body, trials, CANVAS)
+    motion, distance = figure.axes
     above, below = ({line.get_label(): line for line in axes.lines} for axes in (motion, distance))
     for label in ("Regression", "SysID", "ResPhys"):
         assert above[label].get_linestyle() == below[label].get_linestyle()
@@ -53,44 +75,44 @@ def test_lines_have_their_style_in_every_panel_and_none_hides_another():
 class TestErrors:
     def test_a_model_without_error_does_not_hide_the_others(self):
         rows = np.full((2, 5), 0.5)
-        (axes,) = figures.error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01).axes
+        (axes,) = error_over_time({"simulation": rows, "resphys": 0.0 * rows}, 0.01 * np.arange(5)).axes
         low, high = axes.get_ylim()
         assert axes.get_yscale() == "log"
         assert low <= 0.5 <= high
         assert not axes.texts
 
     def test_lines_are_filtered_and_thin_behind(self):
-        rows = np.ones((2, 200))
+        rows, times = np.ones((2, 200)), 0.01 * np.arange(200)
         rows[:, 100:110] = 9.0
         rows[1, 180:] = np.inf
-        (axes,) = figures.error_over_time({"resphys": rows}, 0.01, window=1.0).axes
+        (axes,) = error_over_time({"resphys": rows}, times, window=1.0).axes
         thin, thick = axes.lines
         assert thin.get_linewidth() < 1.0 < thick.get_linewidth()
         assert np.nanmax(thin.get_ydata()) == 9.0
         assert np.nanmax(thick.get_ydata()) == 1.0
         np.testing.assert_allclose(thick.get_xdata()[[0, -1]], [0.0, 1.99])
         assert np.isnan(thin.get_ydata()[180:]).all()
-        (axes,) = figures.error_over_time({"resphys": rows}, 0.01).axes
+        (axes,) = error_over_time({"resphys": rows}, times).axes
         (only,) = axes.lines
         assert np.nanmax(only.get_ydata()) == 9.0
 
     def test_lines_end_where_a_trial_diverged(self):
         rows = np.array([[1.0, 1.0, 1.0], [3.0, np.nan, np.inf]])
-        (line,) = figures.error_over_time({"resphys": rows}, np.arange(1.0, 4.0)).axes[0].lines
+        (line,) = error_over_time({"resphys": rows}, np.arange(1.0, 4.0)).axes[0].lines
         np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
 
 
 class TestLearning:
     def test_one_epoch_is_seen_and_named_by_a_whole_number(self):
         record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
-        losses, rate = learning_figures.training_curves([record]).axes
+        losses, rate = training_curves([record]).axes
         assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
         low, high = rate.get_xlim()
         assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
 
     def test_the_start_that_was_kept_is_bold(self):
         histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
-        (axes,) = learning_figures.loss_histories(histories).axes
+        (axes,) = loss_histories(histories).axes
         assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
         np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
 
@@ -98,7 +120,7 @@ class TestLearning:
 class TestMotion:
     def test_a_model_that_runs_away_does_not_set_the_scale(self):
         wild = MEASURED + np.exp(50.0 * TIMES)[:, None, None]
-        figure = motion_figures.marker_paths(TIMES, MEASURED, {"resphys": wild}, ["A"])
+        figure = paths_of({"resphys": wild})
         spans = [np.ptp(axes.get_ylim()) for axes in figure.axes[:3]]
         assert spans[2] < 50.0
         assert 0.05 * np.ptp(MEASURED[..., 2]) * 1e3 < spans[1] < 5.0  # [mm]
@@ -106,7 +128,7 @@ class TestMotion:
     def test_prediction_intervals_are_bands_around_their_model(self):
         shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}
         widths = {"resphys": np.linspace(1e-3, 3e-3, 20)[:, None]}
-        figure = motion_figures.marker_paths(TIMES, MEASURED, shown, ["A"], bands=widths)
+        figure = paths_of(shown, bands=widths)
         (band,) = figure.axes[2].collections
         corners = band.get_paths()[0].vertices
         for time, middle, width in zip(TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True):
@@ -116,8 +138,8 @@ class TestMotion:
     def test_markers_stand_over_the_pressures(self):
         times = 0.1 * np.arange(4)
         moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
-        driven = Driven(PRESSURE, ("chamber_1",), {"Pressures": np.full((3, 1), 5e3)})
-        figure = motion_figures.marker_paths(times, moved, {"resphys": moved}, ["A"], driven)
+        driven = Driven(PRESSURE, ("chamber_1",), {"a": np.full((3, 1), 5e3)})
+        figure = paths_of({"resphys": moved}, moved, times, driven=driven)
         *coordinates, below = figure.axes
         assert len(coordinates) == 3
         assert all(axes.get_xlim() == below.get_xlim() for axes in coordinates)
@@ -128,10 +150,16 @@ class TestMotion:
 
 
 class TestInputs:
+    def figures_of(self, driven, *tested):
+        """Figures of the section on the inputs."""
+        trials = SimpleNamespace(names=tested, time_step=0.5, labels=())
+        mesh = box_hexahedra(divisions=(1, 1, 1))
+        return body_section(SimpleNamespace(trials=trials, driven=driven, mesh=mesh, fixed=[]), CANVAS).blocks
+
     def test_pressures_are_in_kilopascal_in_the_chambers_colours(self):
         pressure = np.array([[0.0, 1e3], [2e4, 3e3]])
         driven = Driven(PRESSURE, ("one", "two"), {"a": pressure, "b": 2 * pressure}, 2e4)
-        figure = motion_figures.input_sequences(0.5, driven)
+        (figure,) = self.figures_of(driven, "b")
         first, second = figure.axes
         assert second.get_xlim() == (0.0, 1.0)
         assert [line.get_ydata()[0] for line in first.lines] == [20.0]
@@ -141,8 +169,8 @@ class TestInputs:
         assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(CHAMBER_COLOURS[:2])
 
     def test_those_of_poses_are_bars_of_the_chambers_in_use(self):
-        poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b (test)": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
-        figure = motion_figures.pose_inputs(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4))
+        poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
+        (figure,) = self.figures_of(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4, poses=("a", "b")), "b")
         (axes,) = figure.axes
         assert axes.get_xlabel() == "pressure [kPa]"
         assert [tick.get_text() for tick in axes.get_yticklabels()] == ["a", "b (test)"]
@@ -162,7 +190,8 @@ def test_followed_paths_are_drawn_in_their_plane():
     paths = [
         FollowedPath(name=name, seconds=2.0, path=path, points={"open_sysid": 1.1 * path}) for name in ("line", "bow")
     ]
-    figure = motion_figures.followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]])
+    with figures.in_style():
+        figure = followed_paths(paths, {"open_sysid": "SysID"}, np.eye(3)[[0, 2]])
     asked, driven = figure.axes[0].lines
     np.testing.assert_allclose(np.ptp(asked.get_xdata()), 20.0)  # [mm]
     np.testing.assert_allclose(np.ptp(driven.get_ydata()), 11.0)

@@ -13,8 +13,7 @@ from support.vertex_run import settings, write_run
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.report.data import errors_by_load
-from warp_resphys.report.law_section import law_text, not_needed_text, outside_text, wording
-from warp_resphys.report.learning_figures import drawn_stretches
+from warp_resphys.report.law_section import drawn_stretches, law_text, not_needed_text, outside_text, wording
 from warp_resphys.report.page import percent_text
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.uniaxial import ACROSS, ALONG, small_strain, small_strain_of, uniaxial_stress

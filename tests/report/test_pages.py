@@ -21,8 +21,8 @@ from warp_resphys.io.stages import StageContext
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import run_page
+from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
-from warp_resphys.report.marker_section import paths_section
 from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
 from warp_resphys.settings.stages import ReportStage
 

@@ -12,6 +12,7 @@ from warp_resphys.experiment.report import read_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json
 from warp_resphys.report import figures
+from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.page import error_parts, number_text
 
 SETTINGS = settings()
@@ -93,7 +94,7 @@ def test_errors_of_exactly_zero_are_a_report(tmp_path):
     write_run(tmp_path, SETTINGS, models=("reconstruction",))
     trials = read_trials(tmp_path, SETTINGS)
     trials.positions["reconstruction"][:] = trials.target
-    figure = figures.error_over_time(trials.errors_mm, 0.01)
+    figure = error_over_time(trials.errors_mm, trials.times[0])
     assert "zero, or diverged, throughout" in [text.get_text() for text in figure.axes[0].texts]
     assert "0.000" in report(tmp_path, SETTINGS).text
 

@@ -5,7 +5,7 @@ import pytest
 from support.report_page import report
 from support.vertex_run import settings, write_run
 from warp_resphys.io.files import write_json
-from warp_resphys.report.law_section import shapes_table, share_text
+from warp_resphys.report.sections import shapes_table, share_text
 
 
 def result(simulation, sysid=None, law=None, **more):

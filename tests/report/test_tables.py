@@ -13,10 +13,11 @@ from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
+from warp_resphys.report.error_section import largest_filtered
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell, duration_text, error_parts, number_text
 from warp_resphys.report.render import axes_from_below, motion_axes
-from warp_resphys.report.run_page import largest_filtered, published_beside, range_texts
+from warp_resphys.report.run_page import published_beside, range_texts
 from warp_resphys.report.sections import (
     against,
     horizon_table,

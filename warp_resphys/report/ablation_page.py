@@ -2,25 +2,24 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from ..settings.run import RunSettings
-from .figures import marker_boxes
+from .figures import TONES, FloatArray, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
-    Canvas,
     Cell,
     PageTable,
     Part,
     Row,
     Text,
+    canvas_beside,
     experiment_kicker,
-    figures_beside,
     number_text,
     write_page,
 )
@@ -74,9 +73,9 @@ def write_ablation_report(
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
     body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
-    with figures_beside(path) as folder:
-        draw = partial(marker_boxes, {row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
-        figure = Canvas(folder).figure("marker_ablation", draw, alt, caption)
+    with canvas_beside(path) as canvas:
+        boxes = marker_boxes({row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
+        figure = canvas.figure("marker_ablation", boxes, alt, caption)
     write_page(
         path,
         [
@@ -90,6 +89,32 @@ def write_ablation_report(
         settings=settings.plain(),
     )
     _LOG.info("report written: %s", path)
+
+
+def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
+    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+
+    Args:
+        errors: (D,) errors [mm] of the draws, by number of markers.
+        uncorrected: Error without any correction [mm].
+    """
+    ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
+    grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
+    figure = new_figure(3.6)
+    axes, count = figure.subplots(), len(errors)
+    lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
+    axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
+    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
+    place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
+    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
+    axes.set_xlim(0.5, count + 0.5)
+    axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
+    axes.set_yscale("log")
+    axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
+    use_logarithm(axes)
+    axes.grid(visible=False, axis="x")
+    axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
+    return figure
 
 
 def _how_reconstructed(modes: int | None, regularisation: float) -> str:

@@ -1,15 +1,17 @@
 """The section on control: errors of followed paths on the simulated laboratory, and how motions were planned."""
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ..settings.control import ControlSettings
-from .data import MODELS, RunReport
+from .data import MODELS, FloatArray, FollowedPath, RunReport
 from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # By prefix of a controller: name in words, and description.
     "open_": ("{}, open loop", "planned once for the whole path, and played"),
@@ -17,12 +19,12 @@ _KINDS: Final[Mapping[str, tuple[str, str]]] = {  # By prefix of a controller: n
     "receding_": ("{}, receding horizon", "planned anew at each step, from an estimate by the markers"),
     "feedback_": ("Jacobian feedback, {}/s", "with the measured Jacobian of the point by the inputs"),
 }
+_LINES: Final[Mapping[str, Any]] = {"open": (0, (4, 2)), "receding": "-"}  # By beginning of a controller's name.
+_COLUMNS: Final = 5  # Of followed paths.
 
 
 def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the section; None where nothing is controlled, or no simulation plays the robot."""
-    from . import motion_figures
-
     metrics, control = data.metrics.get("control") or {}, data.settings.control
     if not metrics or control is None:
         return None
@@ -38,11 +40,48 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
             "point starts from where the tip hangs."
         )
         plane = np.array([control.right, control.up], dtype=np.float64)
-        blocks.append(
-            canvas.figure("control", partial(motion_figures.followed_paths, drawn, named, plane), alt, caption)
-        )
+        blocks.append(canvas.figure("control", followed_paths(drawn, named, plane), alt, caption))
     blocks += [Text("How it was planned", heading=True), Items(_facts(metrics), "planned")]
     return Part("Control", blocks)
+
+
+def followed_paths(paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray) -> "Figure":
+    """Draw paths and the paths of the controlled point, side by side in their plane.
+
+    Args:
+        paths: Paths and points.
+        controllers: Names in words of the controllers that are drawn.
+        plane: (2, 3) directions of the width and of the height.
+    """
+    from . import figures
+
+    columns = min(_COLUMNS, len(paths))
+    rows = -(-len(paths) // columns)
+    figure = figures.new_figure(figures.WIDE / columns * rows + 0.35)
+    every = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    first = plane[0] / np.linalg.norm(plane[0])
+    second = plane[1] - (plane[1] @ first) * first
+    across = 1e3 * np.stack([first, second / np.linalg.norm(second)])
+    middle = np.mean([followed.path.mean(axis=0) for followed in paths], axis=0)
+    lines: dict[str, Any] = {}
+    for axes, followed in zip(every, paths, strict=False):
+        x, y = ((followed.path - middle) @ across.T).T
+        (lines["path"],) = axes.plot(x, y, color=figures.TONES["target"].light, linewidth=3.2)
+        for controller, name in controllers.items():
+            beginning, model = controller.split("_", 1)
+            x, y = ((followed.points[controller] - middle) @ across.T).T
+            tone = figures.TONES[model].light
+            (lines[name],) = axes.plot(x, y, color=tone, linestyle=_LINES[beginning], linewidth=1.1)
+        axes.set_aspect("equal")
+        axes.set_title(followed.name)
+        axes.grid(False)
+    for axes in every[len(paths) :]:
+        axes.set_visible(False)
+    for axes in every:
+        axes.tick_params(labelsize=figures.STYLE["xtick.labelsize"] - 1.5)
+    every[0].set_ylabel("mm")
+    figure.legend(list(lines.values()), list(lines), loc="outside upper left", ncols=4, columnspacing=1.6)
+    return figure
 
 
 def controller_name(controller: str) -> str:

@@ -1,4 +1,4 @@
-"""The style of all figures, and the figures of errors.
+"""The style of all figures.
 
 Their colours follow the reader's theme.
 """
@@ -6,7 +6,7 @@ Their colours follow the reader's theme.
 import io
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -14,12 +14,12 @@ from typing import Any, Final, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import median_filter
 from .data import MODELS
 
 FloatArray = NDArray[np.float64]
@@ -57,7 +57,6 @@ LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.i
 CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
 LARGEST_SHOWN: Final = 1e5  # Largest error [mm] or loss that is drawn.
 FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
-ROUND_STEPS: Final = (1, 2, 5, 10)  # Distances of ticks, times a power of ten.
 WIDE: Final = 7.3  # [in]
 _LEGEND_ROW: Final = 5  # Largest number of names in one row.
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
@@ -108,101 +107,6 @@ def in_style() -> Iterator[None]:
         yield
 
 
-@in_style()
-def error_over_time(
-    errors: Mapping[str, FloatArray],
-    times: FloatArray | float,
-    *,
-    of: str = "vertex",
-    window: float | None = None,
-    panels: Mapping[str, Sequence[int]] | None = None,
-) -> Figure:
-    """Draw each model's mean error over time and, for the main models, the range of the trials.
-
-    Args:
-        errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
-        times: (T,) [s]; or the time between two frames, the first of which is at zero.
-        of: What is observed: "vertex" or "marker".
-        window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
-            unfiltered one as a thin line. None for no filter.
-        panels: Rows of trials by title, with a panel for each; without any, one panel has all trials.
-    """
-    groups: dict[str, Any] = {**panels} if panels else {"": slice(None)}
-    figure = new_figure(3.5)
-    every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
-    lowest: list[float] = []
-    for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
-        lowest += _error_lines(axes, {model: own[rows] for model, own in errors.items()}, times, window)
-        axes.set_title(title)
-    if len(groups) > 1:
-        figure.set_layout_engine("constrained", wspace=_BETWEEN)
-    for axes in every.flat:  # Once everything is drawn, as they share their axis.
-        use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
-    for axes in every[-1]:
-        axes.set_xlabel("time [s]")
-    for axes in every[:, 0]:
-        axes.set_ylabel(f"mean {of} error [mm]")
-    legend_above(figure, every[0, 0])
-    return figure
-
-
-def _error_lines(
-    axes: Axes, errors: Mapping[str, FloatArray], times: FloatArray | float, window: float | None
-) -> list[float]:
-    """Draws the errors of some trials; returns the lowest filtered error of each model."""
-    lowest: list[float] = []
-    for model, rows in errors.items():
-        time = times if isinstance(times, np.ndarray) else times * np.arange(rows.shape[1])
-        mean, line = mean_of_trials(rows), model_line(model)
-        shown = positive(mean)
-        if window is not None:
-            axes.plot(time, shown, color=line["color"], linewidth=0.6, alpha=0.45)
-            shown = positive(median_filter(mean, float(time[1] - time[0]), window))
-            settled = shown[len(shown) // 10 :]
-            lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
-        elif len(rows) > 1 and (model == "sysid" or model not in _DASHED):
-            low, high = (positive(extreme.reduce(rows, axis=0)) for extreme in (np.fmin, np.fmax))
-            axes.fill_between(time, low, high, color=line["color"], alpha=0.15, linewidth=0)
-        axes.plot(time, shown, **line)
-        axes.set_xlim(0.0, time[-1])
-    return lowest
-
-
-def mean_of_trials(rows: FloatArray) -> FloatArray:
-    """Return the mean (T,) over trials (R, T), without NaN; infinite where one diverged, NaN where all are NaN."""
-    held = ~np.isnan(rows)
-    count = held.sum(axis=0)
-    mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
-    return mean
-
-
-@in_style()
-def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
-    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
-
-    Args:
-        errors: (D,) errors [mm] of the draws, by number of markers.
-        uncorrected: Error without any correction [mm].
-    """
-    ink: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 0.9}
-    grey, median = TONES["muted"].light, {"color": TONES["simulation"].light, "linewidth": 2.0}
-    figure = new_figure(3.6)
-    axes, count = figure.subplots(), len(errors)
-    lines: Any = {"boxprops": ink, "whiskerprops": ink, "capprops": ink, "medianprops": median}
-    axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
-    axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
-    place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
-    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
-    axes.set_xlim(0.5, count + 0.5)
-    axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
-    axes.set_yscale("log")
-    axes.set_ylim(top=1.6 * max(uncorrected, *(row.max() for row in errors.values())))
-    use_logarithm(axes)
-    axes.grid(visible=False, axis="x")
-    axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
-    return figure
-
-
 def save_png(figure: Figure, path: Path) -> None:
     """Write a figure with a white background."""
     figure.savefig(path, format="png", dpi=200, facecolor="white")
@@ -251,6 +155,30 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     columns = len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
+
+
+def keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0) -> None:
+    """Limit an axis to a measured motion (T,) and a margin, a share of it, with a least span.
+
+    A model that diverges then does not set the scale, and noise does not look like motion.
+    """
+    if np.isfinite(seen).any():
+        low, high = np.nanmin(seen), np.nanmax(seen)
+        margin = share * (high - low) + 0.02
+        bottom, top = axes.get_ylim()
+        bottom, top = max(low - margin, bottom), min(high + margin, top)
+        more = max(0.0, 0.5 * (least - (top - bottom)))
+        axes.set_ylim(bottom - more, top + more)
+
+
+def few_ticks(axis: Axis, most: int) -> None:
+    """Label an axis at a few round numbers."""
+    axis.set_major_locator(MaxNLocator(most, steps=(1, 2, 5, 10)))
+
+
+def count(axis: Axis, most: int) -> None:
+    """Label an axis at whole numbers only, even if there is just one."""
+    axis.set_major_locator(MaxNLocator(most, integer=True, min_n_ticks=1))
 
 
 def positive(values: FloatArray) -> FloatArray:

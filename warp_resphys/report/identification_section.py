@@ -2,9 +2,8 @@
 
 import math
 import re
-from collections.abc import Mapping
-from functools import partial
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -13,7 +12,10 @@ from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
 from .data import MODELS, RunReport
-from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, Drawn, PageTable, Part, Row, Text
+from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, PageTable, Part, Row, Text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Name, unit on the page, and its number in an SI unit.
 Wording = tuple[str, str, float]
@@ -101,25 +103,40 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     markers = data.settings.markers
     lengths = {} if markers is None else {name: body.length for name, body in markers.rigid_bodies.items()}
     blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
-    return Part("Identification", [*blocks, *_loss_figures(data, identified, canvas)])
-
-
-def _loss_figures(data: RunReport, identified: Mapping[str, Any], canvas: Canvas) -> list[Drawn]:
-    """The losses of the identifications over their evaluations."""
-    from . import learning_figures
-
-    drawn = []
     if histories := {name: result["history"] for name, result in identified.items() if any(result["history"])}:
-        drawn.append(
-            canvas.figure(
-                "loss_history",
-                partial(learning_figures.loss_histories, histories),
-                "Loss of the identification over its evaluations, with a line for each start, on a logarithmic axis.",
-                "Lowest loss so far over the evaluations, with a line for each start; the kept start is bold. The loss "
-                "is the mean squared distance of the markers over the square of the motion’s amplitude.",  # noqa: RUF001
-            )
+        alt = "Loss of the identification over its evaluations, with a line for each start, on a logarithmic axis."
+        caption = (
+            "Lowest loss so far over the evaluations, with a line for each start; the kept start is bold. The loss "
+            "is the mean squared distance of the markers over the square of the motion’s amplitude."  # noqa: RUF001
         )
-    return drawn
+        blocks.append(canvas.figure("loss_history", loss_histories(histories), alt, caption))
+    return Part("Identification", blocks)
+
+
+def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> "Figure":
+    """Draw the best loss so far over the evaluations of each start, with a panel for each identification.
+
+    Args:
+        histories: By identification: for every start its records with `loss`, one for each evaluation.
+    """
+    from . import figures
+
+    figure = figures.new_figure(2.6)
+    panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
+    for axes, (name, starts) in zip(panels, histories.items(), strict=True):
+        ends = [record["loss"] for start in starts for record in start if record["loss"] is not None]
+        for start in filter(None, starts):
+            losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
+            best = bool(ends) and losses[-1] <= min(ends)
+            tone, width = figures.TONES["sysid" if best else "muted"].light, 1.8 if best else 0.9
+            shown = figures.positive(losses)
+            axes.plot(np.arange(1, len(losses) + 1), shown, ".-", color=tone, linewidth=width, markersize=3.5)
+        axes.set(title=MODELS[name][0], xlabel="evaluation")
+        figures.count(axes.xaxis, 5)
+    for axes in panels:  # Once everything is drawn, as they share their axis.
+        figures.use_logarithm(axes)
+    panels[0].set_ylabel("loss")
+    return figure
 
 
 def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:

@@ -1,9 +1,7 @@
 """The section on the identified law: its terms, its moduli at small strains, the classes that were tried, its use."""
 
-import math
 import re
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +9,7 @@ import numpy as np
 from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
-from .data import MODELS, RunReport
+from .data import MODELS, FloatArray, RunReport
 from .identification_section import Wording, digits, parameter_wording
 from .page import (
     NONE,
@@ -24,10 +22,10 @@ from .page import (
     Row,
     Text,
     in_a_row,
-    number_text,
     significant,
     unbroken,
 )
+from .sections import BEYOND
 from .uniaxial import (
     ACROSS,
     ALONG,
@@ -41,7 +39,10 @@ from .uniaxial import (
 from .verdict import model_name
 
 _NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
-_BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
+_POINTS: Final = 81  # Of the curve of the stress.
+_LEAST: Final = 0.02  # Least range of strains that is drawn, on either side of rest.
+_SHADE: Final = 0.45  # Opacity.
+_MARGIN: Final = 0.15  # Of the drawn range, over the range of the strains.
 _KPA: Final = ("kPa", 1e-3)
 _STRAIN: Final = ("%", 1e2)
 _ANGLE: Final = ("°", 180.0 / np.pi)
@@ -76,7 +77,6 @@ _GROUPS: Final[Mapping[str, str]] = {
     "branches": "relaxation",
     "fibres": "fibres",
 }
-_MATERIALS: Final = ("sysid", "law")  # Models whose material can be put on another body, the better one last.
 
 
 def law_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -154,7 +154,7 @@ def _lower(words: str) -> str:
 
 def outside_text(data: RunReport) -> str:
     """Return a sentence on test trials outside of the stretches of the training; empty if they hardly are."""
-    if data.outside is None or data.outside < _BEYOND:
+    if data.outside is None or data.outside < BEYOND:
         return ""
     low, high = data.stretches["the training"]
     (where, _), *_ = data.stretches.items()
@@ -215,29 +215,49 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
 
 
 def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
-    """Draws the stress in slow tension and compression."""
-    from . import learning_figures
+    """Draws the stress in slow tension and compression, and the stretches of trials as shades."""
+    from . import figures
 
-    stretches = learning_figures.drawn_stretches(data.stretches)
-    fibres = families(constants)
+    stretches, fibres = drawn_stretches(data.stretches), families(constants)
     directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
-    curves = {label: (stretches, uniaxial_stress(constants, stretches, d)) for label, d in directions.items()}
-    modulus = small_strain(constants).youngs_modulus
+    curves = {label: 1e-3 * uniaxial_stress(constants, stretches, d) for label, d in directions.items()}  # [kPa]
+    modulus = 1e-3 * small_strain(constants).youngs_modulus
+    figure, law = figures.new_figure(3.3), figures.TONES["law"].light
+    axes = figure.subplots()
+    for (name, (low, high)), tone in zip(data.stretches.items(), ("rule", "target"), strict=False):
+        colour = figures.TONES[tone].light
+        axes.axvspan(low, high, color=colour, alpha=_SHADE, linewidth=0.0, label=f"stretches in {name}")
+    for (label, stress), dashes in zip(curves.items(), ("-", (0, (4, 1.5))), strict=False):
+        axes.plot(stretches, stress, color=law, linewidth=1.9, label=label, linestyle=dashes)
+    dashed: dict[str, Any] = {"color": figures.TONES["ink"].light, "linewidth": 1.0, "linestyle": (0, (6, 3))}
+    axes.plot(stretches, modulus * (stretches - 1.0), **dashed, label=f"E at small strains, {modulus:.3g} kPa")
+    axes.axhline(0.0, color=figures.TONES["muted"].light, linewidth=0.6)
+    low, high = (extreme([extreme(stress) for stress in curves.values()]) for extreme in (np.nanmin, np.nanmax))
+    margin = 0.1 * (high - low)
+    axes.set(xlim=(stretches[0], stretches[-1]), ylim=(low - margin, high + margin))
+    axes.set(xlabel="stretch", ylabel="nominal stress [kPa]")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=2, columnspacing=1.6)
     ends = "; ".join(
-        f"{label}: {1e-3 * stress[0]:.3g} kPa at a stretch of {x[0]:.2f}, {1e-3 * stress[-1]:.3g} kPa at {x[-1]:.2f}"
-        for label, (x, stress) in curves.items()
+        f"{label}: {stress[0]:.3g} kPa at a stretch of {stretches[0]:.2f}, {stress[-1]:.3g} kPa at {stretches[-1]:.2f}"
+        for label, stress in curves.items()
     )
     without = " Fibres are left out, as there are several families." if fibres > 1 else ""
     shaded = " Shaded: principal stretches at the centres of the cells." if data.stretches else ""
-    return [
-        canvas.figure(
-            "law",
-            partial(learning_figures.stress_over_stretch, curves, modulus, data.stretches),
-            unbroken(f"Nominal stress of the law against stretch. {ends}."),
-            "Nominal stress of the law in slow uniaxial tension and compression; dashed, the straight line with its "
-            f"Young's modulus at small strains.{shaded}{without}",
-        )
-    ]
+    caption = (
+        "Nominal stress of the law in slow uniaxial tension and compression; dashed, the straight line with its "
+        f"Young's modulus at small strains.{shaded}{without}"
+    )
+    return [canvas.figure("law", figure, unbroken(f"Nominal stress of the law against stretch. {ends}."), caption)]
+
+
+def drawn_stretches(ranges: Mapping[str, tuple[float, float]]) -> FloatArray:
+    """Return the stretches (S,) of the curves: those of the trials and a margin, or 0.8 to 1.3 without any."""
+    low = min((low for low, _ in ranges.values()), default=0.8)
+    high = max((high for _, high in ranges.values()), default=1.3)
+    low, high = min(low, 1.0 - _LEAST), max(high, 1.0 + _LEAST)
+    margin = _MARGIN * (high - low)
+    return np.unique(np.append(np.linspace(max(low - margin, 0.2), high + margin, _POINTS), 1.0))
 
 
 def _classes(law: Mapping[str, Any]) -> list[Block]:
@@ -272,55 +292,3 @@ def _is_coefficient(name: str) -> bool:
 
 def _share(value: float | None) -> str:
     return "failed" if value is None else significant(100.0 * value) + " %"
-
-
-def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
-    shapes: Mapping[str, Any] = data.metrics.get("shapes", {})
-    if not shapes:
-        return None
-    note = (
-        "Mean distance of the vertices from a target of the same shape, whose motion begins in the same state; below "
-        "it, the share of the uncorrected simulation's error that is removed. A learned force belongs to its mesh, and "
-        "cannot be put on another one."
-    )
-    beyond = [f"{n} ({100.0 * r['outside']:.0f} %)" for n, r in shapes.items() if r.get("outside", 0.0) > _BEYOND]
-    outside = "Outside of the stretches that the law was learned at, with the share of cells and times: "
-    texts = [outside + f"{in_a_row(beyond)}."] if beyond else []
-    return Part(
-        "Other bodies of the same material", [shapes_table(shapes, note), *(Text(unbroken(text)) for text in texts)]
-    )
-
-
-def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
-    """Return the errors by body and model."""
-    models = _models(shapes)
-    rows = []
-    for name, result in shapes.items():
-        shares = _removed(result)
-        cells = [
-            Cell(number_text(result["errors_mm"][model]), f"removes {share_text(shares[model])}")
-            if model in shares
-            else Cell(number_text(result["errors_mm"].get(model)) if model in result["errors_mm"] else NONE)
-            for model in models
-        ]
-        small = f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"
-        rows.append(Row(name, cells, small=small))
-    return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
-
-
-def _models(shapes: Mapping[str, Any]) -> list[str]:
-    return [model for model in MODELS if any(model in result["errors_mm"] for result in shapes.values())]
-
-
-def _removed(result: Mapping[str, Any]) -> dict[str, float]:
-    """Share of the uncorrected simulation's error that the others remove, where they did not diverge."""
-    errors = result["errors_mm"]
-    base = errors["simulation"]
-    return {m: 1.0 - errors[m] / base for m in _MATERIALS if base and errors.get(m) is not None}
-
-
-def share_text(share: float) -> str:
-    """Return a share as a percentage, with digits for what is left of it."""
-    digits = max(0, -math.floor(math.log10(1.0 - share)) - 1) if 0.9 < share < 1.0 else 0
-    return f"{100.0 * share:.{digits}f} %".replace("-", "\N{MINUS SIGN}")

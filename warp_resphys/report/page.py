@@ -147,22 +147,14 @@ class Canvas:
     """Draws the figures of a page into a folder."""
 
     folder: Path  # Of their files.
-    started: Mapping[str, "Future[Any]"] = field(default_factory=dict)  # Pictures drawn by other processes, by name.
+    started: dict[str, "Future[Any]"] = field(default_factory=dict)  # Pictures drawn by other processes, by name.
     missing: set[str] = field(default_factory=set)  # Reasons why pictures cannot be drawn on this machine.
     renderer: Renderer = field(default_factory=Renderer)  # Of the pictures that are drawn here.
 
-    def figure(self, name: str, draw: "Callable[..., Drawing]", alt: str, caption: str) -> Drawn:
-        """Draw a figure, and save it as a PNG file too.
-
-        Args:
-            name: Of the figure, and of the file.
-            draw: Makes the figure.
-            alt: Description of the figure.
-            caption: Below the figure.
-        """
+    def figure(self, name: str, figure: "Drawing", alt: str, caption: str) -> Drawn:
+        """Return a figure with its description and caption, and save it as a PNG file of its name too."""
         from . import figures
 
-        figure = draw()
         figures.settle(figure)
         figures.save_png(figure, self.folder / f"{name}.png")
         address = data_address(figures.themed_svg(figure, name), "image/svg+xml")
@@ -187,16 +179,19 @@ class Canvas:
 
 
 @contextmanager
-def figures_beside(path: Path) -> Iterator[Path]:
-    """Yield the folder `figures` beside a page, created if it does not exist.
+def canvas_beside(path: Path) -> Iterator[Canvas]:
+    """Yield the canvas of a page, whose files are in the folder `figures` beside it, and apply the style of figures.
 
     Raises:
         DataFileError: A figure could not be written there.
     """
+    from . import figures
+
     folder = path.parent / "figures"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        yield folder
+        with figures.in_style():
+            yield Canvas(folder)
     except OSError as error:
         if is_disk_full(error):
             raise disk_full_error(folder) from error

@@ -17,22 +17,21 @@ from ..io.files import read_array, read_hdf5
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings
-from .figures import TONES, FloatArray, in_style
+from .figures import TONES, FloatArray
 from .identification_section import parameter_rows
 from .page import (
     NO_BREAK_SPACE,
     NONE,
     Block,
-    Canvas,
     Cell,
     Drawn,
     PageTable,
     Part,
     Row,
     Text,
+    canvas_beside,
     drawn_file,
     experiment_kicker,
-    figures_beside,
     number_text,
     write_page,
 )
@@ -163,8 +162,8 @@ def write_pictures_report(
         "± is one standard deviation in the Gauss-Newton approximation, for distances that are correlated along the "
         "outlines.",
     )
-    with figures_beside(path) as folder:
-        canvas, drawn = Canvas(folder), list[Block]()
+    with canvas_beside(path) as canvas:
+        drawn = list[Block]()
         panels = [(own, picture(own.pose, own.drawn)) for own in results if own.outline_mm["sysid"] is not None]
         clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
         # Pictures without outlines are shown as well, where there is nothing else to see.
@@ -220,7 +219,6 @@ def _text(value: float | None) -> str:
     return NONE if value is None else number_text(value)
 
 
-@in_style()
 def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], outlines: Path, path: Path) -> Drawn:
     """Draws the outlines on the middle picture of every pose into a PNG file.
 
@@ -273,7 +271,6 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
     return drawn_file(path, f"Outlines on pictures. Mean distances: {alt}.", caption)
 
 
-@in_style()
 def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path) -> Drawn:
     """Draws the first cloud of every pose on the body of each model into a PNG file, in colours of the distance.
 

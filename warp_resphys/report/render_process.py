@@ -25,9 +25,10 @@ def main() -> None:
     """Draw scenes until there are no more."""
     target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Keeps messages of VTK out of the frames.
+    source: Any = sys.stdin.buffer
     drawer = _Drawer()
-    while sys.stdin.buffer.peek(1):
-        for frame in drawer.frames(pickle.load(sys.stdin.buffer)):
+    while source.peek(1):
+        for frame in drawer.frames(pickle.load(source)):
             pickle.dump(np.ascontiguousarray(frame), target)
         pickle.dump(None, target)
         target.flush()
@@ -141,6 +142,7 @@ def _mesh(layer: Layer, points: FloatArray, cells: Any) -> Any:
     import pyvista
 
     if layer.kind.startswith("slice"):
+        assert layer.plane is not None
         solid = pyvista.CellType.HEXAHEDRON if cells.shape[1] == 8 else pyvista.CellType.TETRA
         return pyvista.UnstructuredGrid({solid: cells}, points).slice(normal=layer.plane[0], origin=layer.plane[1])
     if cells.shape[1] == 2:  # VTK expects the number of points before each line.

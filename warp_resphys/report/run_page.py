@@ -3,20 +3,19 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from markupsafe import Markup
 
 from ..io.errors import number_of
+from .body_section import body_section, paths_section
 from .control_section import control_section
-from .data import MODELS, OUTSIDE, RunReport, TrialResults, errors_by_load, folds_in, trial_errors, untrained
+from .data import MODELS, OUTSIDE, RunReport, errors_by_load, folds_in, trial_errors, untrained
+from .error_section import error_section
 from .identification_section import identification_section
-from .law_section import law_section, shapes_section
-from .marker_section import paths_section
-from .motion_sections import body_section, motion_section, start_drawing
+from .law_section import law_section
+from .motion_section import motion_section, start_drawing
 from .page import (
     NONE,
     Canvas,
@@ -26,11 +25,10 @@ from .page import (
     Part,
     Row,
     Text,
+    canvas_beside,
     duration_text,
     error_parts,
     experiment_kicker,
-    figures_beside,
-    largest_text,
     mm_text,
     number_text,
     published_parts,
@@ -40,14 +38,13 @@ from .page import (
 )
 from .sections import (
     horizons_section,
-    model_table,
-    numbers,
     quality_section,
     registration_section,
     scales_section,
-    training_section,
+    shapes_section,
     trials_section,
 )
+from .training_section import training_section
 from .verdict import LEAST_TRIALS, known_errors, recommended, standings, verdict
 
 _LOG = logging.getLogger(__name__)
@@ -71,8 +68,6 @@ _PUBLISHED_FOR: Final = {  # By what is observed: how the published errors diffe
     "arm": "The published errors are for the published simulator, of 494 vertices, on the authors' recordings.",
 }
 _MOST_LABELS: Final = 6  # Markers that are named one by one.
-_FILTER: Final = 1.0  # Window of the median filter [s], as published.
-_LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
 
 
 def write_report(path: Path, data: RunReport) -> None:
@@ -88,8 +83,9 @@ def write_report(path: Path, data: RunReport) -> None:
     Raises:
         DataFileError: A file could not be written.
     """
-    with figures_beside(path) as folder, ThreadPoolExecutor(1) as pool:
-        canvas = Canvas(folder, start_drawing(data, folder, pool))  # In another process, while this one draws figures.
+    with canvas_beside(path) as canvas, ThreadPoolExecutor(1) as pool:
+        # In another process, while this one draws figures.
+        canvas.started.update(start_drawing(data, canvas.folder, pool))
         ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for the other process.
         made = {section: section(data, canvas) for section in ready}
     seconds = data.metrics.get("seconds_per_test_trajectory", {})
@@ -289,70 +285,6 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
             text += f" At higher inputs: {', '.join(counts)}{earliest}."
         sentences.append(unbroken(text))
     return sentences
-
-
-def error_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors over time, of each trial and of each marker."""
-    trials, metrics = data.trials, data.metrics
-    if trials is None:
-        return None
-    blocks: list[Any] = []
-    if trials.moves:
-        from . import figures
-
-        times = np.nanmean(trials.times, axis=0)
-        window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
-        of = "marker" if data.sees_markers else "vertex"
-        panels = _panels(data, trials)
-        draw = partial(figures.error_over_time, trials.errors_mm, times, of=of, window=window, panels=panels)
-        reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
-        alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
-        blocks.append(canvas.figure("error_over_time", draw, alt, _error_caption(data, window)))
-    if by_model := metrics.get("per_marker"):
-        shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
-        by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
-        blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
-    if turned := metrics.get("orientations_deg"):
-        bodies = next(iter(turned.values()))
-        by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
-        blocks.append(model_table("Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]))
-    return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
-
-
-def _panels(data: RunReport, trials: TrialResults) -> dict[str, list[int]]:
-    """Rows of the test trials by kind of load; empty if there are no two kinds."""
-    kinds = errors_by_load(data.metrics, data.others)
-    named = {
-        kind: [row for row, n in enumerate(trials.names) if (n in data.others) is (kind == OUTSIDE)] for kind in kinds
-    }
-    return {f"{kind} ({number_of(len(rows), 'trial')})": rows for kind, rows in named.items()}
-
-
-def _error_caption(data: RunReport, window: float | None) -> str:
-    count = len(data.metrics["per_trajectory"])
-    text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
-    if window is not None:
-        text += (
-            f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
-        )
-        text += largest_filtered(data.metrics)
-    elif count > 1:
-        parted = bool(errors_by_load(data.metrics, data.others))
-        text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
-        text += " of a solid line" if data.sees_markers else ""
-        text += " spans the smallest to the largest of them."
-    else:
-        text += "."
-    if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
-        text += " A line ends where the first roll-out has diverged."
-    return unbroken(text)
-
-
-def largest_filtered(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence on the largest filtered error of single trials, by model; empty if it is not known."""
-    largest = metrics.get("median_filtered", {})
-    parts = [f"{mm_text(largest[m])} ({MODELS[m][0]})" for m in MODELS if largest.get(m) is not None]
-    return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

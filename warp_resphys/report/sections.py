@@ -1,7 +1,7 @@
-"""Sections of the page of a run: errors by horizon and by input, its recordings, and how its networks were trained."""
+"""Sections of the page of a run: errors by trial, horizon and input, and its recordings."""
 
+import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -12,6 +12,7 @@ from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
 from ..stepping.quantity import Quantity
 from .data import MODELS, OUTSIDE, RunReport, folds_in, models_in_figures
 from .page import (
+    MINUS,
     NONE,
     Canvas,
     Cell,
@@ -23,17 +24,17 @@ from .page import (
     Text,
     drawn_file,
     error_parts,
+    in_a_row,
     number_text,
     percent_text,
     published_parts,
+    unbroken,
 )
 
+BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
 _CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the one before.
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
-_TRAINED: Final = (
-    "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the lowest."
-)
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
@@ -273,14 +274,37 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Quality of the recordings", [listed, *tables, Text(note, note=True)])
 
 
-def training_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the curves of the trainings, and which weights were kept."""
-    from . import learning_figures
+def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
+    shapes: Mapping[str, Any] = data.metrics.get("shapes", {})
+    if not shapes:
+        return None
+    note = (
+        "Mean distance of the vertices from a target of the same shape, whose motion begins in the same state; below "
+        "it, the share of the uncorrected simulation's error that is removed. A learned force belongs to its mesh, and "
+        "cannot be put on another one."
+    )
+    beyond = [f"{n} ({100.0 * r['outside']:.0f} %)" for n, r in shapes.items() if r.get("outside", 0.0) > BEYOND]
+    outside = "Outside of the stretches that the law was learned at, with the share of cells and times: "
+    texts = [Text(unbroken(f"{outside}{in_a_row(beyond)}."))] if beyond else []
+    return Part("Other bodies of the same material", [shapes_table(shapes, note), *texts])
 
-    blocks: list[Any] = []
-    for model, (name, _) in MODELS.items():
-        if records := data.training.get(model):
-            alt = f"Losses and validation roll-out error of the training of {name}, {len(records)} epochs."
-            draw = partial(learning_figures.training_curves, records)
-            blocks += [Text(name, heading=True), canvas.figure(f"training_{model}", draw, alt, _TRAINED)]
-    return Part("Training", blocks) if blocks else None
+
+def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
+    """Return the errors by body and model, and the shares of the uncorrected simulation's error that are removed."""
+    models, rows = [model for model in MODELS if any(model in r["errors_mm"] for r in shapes.values())], []
+    for name, result in shapes.items():
+        errors, cells = result["errors_mm"], []
+        for model in models:
+            error, base = errors.get(model), errors["simulation"]
+            removed = error is not None and base and model in ("sysid", "law")
+            below = f"removes {share_text(1.0 - error / base)}" if removed else ""
+            cells.append(Cell(number_text(error) if model in errors else NONE, below))
+        rows.append(Row(name, cells, small=f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"))
+    return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
+
+
+def share_text(share: float) -> str:
+    """Return a share as a percentage, with digits for what is left of it."""
+    digits = max(0, -math.floor(math.log10(1.0 - share)) - 1) if 0.9 < share < 1.0 else 0
+    return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)

@@ -1,10 +1,7 @@
-"""Sections of the page of a run on its motion, and on the body and the inputs that drive it."""
+"""The section of the page of a run on the motion in a trial: a film, a view in space, pictures, and the tip."""
 
 from concurrent.futures import Executor, Future
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
@@ -14,21 +11,18 @@ from ..learning.baselines import BASELINES
 from .bodies import ComparedMotion
 from .data import (
     MODELS,
-    Driven,
     Film,
-    FloatArray,
     RunReport,
     TrialResults,
     at_times,
     shown_markers,
     shown_models,
 )
-from .page import Block, Canvas, Drawn, Part, data_address, drawn_file, largest_text, unbroken
+from .page import Block, Canvas, Drawn, Part, data_address, largest_text, unbroken
 from .render import Renderer, draw, hangs, write_film
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the interactive view.
-_SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
 
 
 def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
@@ -136,10 +130,10 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
 
 
 def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours: str, canvas: Canvas) -> Drawn:
-    """Draws the body and its markers at a few instants."""
-    from . import motion_figures
+    """Shows the body at a few instants, each with a second view of its markers."""
+    from . import figures
 
-    frames = canvas.started["pictures"].result()
+    frames = canvas.started["pictures"].result()  # (F, H, 2 W, 4)
     titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
     caption, when = f"{name} at {len(titles)} instants, one with the largest error of the grey body.", ", ".join(titles)
     if len(motion.times) == 1:  # A pose.
@@ -152,99 +146,52 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
     if data.metrics["errors_mm"][last]["diverged"]:
         caption += f" Where {MODELS[last][0]} is not drawn, it has diverged."
     alt = f"The deformed body at {when}, with observed and simulated markers."
-    return canvas.figure("motion", partial(motion_figures.motion_instants, frames, titles), alt, caption)
+    count, height, width, _ = frames.shape
+    figure = figures.new_figure(4.0 * height / width * figures.WIDE / count + 0.35)
+    panels = figure.subplots(2, count, squeeze=False)
+    for row, frame, title in zip(panels.T, frames, titles, strict=True):
+        for axes, picture in zip(row, np.split(frame, 2, axis=1), strict=True):
+            axes.imshow(picture)
+            axes.set_axis_off()
+        row[0].set_title(title)
+    return canvas.figure("motion", figure, alt, caption)
 
 
 def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
-    """Draws the tip over time."""
-    from . import motion_figures
+    """Draws the tip over time and, below it, the distance of each model's tip from that of the target."""
+    from . import figures
 
     if not trials.moves or not len(data.tip):
         return []
     row = trials.worst
     drawn = [m for m in (*BASELINES, "simulation", "sysid", "law", "resphys") if m in trials.positions]
     rest = data.mesh.vertices[data.tip].mean(axis=0)
-    paths = {"target": trials.target[row], **{m: trials.positions[m][row] for m in drawn}}
-    paths = {name: q[:, data.tip].mean(axis=1) - rest for name, q in paths.items()}
-    reached = (f"{MODELS[m][0]} leaves the target by up to {_largest(paths[m] - paths['target'])}" for m in drawn)
+    every = [trials.target, *(trials.positions[m] for m in drawn)]
+    target, *paths = (1e3 * (q[row][:, data.tip].mean(axis=1) - rest) for q in every)  # (T, 3)
+    axis, time = int(np.argmax(np.ptp(target, axis=0))), trials.times[row]
+    figure = figures.new_figure(3.9)
+    motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    motion.plot(time, target[:, axis], color=figures.TONES["target"].light, linewidth=4.0, label="Target")
+    reached = []
+    for model, path in zip(drawn, paths, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            gap = np.linalg.norm(path - target, axis=1)
+        motion.plot(time, path[:, axis], **figures.model_line(model))
+        distance.plot(time, figures.positive(gap), **figures.model_line(model))
+        largest = largest_text(np.where(np.isnan(gap), np.inf, gap))
+        reached.append(f"{MODELS[model][0]} leaves the target by up to {largest}")
+    figures.keep_in_view(motion, target[:, axis], 0.8)
+    motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
+    figures.few_ticks(motion.yaxis, 5)
+    figures.use_logarithm(distance)
+    distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, np.nanmax(time)))
+    figures.legend_above(figure, motion)
     return [
         canvas.figure(
             "tip_displacement",
-            partial(motion_figures.tip_displacement, paths, float(np.median(np.diff(trials.times[row])))),
+            figure,
             f"Tip displacement over time. {'; '.join(reached)}.",
             "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
             "the target’s, on a logarithmic axis.",  # noqa: RUF001
         )
     ]
-
-
-def _largest(differences: FloatArray) -> str:
-    """The largest length of vectors (..., C) [m] as text, where values that are not finite count as infinite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        distances = 1e3 * np.linalg.norm(differences, axis=-1)
-    return largest_text(np.where(np.isnan(distances), np.inf, distances))
-
-
-def body_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the picture of the body with its chambers or tendons, and the inputs."""
-    trials, driven = data.trials, data.driven
-    if trials is None or driven is None:
-        return None
-    quantity, markers = driven.quantity, len(trials.labels)
-    parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
-    dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
-    dark = " Dark: clamped." if len(data.fixed) else ""
-    caption = f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}.{dark}"
-    alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
-
-    def body(path: Path) -> Drawn:
-        from .body_picture import MeshSummary, draw_mesh
-
-        constants = data.settings.simulation.parameters
-        density = fmean(value for name, value in constants.items() if name.endswith("density"))
-        coloured = f"{quantity.per}s".capitalize()
-        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
-        draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
-        return drawn_file(path, alt, caption)
-
-    blocks = canvas.attempt("body.png", body)
-    return Part(f"The body and its {quantity.plural}", [*blocks, *_input_figures(driven, trials, canvas)])
-
-
-def _input_figures(driven: Driven, trials: TrialResults, canvas: Canvas) -> list[Drawn]:
-    """Draws the inputs of a few trials over time, and those of the poses."""
-    from . import motion_figures
-
-    over_time, poses = input_sequences(driven, trials), {}
-    for name in driven.poses:
-        poses[f"{name} (test)" if name in trials.names else name] = driven.values[name]
-    words, per = driven.quantity.plural.capitalize(), driven.quantity.per
-    limit = "" if not driven.limit else f"; dashed, the limit of {driven.quantity.shown(driven.limit)}"
-    whose = "a few trials" if len(driven.values) > 1 else "the trial"
-    what, blocks = f"{words} of {len(driven.channels)} {per}s", []
-    if over_time:
-        drawn = partial(motion_figures.input_sequences, trials.time_step, replace(driven, values=over_time))
-        alt, caption = f"{what} over time: {', '.join(over_time)}.", f"{words} of {whose}{limit}."
-        blocks.append(canvas.figure("inputs", drawn, alt, unbroken(caption)))
-    if poses:
-        drawn = partial(motion_figures.pose_inputs, replace(driven, values=poses))
-        alt, caption = (
-            f"{what} by pose: {', '.join(poses)}.",
-            f"{words} of the poses; unused {per}s are left out{limit}.",
-        )
-        blocks.append(canvas.figure("pose_inputs", drawn, alt, unbroken(caption)))
-    return blocks
-
-
-def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
-    """Return inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
-    values = {name: inputs for name, inputs in driven.values.items() if name not in driven.poses}
-    test = [name for name in trials.names if name in values]
-    others = [name for name in values if name not in test and name not in driven.scaled][:1]
-    highest = sorted(driven.scaled, key=lambda name: float(values[name].max()))[-1:]
-    many = _SEQUENCES - len(others) - len(highest)
-    picked = [test[at] for at in np.unique(np.linspace(0, len(test) - 1, many).round().astype(int))] if test else []
-    titles = {name: f"{name}, a trial of the training" for name in others}
-    titles |= {name: f"{name}, a test trial" for name in picked}
-    titles |= {name: f"{name}, a test trial at higher {driven.quantity.words}" for name in highest}
-    return {title: values[name] for name, title in titles.items()}

@@ -1,0 +1,277 @@
+"""The sections on the body and the inputs that drive it, and on its markers over time."""
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ..learning.baselines import BASELINES
+from ..learning.intervals import Intervals
+from .data import Driven, FloatArray, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
+from .page import Canvas, Drawn, Part, drawn_file, mm_text, unbroken
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Models whose coordinates are drawn, as more would overlap.
+_DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
+_CALIBRATED: Final = {  # Source of prediction intervals.
+    "validation": "the errors in the validation trials",
+    "training": "the errors in the training trials, which tend to be too small",
+    "left_out": "the errors in the training trials, with the parameters identified without each of them",
+    "folds": "the errors of the other folds",
+}
+_MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
+_MOST_DOTS: Final = 75  # Dots along a time axis.
+_BAND: Final = 0.16  # Opacity of prediction intervals.
+_LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
+_LEGEND_ROW: Final = 4  # Largest number of names of chambers in one row.
+_BARS: Final = 0.8  # Height of a pose's bars, over the distance of poses.
+_SEQUENCES: Final = 3  # Trials whose inputs are drawn over time.
+_LIMIT: Final[dict[str, Any]] = {"linewidth": 1.0, "linestyle": (0, (4, 3))}  # Line of the largest allowed input.
+
+
+def body_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the picture of the body with its chambers or tendons, and the inputs."""
+    trials, driven = data.trials, data.driven
+    if trials is None or driven is None:
+        return None
+    quantity, markers = driven.quantity, len(trials.labels)
+    parts = f"{len(driven.channels)} {quantity.per}{'s' if len(driven.channels) > 1 else ''}"
+    dots = f", and the {f'{markers} markers' if markers > 1 else 'marker'} as dots" if markers else ""
+    dark = " Dark: clamped." if len(data.fixed) else ""
+    caption = f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}.{dark}"
+    alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
+
+    def body(path: Path) -> Drawn:
+        from .body_picture import MeshSummary, draw_mesh
+
+        constants = data.settings.simulation.parameters
+        density = fmean(value for name, value in constants.items() if name.endswith("density"))
+        coloured = f"{quantity.per}s".capitalize()
+        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
+        draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
+        return drawn_file(path, alt, caption)
+
+    limit = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
+    what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()
+    blocks = canvas.attempt("body.png", body)
+    if over_time := input_sequences(driven, trials):
+        figure, alt = _sequences(driven, trials.time_step, over_time), f"{what} over time: {', '.join(over_time)}."
+        whose = "a few trials" if len(driven.values) > 1 else "the trial"
+        blocks.append(canvas.figure("inputs", figure, alt, unbroken(f"{words} of {whose}{limit}.")))
+    if driven.poses:
+        caption = f"{words} of the poses; unused {quantity.per}s are left out{limit}."
+        figure, alt = _poses(driven, trials.names), f"{what} by pose: {', '.join(driven.poses)}."
+        blocks.append(canvas.figure("pose_inputs", figure, alt, unbroken(caption)))
+    return Part(f"The body and its {quantity.plural}", blocks)
+
+
+def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
+    """Return inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
+    values = {name: inputs for name, inputs in driven.values.items() if name not in driven.poses}
+    test = [name for name in trials.names if name in values]
+    others = [name for name in values if name not in test and name not in driven.scaled][:1]
+    highest = sorted(driven.scaled, key=lambda name: float(values[name].max()))[-1:]
+    many = _SEQUENCES - len(others) - len(highest)
+    picked = [test[at] for at in np.unique(np.linspace(0, len(test) - 1, many).round().astype(int))] if test else []
+    titles = {name: f"{name}, a trial of the training" for name in others}
+    titles |= {name: f"{name}, a test trial" for name in picked}
+    titles |= {name: f"{name}, a test trial at higher {driven.quantity.words}" for name in highest}
+    return {title: values[name] for name, title in titles.items()}
+
+
+def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatArray]) -> "Figure":
+    """Draws inputs over time, with a panel for each trial."""
+    from . import figures
+
+    figure = figures.new_figure(0.9 + 1.35 * len(sequences))
+    panels = figure.subplots(len(sequences), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for axes, (title, rows) in zip(panels, sequences.items(), strict=True):
+        _inputs(axes, time_step * np.arange(len(rows) + 1, dtype=np.float64), rows, driven, title)
+    panels[-1].set(xlabel="time [s]", xlim=(0.0, time_step * max(map(len, sequences.values()))))
+    _part_legend(figure, driven, range(len(driven.channels)))
+    return figure
+
+
+def _inputs(axes: "Axes", times: FloatArray, rows: FloatArray, driven: Driven, title: str) -> None:
+    """Draws steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
+    from . import figures
+
+    quantity = driven.quantity
+    for values, colour in zip(rows.T, cycle(figures.CHAMBER_COLOURS), strict=False):
+        axes.stairs(quantity.shown_factor * values, times, baseline=None, color=colour, linewidth=1.2)
+    if driven.limit is not None:
+        axes.axhline(quantity.shown_factor * driven.limit, color=figures.TONES["muted"].light, **_LIMIT)
+    axes.set_ylabel(f"{quantity.words} [{quantity.shown_unit}]")
+    axes.set_title(title)
+    figures.few_ticks(axes.yaxis, 4)
+
+
+def _poses(driven: Driven, tested: Sequence[str]) -> "Figure":
+    """Draws the last inputs of each pose as bars beside its name; parts without inputs are left out."""
+    from . import figures
+
+    quantity, names = driven.quantity, [f"{name} (test)" if name in tested else name for name in driven.poses]
+    values = quantity.shown_factor * np.stack([driven.values[name][-1] for name in driven.poses])
+    used = np.flatnonzero(values.any(axis=0))
+    count = max(1, len(used))
+    figure = figures.new_figure(0.9 + len(names) * max(0.25, 0.1 * count))
+    axes = figure.subplots()
+    for place, part in enumerate(used):
+        middle = np.arange(len(names)) + _BARS * ((place + 0.5) / count - 0.5)
+        colour = figures.CHAMBER_COLOURS[part % len(figures.CHAMBER_COLOURS)]
+        axes.barh(middle, values[:, part], 0.9 * _BARS / count, color=colour)
+    if driven.limit is not None:
+        axes.axvline(quantity.shown_factor * driven.limit, color=figures.TONES["muted"].light, **_LIMIT)
+    axes.set_yticks(range(len(names)), names)
+    axes.tick_params(axis="y", length=0, labelcolor=figures.TONES["ink"].light)
+    axes.set(xlabel=f"{quantity.words} [{quantity.shown_unit}]", ylim=(len(names) - 0.5, -0.5))
+    figures.few_ticks(axes.xaxis, 6)
+    axes.grid(visible=False, axis="y")
+    _part_legend(figure, driven, used.tolist() or range(len(driven.channels)))
+    return figure
+
+
+def _part_legend(figure: "Figure", driven: Driven, used: Sequence[int]) -> None:
+    """Draws a legend of the used parts below the figure."""
+    from matplotlib.lines import Line2D
+
+    from . import figures
+
+    colours = figures.CHAMBER_COLOURS
+    handles: list[Any] = [
+        Line2D([], [], color=colours[at % len(colours)], label=driven.channels[at].replace("_", " ")) for at in used
+    ]
+    if driven.limit is not None:
+        handles.append(Line2D([], [], color=figures.TONES["muted"].light, label="limit", **_LIMIT))
+    figure.legend(handles=handles, loc="outside lower left", ncols=_LEGEND_ROW, columnspacing=1.4)
+
+
+def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the coordinates of markers over time; of a driven body, of two of them, with its inputs below."""
+    trials, driven = data.trials, data.driven
+    if trials is None or not trials.labels or not trials.moves:
+        return None
+    rows, blocks = best_and_worst(trials), []
+    for row, place in zip(rows, ("worst", "best"), strict=False):
+        name, target = trials.names[row], trials.target[row]
+        if driven is None:
+            reach = np.nanmax(np.linalg.norm(target - trials.bound, axis=2), axis=0, initial=0.0)
+            shown = shown_markers(target)
+            kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
+            which = "least error" if place == "best" else "largest error"
+            model = "the last model of the table" if place == "worst" else "the same model"
+            caption = f"Trial {name}{f', in which {model} has its {which}' if len(rows) > 1 else ''}: "
+            caption += "coordinates of the markers relative to where they were held."
+            hidden = len(shown) - len(kept)
+            after = f" The {hidden} markers that move least are not drawn." if hidden else ""
+            alt = f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines."
+            models, start = [m for m in _DRAWN if m in trials.positions], trials.bound
+        else:
+            words = driven.quantity.plural
+            kept, after = drawn_markers(target, trials.bound, data.mesh.vertices[data.fixed]), ""
+            caption = f"The trial {name}: displacement of markers from rest, and the {words} that drive it."
+            alt = f"Coordinates of markers over time in the trial {name}, and below them the {words} of the "
+            alt += f"{driven.quantity.per}s."
+            models = [m for m in _DRAWN if m in trials.positions and m != "simulation"] or list(trials.positions)
+            start = np.where(np.isfinite(target[0]), target[0], trials.bound)
+        bands = _bands(data, trials, row, kept)
+        figure = marker_paths(trials, row, kept, models, start, bands, driven)
+        file = f"paths_{place}" if driven is None else "markers"
+        blocks.append(canvas.figure(file, figure, alt, f"{caption}{_band_note(data, bands)}{after}"))
+        if driven is not None:
+            break
+    return Part("Marker by marker", blocks)
+
+
+def marker_paths(
+    trials: TrialResults,
+    row: int,
+    kept: Sequence[int],
+    models: Sequence[str],
+    start: FloatArray,
+    bands: Mapping[str, FloatArray],
+    driven: Driven | None = None,
+) -> "Figure":
+    """Draw coordinates of some markers of a trial, measured as dots, simulated as lines, and below them the inputs.
+
+    Args:
+        trials: Measured and simulated positions.
+        row: Of the trial.
+        kept: Numbers of the markers.
+        models: Whose positions are drawn.
+        start: (M, 3) positions from which all are measured [m].
+        bands: (T, kept) half-widths of prediction intervals [m], by model.
+        driven: Inputs; all panels are then stacked.
+    """
+    from . import figures
+
+    with np.errstate(invalid="ignore", over="ignore"):
+        measured_and_simulated = [trials.target, *(trials.positions[model] for model in models)]
+        target, *paths = (1e3 * (q[row] - start)[:, kept] for q in measured_and_simulated)  # [mm]
+    times, labels, many = trials.times[row], [trials.labels[marker] for marker in kept], len(trials.axes)
+    count, stacked = len(kept), driven is not None
+    rows, columns = (many * count, 1) if stacked else (count, many)
+    figure = figures.new_figure(2.9 + 0.95 * many * count if stacked else 0.9 + 1.25 * count)
+    ratios = [1.0] * rows + [1.5] * stacked
+    panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
+    least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
+    every = -(-len(times) // _MOST_DOTS)
+    dots: dict[str, Any] = {"color": figures.TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
+    for place, axes in enumerate(panels[:rows].flat):
+        marker, column = divmod(place, many)
+        axis = trials.axes[column]
+        seen = target[:, marker, axis]
+        axes.plot(times[::every], seen[::every], ".", **dots)
+        for model, path in zip(models, paths, strict=True):
+            moved = np.where(np.abs(path[:, marker, axis]) < figures.LARGEST_SHOWN, path[:, marker, axis], np.nan)
+            axes.plot(times, moved, **figures.model_line(model, 1.1))
+            if model in bands:
+                ends = [moved + sign * 1e3 * bands[model][:, marker] for sign in (-1.0, 1.0)]
+                colour = figures.TONES[model].light
+                axes.fill_between(times, *ends, color=colour, alpha=_BAND, linewidth=0.0, zorder=0.5)
+        figures.keep_in_view(axes, seen, 0.6, least)
+        figures.few_ticks(axes.yaxis, 4)
+        if column == 0 or stacked:
+            axes.set_ylabel(f"{'xyz'[axis] if stacked else labels[marker]} [mm]")
+        if column == 0 if stacked else marker == 0:
+            axes.set_title(f"Marker {labels[marker]}" if stacked else "xyz"[axis])
+    if driven is not None:
+        title = driven.quantity.plural.capitalize()
+        _inputs(panels[-1, 0], times, driven.values[trials.names[row]], driven, title)
+        _part_legend(figure, driven, range(len(driven.channels)))
+    for axes in panels[-1]:
+        axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))
+    figure.align_ylabels(panels[:, 0])
+    figures.legend_above(figure, panels[0, 0])
+    return figure
+
+
+def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
+    """Half-widths (T, M) [m] of the prediction intervals of some markers, of the last model with intervals."""
+    intervals = data.metrics.get("intervals", {}).get("models", {})
+    since = None if trials.since is None else trials.since[row]
+    for model in ("resphys", "law", "sysid"):
+        own = Intervals.from_plain(intervals.get(model))
+        if own is not None and model in trials.positions:
+            spread = trials.spreads[model][row] if model in trials.spreads else None
+            return {model: own.half_widths(trials.positions[model][row], trials.bound, since, spread)[:, kept]}
+    return {}
+
+
+def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:
+    """What the prediction intervals of the drawn band should contain, and what they contain in all test trials."""
+    if not bands:
+        return ""
+    intervals = data.metrics["intervals"]
+    (own,) = (intervals["models"][model] for model in bands)
+    return (
+        f" The band should contain {100.0 * intervals['level']:.0f} % of the measured coordinates, and contains "
+        f"{100.0 * own['coverage']:.0f} % of them; it is ± {mm_text(own['half_width_mm'])} wide on average, from "
+        f"{_CALIBRATED[intervals['calibrated_on']]}."
+    )

@@ -1,0 +1,130 @@
+"""The section on the errors over time, of each marker and of each rigid body."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ..io.errors import number_of
+from ..learning.metrics import median_filter
+from .data import INSIDE, MODELS, OUTSIDE, FloatArray, RunReport, errors_by_load
+from .page import Canvas, Part, largest_text, mm_text, unbroken
+from .sections import model_table, numbers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FILTER: Final = 1.0  # Window of the median filter [s], as published.
+_LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
+_BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
+
+
+def error_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Return the errors over time, of each trial and of each marker."""
+    trials, metrics = data.trials, data.metrics
+    if trials is None:
+        return None
+    blocks: list[Any] = []
+    if trials.moves:
+        times = np.nanmean(trials.times, axis=0)
+        window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
+        of = "marker" if data.sees_markers else "vertex"
+        reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
+        alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
+        panels: dict[str, Any] = {"": slice(None)}
+        if errors_by_load(metrics, data.others):
+            inside = np.array([name not in data.others for name in trials.names])
+            by_load = {INSIDE: inside, OUTSIDE: ~inside}
+            panels = {f"{kind} ({number_of(rows.sum(), 'trial')})": rows for kind, rows in by_load.items()}
+        figure = error_over_time(trials.errors_mm, times, of, window, panels)
+        blocks.append(canvas.figure("error_over_time", figure, alt, _error_caption(data, window)))
+    if by_model := metrics.get("per_marker"):
+        shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
+        by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
+        blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
+    if turned := metrics.get("orientations_deg"):
+        bodies = next(iter(turned.values()))
+        by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
+        blocks.append(model_table("Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]))
+    return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
+
+
+def error_over_time(
+    errors: Mapping[str, FloatArray],
+    times: FloatArray,
+    of: str = "vertex",
+    window: float | None = None,
+    panels: Mapping[str, Any] | None = None,
+) -> "Figure":
+    """Draw each model's mean error over time and, for the main models, the range of the trials.
+
+    Args:
+        errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
+        times: (T,) [s].
+        of: What is observed: "vertex" or "marker".
+        window: Of a median filter [s], for long trials: the filtered error is drawn instead of the range, and the
+            unfiltered one as a thin line. None for no filter.
+        panels: Rows of the trials of each panel, by title; by default one panel has all trials.
+    """
+    from . import figures
+
+    groups = panels or {"": slice(None)}
+    figure, lowest = figures.new_figure(3.5), list[float]()
+    every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
+    for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
+        for model, own in errors.items():
+            mean, line = mean_of_trials(own[rows]), figures.model_line(model)
+            shown = figures.positive(mean)
+            if window is not None:
+                axes.plot(times, shown, color=line["color"], linewidth=0.6, alpha=0.45)
+                shown = figures.positive(median_filter(mean, float(times[1] - times[0]), window))
+                settled = shown[len(shown) // 10 :]
+                lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
+            elif len(own[rows]) > 1 and (model == "sysid" or line["linestyle"] == "-"):
+                low, high = (figures.positive(extreme.reduce(own[rows], axis=0)) for extreme in (np.fmin, np.fmax))
+                axes.fill_between(times, low, high, color=line["color"], alpha=0.15, linewidth=0)
+            axes.plot(times, shown, **line)
+        axes.set(title=title, xlabel="time [s]", xlim=(0.0, times[-1]))
+    if len(groups) > 1:
+        figure.set_layout_engine("constrained", wspace=_BETWEEN)
+        figures.few_ticks(every[0, 0].xaxis, 5)
+    for axes in every.flat:  # Once everything is drawn, as they share their axis.
+        figures.use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
+    every[0, 0].set_ylabel(f"mean {of} error [mm]")
+    figures.legend_above(figure, every[0, 0])
+    return figure
+
+
+def mean_of_trials(rows: FloatArray) -> FloatArray:
+    """Return the mean (T,) over trials (R, T), without NaN; infinite where one diverged, NaN where all are NaN."""
+    held = ~np.isnan(rows)
+    count = held.sum(axis=0)
+    mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _error_caption(data: RunReport, window: float | None) -> str:
+    count = len(data.metrics["per_trajectory"])
+    text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
+    if window is not None:
+        text += (
+            f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
+        )
+        text += largest_filtered(data.metrics)
+    elif count > 1:
+        parted = bool(errors_by_load(data.metrics, data.others))
+        text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
+        text += " of a solid line" if data.sees_markers else ""
+        text += " spans the smallest to the largest of them."
+    else:
+        text += "."
+    if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
+        text += " A line ends where the first roll-out has diverged."
+    return unbroken(text)
+
+
+def largest_filtered(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on the largest filtered error of single trials, by model; empty if it is not known."""
+    largest = metrics.get("median_filtered", {})
+    parts = [f"{mm_text(largest[m])} ({MODELS[m][0]})" for m in MODELS if largest.get(m) is not None]
+    return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""

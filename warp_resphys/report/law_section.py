@@ -9,7 +9,7 @@ import numpy as np
 from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
-from .data import MODELS, FloatArray, RunReport
+from .data import FloatArray, RunReport
 from .identification_section import Wording, digits, parameter_wording
 from .page import (
     NONE,

@@ -99,7 +99,6 @@ def command_line() -> argparse.ArgumentParser:
     linear = ["banded", "sparse", "multigrid", "pardiso"]
     sizes.add_argument("--linear-solvers", nargs="+", choices=LINEAR_SOLVERS, default=linear)
     sizes.add_argument("--refinements", nargs="+", type=float, default=[1.0, 2.0, 3.0, 4.0, 5.0])
-    sizes.add_argument("--longest", type=float, default=150.0, help="time of a case [s]; larger ones are left out")
     follow = parts.add_parser("twin", parents=[shared], help="a twin that follows the trials of a run")
     follow.set_defaults(measure=twin.measure_twin)
     follow.add_argument("run", type=Path)

@@ -1,14 +1,11 @@
 """A step of an experiment's body, forward and backward: by solver, material, refinement, batch and linear solver."""
 
 import argparse
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -17,9 +14,7 @@ import torch
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.experiment.build import build_body, build_simulator, choose_device, finer
-from warp_resphys.io.files import read_json
 from warp_resphys.io.memory import peak_memory_gib
-from warp_resphys.io.progress import Progress
 from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
 from warp_resphys.settings.body import MaterialSettings
@@ -38,12 +33,10 @@ MATERIALS: Final[Mapping[str, Mapping[str, Any]]] = {
 BATCHES: Final[Mapping[str, Sequence[int]]] = {"cpu": (1, 4, 16), "cuda": (1, 16, 256, 1024, 4096)}
 FLOOR: Final = ("obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004]}", "contact.friction=0.3")
 STEPS: Final = "a step of the whole batch"
-_SCRIPT: Final = Path(__file__).parents[1] / "benchmark.py"
 _DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
 _MODULI: Final[tuple[str, ...]] = ("youngs_modulus", "c10")  # by the first of which gradients are taken
 _TIP_MASS: Final = 0.1  # [kg]
 _PRESSURE: Final = 2e4  # [Pa]
-_FITTED: Final = 3  # largest sizes, to which exponents are fitted
 
 
 @dataclass(frozen=True)
@@ -144,8 +137,6 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
         steps.append({**head, "unknowns": free_unknowns(rollout.simulator), **times, **relative})
         parts.append({**head, **part_times(rollout.simulator, batch, arguments.repeats)})
-    if len(cases) == 1:
-        steps[0]["memory_gib"] = peak_memory_gib()  # of this process
     tables: dict[str, Any] = {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
     if arguments.run is not None:
         counts = arguments.batches or (1, 16, 64)
@@ -201,45 +192,13 @@ def environments(run: Path, counts: Sequence[int], repeats: int, device: str) ->
 
 
 def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Times a body that starts straight, by size and linear solver, each case in a process with its own memory.
-
-    Where a case fails or takes too long, larger ones of its linear solver are left out.
-    """
-    tables, kinds = dict[str, Any](), [*product(arguments.materials, arguments.linear_solvers)]
-    fixed = ["--straight", "--steps=2", f"--device={arguments.device}", f"--repeats={arguments.repeats}"]
-    with Progress("sizes", len(kinds) * len(arguments.refinements), "cases") as progress:
-        for material, linear in kinds:
-            rows, failure = Rows(), ""
-            for refinement in arguments.refinements:
-                case = [f"solver.linear_solver={linear}", f"--materials={material}", f"--refinements={refinement}"]
-                if not failure:
-                    measured, failure = alone([*arguments.settings, *case, *fixed], arguments.longest)
-                    rows += measured
-                progress.advance()
-            powers = ", ".join(f"{name} {power:.2f}" for name, power in exponents(rows).items())
-            tables[f"{material}, {linear}; exponents: {powers or 'not known'}{failure}"] = rows
-    return tables
-
-
-def alone(words: Sequence[str], longest: float) -> tuple[Rows, str]:
-    """Returns the row of `measure_steps` in a new process, or none and why it failed."""
-    with TemporaryDirectory() as folder:
-        command = [sys.executable, str(_SCRIPT), "step", *words, "--solvers=quasi_newton", f"--output={folder}"]
-        try:
-            run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=longest)
-        except subprocess.TimeoutExpired:
-            return Rows(), f"; the next takes more than {longest:g} s"
-        if run.returncode:
-            return Rows(), f"; the next: {[f'exit code {run.returncode}', *run.stderr.splitlines()][-1]}"
-        (written,) = Path(folder).iterdir()
-        return read_json(written)["step"][STEPS], ""
-
-
-def exponents(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Returns exponents of times and memory over the number of unknowns, fitted to the three largest sizes."""
-    largest = rows[-_FITTED:]
-    if len(largest) < 2:
-        return {}
-    size = np.log([row["unknowns"] for row in largest])
-    names = ("plain_ms", "backward_ms", "memory_gib")
-    return {name: float(np.polyfit(size, np.log([row[name] for row in largest]), 1)[0]) for name in names}
+    """Times a body that starts straight, by linear solver and size, one case after the other."""
+    arguments.straight, arguments.floor, arguments.steps, rows = True, False, 2, Rows()
+    settings = arguments.settings
+    for material, linear, refinement in product(arguments.materials, arguments.linear_solvers, arguments.refinements):
+        arguments.settings = [*settings, f"solver.linear_solver={linear}"]
+        rollout = rollout_of(arguments, "quasi_newton", material, refinement, 1)
+        head = {"material": material, "linear_solver": linear, "unknowns": free_unknowns(rollout.simulator)}
+        ((times,), _) = take_turns(f"{linear} {refinement:g}", [rollout.measure], arguments.repeats)
+        rows.append({**head, **times, "memory_gib": peak_memory_gib()})  # of this process, so far
+    return {"a step by size": rows}

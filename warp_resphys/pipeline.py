@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
@@ -66,10 +66,10 @@ from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
-from .report.control_section import controller_name
-from .report.data import errors_by_load, other_trials, trial_errors
-from .report.page import number_text, ratio_text
-from .report.sections import shapes_table
+from .report.control_section import tracking_table
+from .report.data import trial_errors
+from .report.page import PageTable, number_text, ratio_text
+from .report.sections import horizon_table, scale_table, shapes_table
 from .report.verdict import known_errors, standings, verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
@@ -98,8 +98,6 @@ from .settings.stages import (
 from .settings.trials import Split, Trial
 
 log = logging.getLogger(__name__)
-
-_MOST_COLUMNS = 5  # largest number of folds that are shown as columns in a terminal
 
 Work = Callable[[StageContext], None]
 
@@ -385,62 +383,37 @@ def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
-    """Prints a table of errors, with columns for folds, horizons and input scales, and the conclusions."""
-    whole = metrics["errors_mm"]
-    folds = {trial: fold["errors_mm"] for trial, fold in metrics.get("folds", {}).items()}
-    columns = folds if len(folds) <= _MOST_COLUMNS else {}
-    columns |= {f"first {seconds} s": errors for seconds, errors in metrics.get("horizons", {}).items()}
-    columns |= {f"{scale} x": errors for scale, errors in metrics.get("scales", {}).items()}
-    columns |= {kind.lower(): errors for kind, errors in errors_by_load(metrics, other_trials(run)).items()}
-    columns = {name: errors for name, errors in columns.items() if errors != whole}
+    """Prints the errors, by model and in the tables of the report, and the conclusions."""
     what = "vertices" if run.markers is None else "markers"
-    title = f"Error of the {what} in the test trials" + "; x: times the inputs" * ("scales" in metrics)
     places = standings(known_errors(trial_errors(metrics)))
-    heads = ("mean, mm", "90 % interval", "vs. best other", *columns, "diverged")
-    table = Table(Column("model", min_width=max(map(len, whole))), *heads, title=title)
-    for model, summary in whole.items():
-        means = [number_text(errors[model]["mean"]) if model in errors else "" for errors in columns.values()]
+    table = Table("model", "mean, mm", "90 % interval", "vs. best other", "diverged")
+    table.title = f"Error of the {what} in the test trials"
+    for model, summary in metrics["errors_mm"].items():
         interval, ratio = places.get(model, (None, None))
         shown = (
             "" if interval is None else " to ".join(map(number_text, interval)),
             "" if ratio is None else ratio_text(ratio),
         )
-        table.add_row(model, number_text(summary["mean"]), *shown, *means, str(summary["diverged"]))
+        table.add_row(model, number_text(summary["mean"]), *shown, str(summary["diverged"]))
     console = Console()
     console.print(table)
-    if folds and not columns:
-        by_trial = Table("left out", *whole, title="Error of each trial [mm]")
-        for trial, errors in folds.items():
-            by_trial.add_row(trial, *(number_text(errors[model]["mean"]) for model in whole))
-        console.print(by_trial)
-    for model, outside in metrics.get("range", {}).items():
-        if outside["left"]:
-            first = min(outside["first_s"].values())
-            console.print(f"{model}: {outside['left']} test trials leave the training range, from {first:.2f} s on.")
-    if metrics.get("control"):
-        console.print(_driven(metrics["control"]["tracking"]))
-    if "noise_mm" in metrics:
-        console.print(f"The noise of the markers alone is {number_text(metrics['noise_mm'])} mm.")
-    if metrics.get("shapes"):
-        console.print(_of_shapes(metrics["shapes"]))
+    tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
+    for further in (
+        horizon_table(metrics, {}),
+        scale_table(metrics.get("scales", {})),
+        tracking_table(tracking) if tracking else None,
+        shapes_table(shapes) if shapes else None,
+    ):
+        if further is not None:
+            console.print(_in_terminal(further))
     for sentence in verdict(metrics, run):
         console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 
 
-def _of_shapes(shapes: Mapping[str, Any]) -> Table:
-    """Table of the errors on other bodies."""
-    shown = shapes_table(shapes)
-    table = Table("body", *shown.columns, title=f"{shown.head}, and the share that is removed")
-    for row in shown.rows:
-        table.add_row(row.head, *(f"{cell.text}{cell.small.replace('removes', ',')}" for cell in row.cells))
-    return table
-
-
-def _driven(tracking: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Table of the controllers' errors, by the duration of the paths."""
-    columns = [f"in {float(seconds):g} s [mm]" for seconds in tracking]
-    table = Table("controller", *columns, title="Mean distance from the paths")
-    for name in next(iter(tracking.values())):
-        table.add_row(controller_name(name), *(number_text(errors[name]["mean_mm"]) for errors in tracking.values()))
+def _in_terminal(page: PageTable) -> Table:
+    """A table of a page."""
+    table = Table(page.head, *page.columns)
+    for row in page.rows:
+        table.add_row(row.head, *(" ".join(filter(None, cell)) for cell in row.cells))
     return table

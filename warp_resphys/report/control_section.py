@@ -28,7 +28,7 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     metrics, control = data.metrics.get("control") or {}, data.settings.control
     if not metrics or control is None:
         return None
-    blocks: list[Any] = [Text(_task(control), "control"), _table(metrics["tracking"])]
+    blocks: list[Any] = [Text(_task(control), "control"), tracking_table(metrics["tracking"])]
     slowest = max(control.seconds)
     drawn = [followed for followed in data.followed if followed.seconds == slowest]
     if drawn:
@@ -107,7 +107,8 @@ def _task(control: ControlSettings) -> str:
     )
 
 
-def _table(tracking: Mapping[str, Any]) -> PageTable:
+def tracking_table(tracking: Mapping[str, Any]) -> PageTable:
+    """Returns the errors of the controllers by the duration of the paths."""
     first = next(iter(tracking.values()))
     best = min(first, key=lambda controller: float(first[controller]["mean_mm"]))
 

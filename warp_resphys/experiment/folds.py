@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from ..io.errors import ResphysError
 from ..io.fan_out import ALONE, WorkerError, Workers, fan_out
 from ..io.progress import Progress
-from ..io.stages import Stage, StageInterrupted, run_stages, up_to_date
+from ..io.stages import Stage, StageInterrupted, run_stages, unfinished
 
 Stages = Callable[[Workers], list[Stage]]
 
@@ -43,7 +43,7 @@ def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
         WorkerError: a fold failed; the other folds keep their results.
         StageInterrupted: Ctrl-C; all folds keep their results.
     """
-    left = [fold for fold in folds.values() if not up_to_date(fold.stages(ALONE), fold.folder)]
+    left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
     if workers.alone or len(left) <= 1:
         with threadpool_limits(1):
             for fold in left:

@@ -31,6 +31,7 @@ from .settings import packages_of
 
 log = logging.getLogger(__name__)
 
+_VALID, _CHANGED = "up to date", "settings changed"  # states of an earlier run
 _PLANNED = "stages.json"  # settings of all stages of the last command
 _PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
 
@@ -100,7 +101,10 @@ def run_stages(
         _plan(stages, Path(run_dir) / _PLANNED)
         for stage, context in _contexts(stages, Path(run_dir)):
             try:
-                took = _valid_seconds(stage, context)
+                took, state = _earlier(stage, context)
+                if state:
+                    expected = state in (_VALID, _CHANGED)
+                    log.log(logging.INFO if expected else logging.WARNING, "%s: %s", stage.name, state)
                 seconds[stage.name] = _run_stage(stage, context) if took is None else took
             except KeyboardInterrupt as error:
                 kept = f"finished and kept: {', '.join(seconds)}; " if seconds else ""
@@ -121,21 +125,9 @@ def _plan(stages: Sequence[Stage], path: Path) -> None:
         write_json(path, planned)
 
 
-def up_to_date(stages: Sequence[Stage], run_dir: str | Path) -> bool:
-    """Whether `run_stages` would run no stage."""
-    return all(_valid_seconds(stage, context) is not None for stage, context in _contexts(stages, Path(run_dir)))
-
-
 def unfinished(stages: Sequence[Stage], run_dir: str | Path) -> list[Stage]:
-    """Returns the stages without a record of the same settings; their outputs are not checked."""
-    return [stage for stage, context in _contexts(stages, Path(run_dir)) if _is_unfinished(stage, context)]
-
-
-def _is_unfinished(stage: Stage, context: StageContext) -> bool:
-    path = _record(context.run_dir, stage.name)
-    with suppress(DataFileError):
-        return not path.is_file() or read_json(path).get("fingerprint") != context.fingerprint
-    return True
+    """Returns the stages that `run_stages` would run."""
+    return [stage for stage, context in _contexts(stages, Path(run_dir)) if _earlier(stage, context)[0] is None]
 
 
 def _contexts(stages: Sequence[Stage], run_dir: Path) -> Iterator[tuple[Stage, StageContext]]:
@@ -249,26 +241,21 @@ def _identity(path: Path) -> dict[str, Any]:
     return {"bytes": status.st_size, "modified_ns": status.st_mtime_ns, "sha256": digest(path)}
 
 
-def _valid_seconds(stage: Stage, context: StageContext) -> float | None:
-    """The duration of an earlier run whose outputs are still valid, or None."""
+def _earlier(stage: Stage, context: StageContext) -> tuple[float | None, str]:
+    """The duration of an earlier run whose outputs are still valid, or None; and its state in words."""
     path = _record(context.run_dir, stage.name)
     if not path.is_file():
-        return None
+        return None, ""
     try:
         record = read_json(path)
         if record["fingerprint"] != context.fingerprint:
-            log.info("%s: settings changed", stage.name)
-            return None
+            return None, _CHANGED
         changed = [name for name in stage.outputs if not _is_same(context.run_dir / name, record["outputs"][name])]
-        seconds = float(record["seconds"])
+        if changed:
+            return None, f"missing or changed since they were written: {', '.join(changed)}"
+        return float(record["seconds"]), _VALID
     except (DataFileError, KeyError, TypeError, ValueError) as error:
-        log.warning("%s: its record cannot be used (%s: %s)", stage.name, type(error).__name__, error)
-        return None
-    if changed:
-        log.warning("%s: missing or changed since they were written: %s", stage.name, ", ".join(changed))
-        return None
-    log.info("%s: up to date", stage.name)
-    return seconds
+        return None, f"its record cannot be used ({type(error).__name__}: {error})"
 
 
 def _is_same(path: Path, identity: Mapping[str, Any]) -> bool:

@@ -24,10 +24,10 @@ from typing import Any, Final
 
 import yaml
 
+from warp_resphys.commands import run_label
 from warp_resphys.data.recordings.segment import convert_segment
 from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_json, write_text
-from warp_resphys.io.labels import run_label
 from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
 from warp_resphys.learning.baselines import BASELINES

@@ -23,9 +23,8 @@ from pydantic import ConfigDict
 from support.command_line import outcome
 from support.main_job import end_of
 from warp_resphys import __version__, cli, commands, launch
-from warp_resphys.commands import NOBODY_READS
+from warp_resphys.commands import NOBODY_READS, run_label
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.labels import run_label
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
 from warp_resphys.io.stages import StageInterrupted
@@ -424,7 +423,7 @@ class TestProcess:
         out, err = self.start(config_dir, heavy, "--help").communicate(timeout=60)
         assert "\nexperiment: beam_" in out
         names = out.splitlines()[-1].removeprefix("imported: ").split()
-        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.imports", ".io.labels")
+        ours = ("", ".cli", ".commands", ".conf", ".io", ".io.errors", ".io.imports")
         assert set(names) == {f"warp_resphys{name}" for name in ours}
         assert err == ""
 

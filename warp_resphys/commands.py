@@ -5,6 +5,7 @@ A command is one word or two: ``view``, ``view film``. This module imports only 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
@@ -17,9 +18,9 @@ from types import MappingProxyType
 from typing import Final
 
 from .io.errors import InputError, did_you_mean
-from .io.labels import OWN_OPTIONS
 
 CONFIG_PACKAGE: Final = "warp_resphys.conf"
+OWN_OPTIONS: Final = "configs"  # in the working directory: groups of the configuration and their options
 USER_ERROR: Final = 2  # exit code of an error that the user can fix
 NOBODY_READS: Final = 141  # exit code where the reader of the output has closed the pipe: 128 + SIGPIPE
 
@@ -87,6 +88,7 @@ VALUED: Final = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--info", "-i", "--experimental-rerun"),
 )
+_LABEL_LENGTH: Final = 100
 _PLAIN: Final = re.compile(r"[\w./-]+")  # a word without special characters of Hydra's syntax
 _OPTIONS: Final = """\
 --cfg job         show all keys and their values, for these settings
@@ -179,3 +181,31 @@ def _groups() -> list[str]:
     for path in [path for place in places for path in place.glob("*/*.yaml")]:
         options.setdefault(path.parent.name, set()).add(path.stem)
     return [f"{group}: {', '.join(sorted(names))}" for group, names in sorted(options.items())]
+
+
+def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+    """Names a run folder after its overrides; an OmegaConf resolver.
+
+    The order of the overrides does not matter, so that a repeated command finds its own files.
+
+    Args:
+        overrides: Hydra's task overrides, such as "material.density=900".
+        excluded: Keys that do not change the results, or that are part of the path already, with all keys below them.
+
+    Returns:
+        "key=value,key=value" sorted by key, or "default" without overrides. Long names, and names with unsuitable
+        characters, are shortened or replaced and end in a hash of the whole.
+    """
+    settings = {}
+    for override in overrides:
+        key, _, value = override.removeprefix("++").partition("=")
+        bare = key.lstrip("+~")
+        if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
+            settings[key] = f"{key}={value}" if value else key
+    whole = ",".join(settings[key] for key in sorted(settings))
+    if not whole:
+        return "default"
+    label = re.sub(r"[^A-Za-z0-9._=,+~-]", "-", whole)
+    if label == whole and len(label) <= _LABEL_LENGTH:
+        return label
+    return f"{label[:_LABEL_LENGTH]}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"

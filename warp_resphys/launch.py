@@ -31,11 +31,17 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from .commands import CONFIG_PACKAGE, USER_ERROR, configuration, ends_where_nobody_reads
+from .commands import (
+    CONFIG_PACKAGE,
+    OWN_OPTIONS,
+    USER_ERROR,
+    configuration,
+    ends_where_nobody_reads,
+    run_label,
+)
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
-from .io.labels import OWN_OPTIONS, run_label
 from .io.settings import parse
 
 INTERRUPTED: Final = 130

@@ -24,7 +24,6 @@ def test_the_package_imports_without_the_modules_of_unix():
         "kernel_cache",
         "machine",
         "memory",
-        "resumable",
         "stages",
     ]
     program = f"""

@@ -12,7 +12,7 @@ import torch
 
 from warp_resphys.io import files
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.resumable import is_final, resume_checkpoint
+from warp_resphys.io.files import is_final, resume_checkpoint
 
 REPOSITORY = Path(__file__).parents[2]
 TENSORS = {"weight": torch.arange(6.0).reshape(2, 3).T}

@@ -12,9 +12,8 @@ from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN,
 from ..experiment.parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.files import write_checkpoint, write_json
+from ..io.files import resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..mesh.motion_files import input_columns, write_csv
 from ..robot.loading import load

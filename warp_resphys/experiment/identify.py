@@ -12,9 +12,8 @@ import torch
 
 from ..data.rigid_bodies import corners_of, independent
 from ..io.errors import ConvergenceError
-from ..io.files import write_checkpoint, write_json
+from ..io.files import resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.bounds import Bounds, Prior
 from ..learning.identification import Identifier, ParameterSearch

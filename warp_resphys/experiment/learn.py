@@ -11,9 +11,8 @@ from typing import Any
 import torch
 
 from ..dynamics.modes import RestStiffness
-from ..io.files import read_array, read_hdf5, write_checkpoint, write_json
+from ..io.files import read_array, read_hdf5, resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.resumable import resume_checkpoint
 from ..io.stages import StageContext
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state

@@ -18,10 +18,9 @@ from threadpoolctl import threadpool_limits
 
 from ..io.errors import InputError
 from ..io.fan_out import Workers, fan_out
-from ..io.files import atomic_hdf5, create, read_array, read_hdf5
+from ..io.files import atomic_hdf5, create, is_final, read_array, read_hdf5
 from ..io.machine import available_cores
 from ..io.progress import Progress
-from ..io.resumable import is_final
 from ..io.stages import StageContext
 from ..settings.run import ParallelSettings
 from ..stepping.state import State

@@ -1,14 +1,15 @@
 """Reads and writes JSON, HDF5, NumPy and safetensors files, none of which can run code when it is opened.
 
 All are written atomically. HDF5 files are built in memory first, because the HDF5 library cannot close a file on a full
-disk and crashes the interpreter at exit; a file should fit into memory two or three times. `resumable` writes the
-results of long computations while they run.
+disk and crashes the interpreter at exit; a file should fit into memory two or three times. Interrupted work resumes
+from checkpoints.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import struct
 import tokenize
 import zipfile
@@ -27,6 +28,8 @@ from .errors import DataFileError
 
 if TYPE_CHECKING:
     import torch
+
+log = logging.getLogger(__name__)
 
 FORMAT = "warp_resphys"
 FORMAT_VERSION = 1
@@ -291,3 +294,30 @@ def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, tor
         raise DataFileError(
             f"{path} is not a complete safetensors file ({error}): delete it and run the same command again"
         ) from error
+
+
+def is_final(path: Path, kind: str, fingerprint: str) -> bool:
+    """Whether an HDF5 file with this fingerprint exists.
+
+    Raises:
+        DataFileError: the file is damaged, or of another program.
+    """
+    if not path.is_file():
+        return False
+    with read_hdf5(path, kind) as file:
+        return str(file.attrs.get("fingerprint")) == fingerprint
+
+
+def resume_checkpoint(path: Path, kind: str, fingerprint: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]] | None:
+    """Reads a checkpoint of work with this fingerprint; None if there is none that can be used."""
+    if not path.exists():
+        return None
+    try:
+        tensors, metadata = read_checkpoint(path, kind)
+    except DataFileError as error:
+        log.warning("a checkpoint cannot be used: %s", error)
+        return None
+    if metadata.get("fingerprint") != fingerprint:
+        log.warning("%s is not used: it belongs to other settings", path)
+        return None
+    return tensors, metadata

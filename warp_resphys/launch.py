@@ -196,11 +196,11 @@ def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
 
 def _show(config: DictConfig, key: str) -> None:
     """Prints the settings of a run, with the defaults of all keys that are not in a YAML file."""
-    from .io.setting_errors import completed
-    from .settings.run import RunSettings, filled
+    from .settings.run import RunSettings
 
-    values = filled(OmegaConf.to_container(config, resolve=True))
-    whole = OmegaConf.create(completed(RunSettings.model_json_schema(), values))
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    run = {name: value for name, value in values.items() if name != "tune"}
+    whole = OmegaConf.create({**values, **parse(RunSettings, run).plain()})
     chosen = OmegaConf.select(whole, key) if key else whole
     print(OmegaConf.to_yaml(chosen).rstrip() if OmegaConf.is_config(chosen) else chosen)
 

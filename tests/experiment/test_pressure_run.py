@@ -197,7 +197,7 @@ def recorded(tmp_path, finished, change):
         (["data.cutoff=80.0"], "data.cutoff"),
         (["data.input_scales=[1.5]", "data.folder=run/recordings", "data.test=[t003]"], "recordings have their own"),
         (["laboratory.time_step=0.003"], "the first must be a multiple of the second"),
-        (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "but fibres is null"),
+        (["+identify.parameters.fibre_stiffness={lower:1.0,upper:2.0}"], "names 'fibre_stiffness': choose from"),
         (["laboratory.sequences.correlation=[[1.0],[0.0]]"], "correlation is "),
         (["+identify.first_guess.pressure=0.04"], "identify.first_guess"),
         (["reconstruction=lbfgsb", "+reconstruction.modes=4"], "reconstruction.method=lbfgsb has none"),

@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from support.configured import composed
+from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import MeshError
-from warp_resphys.io.settings import parse
 from warp_resphys.mesh.arm import mesh_arm
 from warp_resphys.mesh.arm_geometry import ArmGeometry
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
-from warp_resphys.settings.mesh import MeshGroup
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
 SHAPES = [
@@ -81,7 +79,7 @@ def area(polygon):
 
 
 def configured(*overrides):
-    return parse(MeshGroup, {"mesh": composed(*overrides)["mesh"]}).mesh
+    return settings(*overrides).mesh
 
 
 @pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])

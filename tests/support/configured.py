@@ -7,17 +7,16 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.io.setting_errors import completed
 from warp_resphys.io.settings import parse
 from warp_resphys.launch import freed
-from warp_resphys.settings.run import RunSettings, filled
+from warp_resphys.settings.run import RunSettings
 
 
 @functools.cache
 def _composed(*overrides):
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
         plain = OmegaConf.to_container(compose("config", freed(overrides)), resolve=True)
-    return completed(RunSettings.model_json_schema(), filled(plain))
+    return parse(RunSettings, plain).plain()
 
 
 def composed(*overrides):

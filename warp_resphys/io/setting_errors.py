@@ -162,28 +162,6 @@ def _range(node: Schema) -> str:
     return f"a {noun}{f' {words}' if words else ''}"
 
 
-def completed(schema: Schema, values: Any, node: Schema | None = None) -> Any:
-    """Adds the defaults of all omitted keys; invalid values are returned unchanged.
-
-    Args:
-        schema: JSON Schema of the class.
-        values: nested plain data.
-        node: JSON Schema of the values; that of the class if omitted.
-    """
-    if not isinstance(values, Mapping):
-        return values
-    choices = [option for option in options(schema, schema if node is None else node) if option.get("type") == "object"]
-    option: Schema = next((option for option in choices if _fits(option, values)), {})
-    named, other = option.get("properties", {}), option.get("additionalProperties")
-    defaults = {key: member["default"] for key, member in named.items() if "default" in member and key not in values}
-
-    def below(key: str, value: Any) -> Any:
-        member = named.get(key, other)
-        return completed(schema, value, member) if isinstance(member, Mapping) else value
-
-    return {key: below(key, value) for key, value in {**values, **defaults}.items()}
-
-
 def _path(values: Any, error: ErrorDetails) -> Path:
     """Keys that lead to an error, without pydantic's names of types; for a list member, the path of the list."""
     path: list[str | int] = []

@@ -2,44 +2,30 @@
 
 import contextlib
 import csv
-import json
-import signal
-from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.configured import check, composed
-from support.main_job import run
+from support.main_job import finish
 from warp_resphys import box_hexahedra, select_vertices
-from warp_resphys.experiment import ablation
-from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.mesh.mesh import surface_vertices
 from warp_resphys.report.ablation_page import verdict
 
 COUNTS = [1, 4, 33, 42]
 TINY = [
-    "experiment=marker_ablation",
-    "mesh.divisions=[4,2,2]",
-    "data.steps=8",
-    f"ablation.counts={COUNTS}".replace(" ", ""),
-    "ablation.draws=5",
-    "ablation.processes=1",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-    "hydra.run.dir=run",
+    *("experiment=marker_ablation", "mesh.divisions=[4,2,2]", "data.steps=8", "ablation.draws=5"),
+    *(f"ablation.counts={COUNTS}".replace(" ", ""), "ablation.processes=1"),
 ]
-SURFACE = surface_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)))
-CLAMPED = select_vertices(box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)), x=0.0)
+BEAM = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+SURFACE, CLAMPED = surface_vertices(BEAM), select_vertices(BEAM, x=0.0)
 
 
-def rows(folder="run"):
-    return json.loads((Path(folder) / "metrics.json").read_text())["by_markers"]
+def rows(folder):
+    return read_json(folder / "metrics.json")["by_markers"]
 
 
-def errors(folder="run"):
+def errors(folder):
     return np.array([row["errors_mm"] for row in rows(folder)])
 
 
@@ -47,12 +33,11 @@ def errors(folder="run"):
 def finished(tmp_path_factory):
     root = tmp_path_factory.mktemp("ablation")
     with contextlib.chdir(root):
-        assert run(*TINY)[0] == 0
-    return root / "run"
+        return root / finish(*TINY)
 
 
 def test_more_markers_leave_less_error_and_spread(finished):
-    results = json.loads((finished / "metrics.json").read_text())
+    results = read_json(finished / "metrics.json")
     assert results["uncorrected_mm"] > 0.3
     medians = [row["median_mm"] for row in rows(finished)]
     assert np.diff(medians).max() <= 1e-9 * medians[0]  # The last count only adds markers that cannot move.
@@ -90,66 +75,13 @@ def test_the_table_is_that_of_the_stored_distances(finished):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_and_a_set_does_not_depend_on_the_other_counts(finished, folder, monkeypatch):
-    step = ablation._FromMarkers.step
-
-    def interrupted(march, number):
-        if (march._count, number) == (1, 3):
-            signal.raise_signal(signal.SIGINT)
-        return step(march, number)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    with monkeypatch.context() as patch:
-        patch.setattr(ablation._FromMarkers, "step", interrupted)
-        assert run(*TINY)[0] == 130
-    signal.signal(signal.SIGINT, before)
-    reconstructed = Counter()
-
-    def counted(march, number):
-        reconstructed[march._count] += 1
-        return step(march, number)
-
-    monkeypatch.setattr(ablation._FromMarkers, "step", counted)
-    assert run(*TINY)[0] == 0
-    assert reconstructed == {1: 8}  # The largest sets come first, and are kept.
-    np.testing.assert_allclose(errors(), errors(finished), rtol=1e-6)
-    assert run(*TINY)[0] == 0
-    assert reconstructed.total() == 8
-    assert run(*TINY, "ablation.counts=[4]")[0] == 0
-    np.testing.assert_allclose(errors(), errors(finished)[1:2], rtol=1e-6)
-    assert run(*TINY, "ablation.counts=[4]", "seed=1")[0] == 0
-    assert np.abs(errors() / errors(finished)[1:2] - 1.0).max() > 0.01
-
-
-@pytest.mark.slow
-def test_processes_give_the_same_numbers_in_the_same_order_and_do_not_count_as_a_change(finished, folder):
-    assert run(*TINY, "ablation.processes=2")[0] == 0
-    assert rows() == rows(finished)
-    with (
-        read_hdf5("run/ablation.h5", "marker ablation") as file,
-        read_hdf5(finished / "ablation.h5", "marker ablation") as serial,
-    ):
-        for name in ("count", "markers", "error", "misfit"):
-            np.testing.assert_array_equal(file[name][:], serial[name][:])
-    written = Path("run/ablation.h5").stat().st_mtime_ns
-    assert run(*TINY, "ablation.processes=3")[0] == 0
-    assert Path("run/ablation.h5").stat().st_mtime_ns == written
-
-
-@pytest.mark.parametrize(
-    ("overrides", "key"),
-    [
-        ("ablation.counts=[1,43]", "ablation.counts"),
-        ("ablation.counts=[2,2]", "ablation.counts"),
-        ("ablation.modes=1000", "1000 vibration modes were asked for, but the body has 1 to 108."),
-        ("data.weights_g.observed=[50,70]", "data.weights_g.observed"),
-        ("reconstruction=lbfgsb ablation.modes=4", "reconstruction.method"),
-    ],
-)
-def test_bad_input(overrides, key):
-    with pytest.raises(InputError) as told:
-        check(composed(*TINY, *overrides.split()))
-    assert key in str(told.value)
+def test_a_set_depends_on_the_seed_and_neither_on_the_other_counts_nor_on_processes(finished, folder):
+    assert rows(finish(*TINY, "ablation.processes=2")) == rows(finished)
+    written = (folder / "run" / "ablation.h5").stat().st_mtime_ns
+    assert (finish(*TINY, "ablation.processes=3") / "ablation.h5").stat().st_mtime_ns == written
+    np.testing.assert_allclose(errors(finish(*TINY, "ablation.counts=[4]")), errors(finished)[1:2], rtol=1e-6)
+    other = errors(finish(*TINY, "ablation.counts=[4]", "seed=1"))
+    assert np.abs(other / errors(finished)[1:2] - 1.0).max() > 0.01
 
 
 def test_verdict_looks_from_the_largest_number_of_markers_down():

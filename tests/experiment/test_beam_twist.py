@@ -67,13 +67,3 @@ def test_the_quick_budget_picks_evenly(experiment, unit, factor):
             assert np.diff(places).min() >= 1
         chosen = np.array([getattr(full.amounts, name)[place] for place in places])
         np.testing.assert_allclose([amounts[name] for name in picked], factor * chosen)
-
-
-@pytest.mark.parametrize(("limit", "picked"), [(1, [10]), (3, [10, 30, 50]), (9, [10, 20, 30, 40, 50])])
-def test_limits(limit, picked):
-    row = [10, 20, 30, 40, 50]
-    angles = f"data.angles_deg={{train: {row}, validation: [60], test: [70]}}"
-    split = split_of(
-        settings("experiment=beam_twist", angles, f"data.limit={{train: {limit}, validation: 1, test: 1}}")
-    )
-    assert split.train == tuple(f"{angle}°" for angle in picked)

@@ -1,6 +1,6 @@
 """Recordings of a body, real or simulated, become markers in its frame; what cannot is refused by file and marker."""
 
-import json
+import copy
 import re
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
 from warp_resphys.experiment.trials import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
@@ -41,10 +41,6 @@ SMALL = [
     "laboratory.validation=[]",
     "laboratory.test=[m90]",
 ]
-
-
-def read_json(path):
-    return json.loads(path.read_text())
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +102,7 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     assert max(abs(x) for shift in registration["shift_mm"].values() for x in shift) < 0.1
 
 
-def test_a_laboratory_binds_its_markers_as_they_are_configured():
-    """Whatever changes where markers go makes its recordings anew."""
+def test_what_binds_markers_makes_the_recordings_anew():
     changes = ("markers.bind=patch", "markers.patch=0.05", "markers.largest_distance=0.03")
     made = [acquisition_stages(settings("experiment=beam_real", *SMALL, *changes[:count]))[0] for count in range(4)]
     assert len({fingerprint(stage, {}) for stage in made}) == 4
@@ -213,6 +208,10 @@ def test_a_trial_with_markers_of_its_own(shelf):
     for name, own in {"bare": "Tip - 2", "load52": "Tip - 2", "load101": "Tip - 4"}.items():
         shelf.config["data"]["trials"][name]["labels"] = ["Tip - 1", own, "Tip - 3", *BASES]
     check(shelf.config)
+    wrong = copy.deepcopy(shelf.config)
+    wrong["data"]["trials"]["load52"]["labels"] = ["a", "b", "c", *BASES]
+    with pytest.raises(InputError, match=r"load52\.labels names 'a', .* none of which is in markers\.trac"):
+        check(wrong)
     shelf.learned = ["bare", "load52"]
     results = shelf.bring_in()
     assert list(results["labels"]) == [*TIPS, "Tip - 4"]
@@ -234,14 +233,6 @@ def test_a_trial_with_markers_of_its_own(shelf):
     assert read_dataset(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
 
 
-def test_a_trial_whose_labels_are_all_wrong_is_named(shelf):
-    shelf.config["data"]["trials"]["load52"]["labels"] = ["a", "b", "c", *BASES]
-    with pytest.raises(
-        InputError, match=r"data\.trials\.load52\.labels names 'a', .* none of which is in markers\.trac"
-    ):
-        check(shelf.config)
-
-
 def published_layout(shelf, name, first):
     """The recording from a frame on, with the places of its markers on the undeformed body."""
     positions = shelf.recordings[name].positions
@@ -260,6 +251,9 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     np.testing.assert_allclose(results["times"], np.broadcast_to(np.arange(41) / RATE, (3, 41)), atol=1e-9)
     np.testing.assert_allclose(results["observed"][2], whole["observed"][2, 3:44], rtol=0.0, atol=5e-5)
     assert np.linalg.norm(results["held"] - results["bound"], axis=2).min() > 5e-4
+    rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
+    shelf.write("load52", positions=still(shelf, 5e-5), rest=rest)
+    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that count")
 
 
 def refuse(shelf, message, error=DataFileError):
@@ -342,25 +336,12 @@ def test_chosen_markers_register(shelf):
         shelf.bring_in()
 
 
-def test_recordings_in_which_nothing_moves_are_named(shelf):
-    """Also those that begin with the release, of which none is looked for."""
-    for name in shelf.recordings:
-        published_layout(shelf, name, first=44)
-    shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
-    rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
-    shelf.write("load52", positions=still(shelf, 5e-5), rest=rest)
-    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that count")
-
-
-def test_a_wrong_vertical_is_noticed(shelf):
+def test_a_wrong_vertical_and_a_body_that_is_too_short_are_noticed(shelf):
     shelf.config["data"]["up"] = "-x"
     refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
-
-
-def test_a_marker_far_from_the_body_is_named(shelf):
+    shelf.config["data"]["up"] = "x"
     shelf.config["mesh"]["size"] = [0.06, 0.03, 0.03]
-    shelf.config["markers"]["bind"] = "normal"
-    shelf.config["markers"]["bind_to"] = None
+    shelf.config["markers"] |= {"bind": "normal", "bind_to": None}
     refuse(shelf, r"Marker 'Tip - \d' is \d\d\.\d mm from the surface", InputError)
 
 

@@ -1,7 +1,12 @@
 """The main job through its command line: `warp-resphys` with a small beam, a few steps and a few epochs."""
 
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+from collections import Counter
 from pathlib import Path
 
 import meshio
@@ -22,13 +27,17 @@ from support.main_job import (
     STAGES,
     TINY,
     errors,
+    files,
+    finish,
     metrics,
+    ran,
     run,
     same_errors,
 )
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment import models
 from warp_resphys.experiment.build import build_simulator
+from warp_resphys.experiment.parts import PartRollout
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
@@ -36,37 +45,31 @@ from warp_resphys.io.stages import fingerprint, package_versions
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.networks import ResidualForce
 from warp_resphys.learning.predictors import LearnedPredictor
+from warp_resphys.learning.reconstruction import LBFGSB
+from warp_resphys.learning.training import EpochTrainer
+
+LEARNED_FILES = (("", "safetensors"), ("training_", "json"))
 
 
 class TestCompleteRun:
-    def test_files(self, finished):
+    def test_files_and_metrics(self, finished):
         names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
         names = {name for name in names if not name.startswith("figures/")}
-        data = {"dataset.h5", "reconstruction_resphys.h5", "rollouts.h5", "resphys.safetensors"}
-        data |= {
-            "training_resphys.json",
-            "simfree.safetensors",
-            "training_simfree.json",
-            "times.json",
-            "reconstruction.json",
-        }
-        assert names == data | {"errors.json", "metrics.json", "report.html", "stages.json"}
-
-    def test_metrics(self, finished):
+        learned = {f"{kind}{model}.{end}" for model in ("resphys", "simfree") for kind, end in LEARNED_FILES}
+        data = {"dataset.h5", "reconstruction_resphys.h5", "reconstruction.json", "rollouts.h5", "times.json"}
+        assert names == data | learned | {"errors.json", "metrics.json", "report.html", "stages.json"}
         results = metrics(finished[0])
         keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
         keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
-        keys |= {"first_guesses", "baselines"}
-        assert set(results) == keys
+        assert set(results) == keys | {"first_guesses", "baselines"}
         assert set(results["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
         assert set(results["errors_mm"]) == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
-        assert set(results["errors_vs_reconstruction_mm"]) == {*BASELINES, "simulation", "resphys", "simfree"}
+        assert set(results["errors_vs_reconstruction_mm"]) == set(results["errors_mm"]) - {"reconstruction"}
         assert results["baselines"].keys() == {*BASELINES}
         assert list(results["seconds"]) == STAGES
         assert 0.1 < results["peak_memory_gib"] < 4.0
         assert results["versions"] == package_versions()
         assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(results["versions"])
-        assert results["device"] in ("cpu", "cuda")
         assert [trial["name"] for trial in results["per_trajectory"]] == ["70 g", "150 g"]
 
     def test_the_correction_corrects(self, finished):
@@ -172,16 +175,38 @@ class TestOtherRuns:
         assert results["reconstruction"]["mean"] < 0.1 * results["simulation"]["mean"]
         assert results["resphys"]["mean"] < 0.5 * results["simulation"]["mean"]
 
-    def test_multirun(self, finished, folder):
-        """The same seed gives the same numbers in another folder, and another seed others."""
+    def test_seeds_of_a_multirun_give_other_networks_of_the_same_data(self, folder):
         code, err = run("--multirun", "seed=0,1", *TINY)
         assert (code, "Traceback" in err) == (0, False)
-        folders = sorted(Path("runs/beam_oscillation").glob("*/metrics.json"))
-        results = [errors(path.parent) for path in folders]
-        seeds = [OmegaConf.load(path.parent / ".hydra" / "config.yaml").seed for path in folders]
-        same_errors(results[seeds.index(0)], errors(finished[0]))
-        assert results[0] != results[1]
-        same_errors(*(metrics(path.parent)["errors_mm"]["simulation"]["mean"] for path in folders))
+        folders = [path.parent for path in Path("runs/beam_oscillation").glob("*/metrics.json")]
+        first, second = map(errors, folders)
+        assert first != second
+        same_errors(*(metrics(folder)["errors_mm"]["simulation"]["mean"] for folder in folders))
+
+    def test_the_same_seed_gives_the_same_numbers_in_another_process(self, finished, folder):
+        """Of two threads and another order of sets."""
+        environment = {**os.environ, "PYTHONHASHSEED": "2", "OMP_NUM_THREADS": "2"}
+        command = [sys.executable, "-m", "warp_resphys", *TINY, IN_RUN]
+        subprocess.run(command, env=environment, check=True, capture_output=True, timeout=300)
+        first, second = (numbers(metrics(place)) for place in (finished[0], "run"))
+        assert sum(isinstance(value, float) for value in first.values()) >= 14
+        assert second.keys() == first.keys()
+        for key, value in first.items():
+            wanted = pytest.approx(value, rel=1e-6, abs=0.0) if isinstance(value, float) else value
+            assert second[key] == wanted, key
+
+    def test_a_mesh_from_a_file_is_told_by_its_content(self, folder, finished):
+        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        tolerance = ["+fixed.tolerance=1e-6", "+data.load.tolerance=1e-6"]
+        arguments = [*SHORT, "mesh=file", "mesh.path=box.vtu", "mesh.units=cm", *tolerance]
+        finish(*arguments)
+        np.testing.assert_allclose(errors()[:2], errors(finished[0])[:2], rtol=0.05)
+        before = files()
+        box = box_hexahedra((0.1, 0.03, 0.03), (3, 2, 2))
+        meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
+        finish(*arguments)
+        assert ran(before) == STAGES
 
     def test_a_diverged_roll_out_is_counted_and_is_no_number(self, finished, copied, monkeypatch):
         """The second of two test trajectories gets a force that is not finite at its fifth step."""
@@ -205,6 +230,16 @@ class TestOtherRuns:
         with read_hdf5("run/rollouts.h5", "rollouts") as file:
             results = file["resphys_observed"][:]
         assert np.isnan(results).all((2, 3)).tolist() == [13 * [False], 5 * [False] + 8 * [True]]
+
+
+def numbers(data, place=""):
+    """Every entry of metrics by where it stands, but for times, memory and versions."""
+    if place in ("/seconds", "/seconds_per_test_trajectory", "/peak_memory_gib", "/versions"):
+        return {}
+    entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else None
+    if entries is None:
+        return {place: data}
+    return {k: v for key, value in entries for k, v in numbers(value, f"{place}/{key}").items()}
 
 
 def options(group):
@@ -240,11 +275,6 @@ class TestConfiguration:
         else:
             check(composed(*overrides))
 
-    @pytest.mark.parametrize("option", FROM_MARKERS)
-    def test_reconstructions_from_markers_are_refused_where_whole_states_are_known(self, option):
-        with pytest.raises(InputError, match=r"reconstruction\.method"):
-            check(composed(f"reconstruction={option}"))
-
     def test_published_sizes_and_settings(self):
         run = settings("physics=published", "network=published", "trainer=published")
         assert build_simulator(run, run.simulation).body.n_vertices * 3 == 528
@@ -257,3 +287,100 @@ class TestConfiguration:
         assert (trainer.schedule, trainer.gamma, trainer.step_epochs) == ("step", 0.83, 100)
         assert trainer.selection == "validation_loss"
         assert dict(run.physics) == {"mass": "per_vertex", "volume_integration": "full"}
+
+
+class Interruption:
+    """Sends a signal to this process at a chosen step or epoch, and counts the work done."""
+
+    def __init__(self, monkeypatch):
+        self.at, self.signal = None, signal.SIGINT
+        self.done = Counter()
+        arrays, run_epoch = PartRollout.arrays, EpochTrainer.run_epoch
+
+        def interrupted_arrays(rollout, report):
+            def counted(**shown):
+                report(**shown)
+                self.count(type(rollout).__name__)
+
+            return arrays(rollout, counted)
+
+        def interrupted_epoch(trainer):
+            record = run_epoch(trainer)
+            self.count("epochs")
+            return record
+
+        monkeypatch.setattr(PartRollout, "arrays", interrupted_arrays)
+        monkeypatch.setattr(EpochTrainer, "run_epoch", interrupted_epoch)
+
+    def count(self, kind):
+        self.done[kind] += 1
+        if self.at == (kind, self.done[kind]):
+            signal.raise_signal(self.signal)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_report")
+class TestInterruption:
+    @pytest.fixture
+    def interruption(self, monkeypatch):
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield Interruption(monkeypatch)
+        signal.signal(signal.SIGINT, before)
+
+    def test_ctrl_c_in_every_stage(self, folder, interruption):
+        """The last time by SIGTERM, with which clusters end a process."""
+        arguments = [*TINY, "integrator=bdf2"]
+        assert run(*arguments, "hydra.run.dir=whole")[0] == 0
+        whole = Counter(interruption.done)
+        assert whole == {"_FreeMotion": 13, "_OfTrials": 13, "epochs": 80, "ModelRollout": 39}
+        interruption.done.clear()
+        cuts = {"_FreeMotion": ("simulate", 1), "_OfTrials": ("reconstruct_resphys", 7)}
+        cuts |= {"epochs": ("train_resphys", 25), "ModelRollout": ("evaluate", 18)}
+        for kind, (stage, at) in cuts.items():
+            interruption.at, interruption.signal = (kind, at), signal.SIGTERM if stage == "evaluate" else signal.SIGINT
+            code, err = run(*arguments, IN_RUN)
+            assert code == 130
+            assert f"interrupted in stage '{stage}'" in err
+            assert "the same command resumes there" in err
+            assert "Traceback" not in err
+            assert not Path("run/metrics.json").exists()
+            assert not list(Path("run").rglob("*.partial"))
+        interruption.at = None
+        assert run(*arguments, IN_RUN)[0] == 0
+        repeated = interruption.done - whole
+        assert repeated.pop("epochs", 0) <= 1  # the epoch that the signal fell into
+        assert repeated == {"_FreeMotion": 1, "_OfTrials": 7, "ModelRollout": 18 - 13}  # the first model is kept
+        same_errors(errors(), errors("whole"))
+        assert not list(Path("run").glob("*_parts"))
+        assert not list(Path("run").glob("train_*.safetensors"))
+
+    def test_each_frame_starts_from_the_force_of_the_one_before(self, folder, monkeypatch):
+        guesses, step = [], LBFGSB.step
+
+        def recorded(self, state, observed, inputs=None, first_guess=None):
+            guesses.append(first_guess)
+            return step(self, state, observed, inputs, first_guess)
+
+        monkeypatch.setattr(LBFGSB, "step", recorded)
+        arguments = [*TINY, IN_RUN, "reconstruction=lbfgsb", "data.steps=4"]
+        assert run(*arguments)[0] == 0
+        with read_hdf5("run/reconstruction_resphys.h5", "reconstruction") as file:
+            np.testing.assert_array_equal(np.stack(guesses, axis=1), file["force"][:, :-1])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["solver.max_iterations=1", *TINY], "the newton solver stopped after 1 iterations"),
+        ([*SHORT, "mesh=file", "mesh.path=box.vtu"], "box.vtu: "),
+    ],
+)
+def test_what_fails_costs_one_sentence_and_leaves_nothing_half_made(folder, overrides, said):
+    code, err = run(*overrides, IN_RUN)
+    (line,) = [line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in STAGES))]
+    assert code == 2
+    assert line.startswith("error: ")
+    assert said in line
+    written = {path.name for path in Path("run").rglob("*") if path.is_file()} if Path("run").exists() else set()
+    assert not written & {"metrics.json", "report.html", "resphys.safetensors", "rollouts.h5"}
+    assert not [name for name in written if name.endswith(".partial")]

@@ -1,25 +1,39 @@
-"""Obstacles from a configuration: contact of the body and of its target, and robots that keep them."""
+"""Contact from a configuration: obstacles, which may move, and surfaces of the body; robots that keep it."""
 
+from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 
-from support.configured import check, composed, settings
+from support.configured import settings
+from support.main_job import run_without_report
+from support.played_run import check_robots
+from warp_resphys import Body
+from warp_resphys.data.base_motion import prescribed, rigid
+from warp_resphys.data.obstacle_motion import contact_inputs, recorded
+from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.energies.contact import Contact
-from warp_resphys.energies.obstacles import HalfSpace
+from warp_resphys.energies.obstacles import Box, HalfSpace, Sphere
+from warp_resphys.energies.surfaces import FrictionPair, SurfaceContact
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
+from warp_resphys.experiment.files import read_dataset
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings
-from warp_resphys.io.errors import InputError
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.files import read_json
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report.identification_section import parameter_wording
+from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
+from warp_resphys.robot.twin.full import FullEstimator
 from warp_resphys.settings.body import SimulatorSettings
-from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.settings.trials import MotionSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
 
@@ -28,13 +42,18 @@ FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
 TWO = (
     "{floor: {shape: half_space, position: [0, 0, -0.05]}, ball: {shape: sphere, position: [0, 0, 0.1], radius: 0.01}}"
 )
+LOWER = "{mesh: {kind: box_hexahedra, size: [0.1, 0.03, 0.06], divisions: [4, 1, 1]}, shift: [0.0, 0.0, -0.062]}"
+ABOVE = (BEAM, f"parts={{lower: {LOWER}}}", "self_contact={friction: 0.3, distance: 5e-4, stiffness: 2e4}")
+
+
+def simulator_of(*overrides):
+    run = settings(*overrides)
+    return build_simulator(run, run.simulation)
 
 
 def test_regions_of_the_body_have_factors_of_friction():
     run = settings(
-        "mesh.divisions=[10,3,3]",
-        f"obstacles={FLOOR}",
-        "+regions={foot: {x: [0.09, 0.1]}}",
+        *("mesh.divisions=[10,3,3]", f"obstacles={FLOOR}", "+regions={foot: {x: [0.09, 0.1]}}"),
         "contact={friction: 0.2, friction_factors: {foot: 3.0}}",
     )
     body = build_body(run)
@@ -46,45 +65,19 @@ def test_regions_of_the_body_have_factors_of_friction():
         build_simulator(run.changed(contact=run.contact.changed(friction_factors={"hand": 1.0})), run.simulation)
 
 
-def test_without_obstacles_there_is_no_contact():
-    assert build_body(settings(BEAM)).energies == ()
-
-
 def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
     run = settings(BEAM, f"obstacles={FLOOR}", "contact={friction: 0.3}", "target.contact={friction: 0.6}")
     (played,) = build_body(target_settings(run, run.target)).energies
     assert isinstance(played, Contact)
     assert played.obstacles == {"floor": HalfSpace(position=(0.0, 0.0, -0.005))}
     assert (played.friction, build_contact(run).friction) == (0.6, 0.3)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        (["contact={friction: 0.5}"], r"contact is set, but obstacles has none: name an obstacle"),
-        (
-            [f"obstacles={FLOOR}", "contact={friction: {wall: 0.5}}"],
-            r"values for 'wall', but the obstacles are 'floor'",
-        ),
-        ([f"obstacles={TWO}", "contact={stiffness: {ball: 1e5}}"], r"contact\.stiffness has values for 'ball'"),
-        (["obstacles={floor: {shape: half_space, axis: [0, 0, 0]}}"], r"obstacles\.floor\.axis"),
-        (["obstacles={floor: {shape: half_space, position: [0, 0, 0.01]}}"], r"within the obstacle 'floor' at rest"),
-    ],
-)
-def test_obstacles_that_do_not_fit_are_refused(given, said):
-    with pytest.raises(InputError, match=said):
-        check(composed(BEAM, *given))
-
-
-def test_a_run_with_control_is_refused():
-    floor = "{floor: {shape: half_space, position: [0, 0, -0.5]}}"
-    with pytest.raises(InputError, match="reduced model, which has no contact"):
-        check(composed("experiment=tendon_rod_control", f"obstacles={floor}"))
+    truth = true_contact(settings("experiment=beam_obstacle"))
+    assert truth["contact_friction"] == 0.5
+    assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
 
 
 def test_parameters_have_a_name_for_each_obstacle():
-    run = settings(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
-    simulator = build_simulator(run, run.simulation)
+    simulator = simulator_of(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
     assert {"contact_friction", "contact_friction_floor", "obstacle_x_ball", "obstacle_turn_y_floor"} <= {
         *identifiable_parameters(simulator)
     }
@@ -92,46 +85,30 @@ def test_parameters_have_a_name_for_each_obstacle():
     assert constants["contact_friction"].tolist() == [[0.1, 0.7], [0.1, 0.8]]
 
 
-def test_the_truth_of_a_laboratory_is_by_parameter():
-    truth = true_contact(settings("experiment=beam_obstacle"))
-    assert truth["contact_friction"] == 0.5
-    assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
+def robot_of(run, parameters):
+    mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
+    return Robot(Description("beam", "sysid", SimulatorSettings.of(run), run.simulation, mesh, parameters))
 
 
 @pytest.fixture(scope="module")
 def robot():
     run = settings(BEAM, f"obstacles={FLOOR}", "contact={friction: 0.4}", "integrator=bdf2")
-    described = Description(
-        "beam",
-        "sysid",
-        SimulatorSettings.of(run),
-        run.simulation,
-        box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1)),
-        {"obstacle_z": 1e-3, "contact_friction": 0.2},
-    )
-    return Robot(described)
+    return robot_of(run, {"obstacle_z": 1e-3, "contact_friction": 0.2})
 
 
-def test_a_robot_rests_and_falls_on_its_obstacle(robot):
+def test_a_robot_rests_and_falls_on_its_obstacle_and_keeps_it_in_its_file(robot, tmp_path):
     """A floor 4 mm below the beam, which bends 8 mm under its weight."""
-    lowest = float(robot.settle().q[0, :, 2].min())
-    assert -4e-3 < lowest < -3e-3
-    assert float(robot.with_parameters(obstacle_z=-0.1).settle().q[0, :, 2].min()) < -6e-3
-    state = robot.begin()
-    for _ in range(30):
-        state = robot.step(state)
-        assert float(state.q[0, :, 2].min()) > -4e-3
-
-
-def test_a_saved_robot_keeps_its_obstacles(robot, tmp_path):
     path = tmp_path / "robot.safetensors"
     robot.description.write(path)
     loaded = Robot(Description.read(path))
     (contact,) = loaded.simulator.body.energies
     assert contact == build_contact(robot.description.settings)
+    assert -4e-3 < float(robot.settle().q[0, :, 2].min()) < -3e-3
+    assert float(robot.with_parameters(obstacle_z=-0.1).settle().q[0, :, 2].min()) < -6e-3
     state, again = robot.begin(), loaded.begin()
-    for _ in range(12):
+    for _ in range(30):
         state, again = robot.step(state), loaded.step(again)
+        assert float(state.q[0, :, 2].min()) > -4e-3
     np.testing.assert_array_equal(again.q, state.q)
 
 
@@ -148,30 +125,109 @@ def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):
     np.testing.assert_allclose(moved, np.tile([0.0, 0.0, -1e-3 / live.size], (8, 1)), atol=1e-6)
 
 
-@pytest.mark.slow
-def test_the_tentacle_curls_around_its_post_and_not_onto_itself():
-    """It goes through the place of the post where that is elsewhere, and lies on it otherwise, far from itself."""
-    run = settings("experiment=tentacle_wrap", "mesh.layers=8")
-    simulator, post = build_simulator(run, run.simulation), run.obstacles["post"]
-    vertices = simulator.body.mesh.vertices
-    ends = {}
-    for name, shift in {"around": 0.0, "alone": 1.0}.items():
-        constants = simulator.prepare({"obstacle_x": simulator.tensor([[shift]])})
-        state = simulator.rest_state()
-        for number in range(100):
-            tension = simulator.tensor([[run.data.input_limit * min(number / 80, 1.0), 0.0]])
-            before, inputs = state, Inputs(tendon_tension=tension)
-            state, _ = simulator.step(state, inputs, constants)
-        ends[name] = state.q[0].numpy()
-        if name == "around":
-            forces = simulator.contacts(before, state, inputs, constants)[""]
-    away = {name: np.linalg.norm((q - post.position)[:, [0, 2]], axis=1) - post.radius for name, q in ends.items()}
-    assert away["alone"].min() < -5e-3
-    assert 0.0 < away["around"].min() < run.contact.distance
-    assert float(forces.normal.sum((1, 2))[0, 0]) < -0.1  # N: it pulls itself against the post.
-    layers = np.unique(vertices[:, 2].round(6))
-    line = np.stack([ends["around"][np.isclose(vertices[:, 2], z, atol=1e-5)].mean(axis=0) for z in layers])
-    tip = line[0] - line[1]
-    assert tip[2] > 0.7 * np.linalg.norm(tip)  # The tip points up, where it hangs down at rest.
-    far = np.abs(layers[:, None] - layers) > 0.08
-    assert np.linalg.norm(line[:, None] - line, axis=2)[far].min() > 0.03
+class TestSurfaces:
+    def test_contact_is_an_energy_of_the_body_whose_parameters_can_be_identified(self):
+        assert build_body(settings(*ABOVE)).energies == (SurfaceContact(2e4, 0.3, 5e-4, 1e-3),)
+        assert build_body(settings(BEAM)).energies == ()
+        simulator = simulator_of(*ABOVE)
+        assert {"surface_friction", "surface_stiffness"} <= {*identifiable_parameters(simulator)}
+        given = {"surface_friction": torch.tensor([0.1, 0.7], dtype=torch.float64)}
+        assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.1], [0.7]]
+        assert parameter_wording("surface_friction")[:2] == ("Friction between surfaces", "")
+
+    def test_friction_of_pairs_of_regions_is_configured_and_identified(self):
+        pairs = "self_contact.pairs={pad: {first: lower, second: body, friction: 0.8}}"
+        simulator = simulator_of(*ABOVE, pairs)
+        (contact,) = simulator.body.energies
+        assert contact.pairs == {"pad": FrictionPair("lower", "body", 0.8)}
+        given = {"surface_friction_pad": torch.tensor([0.5, 0.6], dtype=torch.float64)}
+        assert given.keys() <= {*identifiable_parameters(simulator)}
+        assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.3, 0.5], [0.3, 0.6]]
+        assert parameter_wording("surface_friction_pad")[0] == "Friction between surfaces, 'pad'"
+        with pytest.raises(InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"):
+            build_body(settings(*ABOVE, pairs.replace("body", "shell")))
+
+    def test_a_beam_lies_on_another_one(self):
+        """The upper beam bends more than the thicker one below: in equilibrium its end lies on it."""
+        upper, gaps = torch.arange(20 + 20) < 20, []
+        for given in (ABOVE, ABOVE[:2]):
+            simulator = simulator_of(*given, "integrator=bdf2")
+            q, end = simulator.static_equilibrium().q[0], simulator.rest_positions[:, 0] > 0.09
+            gaps.append(float(q[upper & end, 2].min() - q[~upper & end, 2].max()))
+        touching, free = gaps
+        assert free < -1e-3 < 0.0 < touching < 1e-3
+
+    def test_a_twin_refuses_it(self):
+        with pytest.raises(InputError, match="contact between surfaces"):
+            FullEstimator(robot_of(settings(BEAM, "self_contact={friction: 0.3}", "integrator=bdf2"), {}), {})
+
+
+def swing(**more):
+    swings = {"a": {"frequency": 1.0, "translation": (0.01, 0.0, -0.02), "rotation": (0.2, 0.3, -0.1)}}
+    return parse(MotionSettings, {"swings": swings, **more})
+
+
+def shown(poses, places, rate=100.0, labels=("ball",)):
+    """A recording of points fixed to an obstacle."""
+    points = rigid(poses).apply(np.broadcast_to(places, (len(poses), *np.shape(places))))
+    return Recording((*labels, "tip"), np.concatenate([points, points[:, :1]], axis=1), rate, Path("motion.h5"))
+
+
+class TestMotions:
+    def test_inputs_of_contact_move_obstacles_rigidly(self):
+        """A turn about a point outside of the obstacle moves its corners as it moves points of space."""
+        box = Box(edges=(0.02, 0.03, 0.04), position=(0.05, 0.01, -0.1), axis=(0.3, 0.2, 1.0), moves=True)
+        obstacles = {"still": Sphere(radius=0.01, position=(0.0, 0.0, 1.0)), "box": box}
+        body = Body(box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1)), energies=[Contact(obstacles)])
+        poses = prescribed(swing(about=(0.02, 0.0, 0.03)), np.linspace(0.0, 1.0, 7))
+        rest = ObstacleSurface.of(body)
+        moved = rest.moved(contact_inputs(body, {"box": poses}))
+        still, corners = (np.flatnonzero(rest.owners == number) for number in (0, 1))
+        np.testing.assert_array_equal(moved.points[:, still], np.broadcast_to(rest.points[still], (7, len(still), 3)))
+        expected = rigid(poses).apply(np.broadcast_to(rest.points[corners], (7, len(corners), 3)))
+        np.testing.assert_allclose(moved.points[:, corners], expected, atol=1e-15)
+        assert np.ptp(expected, axis=0).max() > 0.02
+        np.testing.assert_array_equal(moved.at(3).points, moved.points[3])
+
+    def test_a_marker_shows_a_translation_and_a_rigid_body_a_turn(self):
+        poses = prescribed(swing(start=0.1, ramp=0.1), np.arange(100) / 100.0)
+        places = np.array([0.3, 0.1, -0.2]) + ARM * np.eye(4, 3, -1)
+        whole = recorded(shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05)
+        np.testing.assert_allclose(whole, poses, atol=2e-6)
+        alone = recorded(shown(poses, places[:1]), "ball", 0.05)
+        np.testing.assert_allclose(alone[:, :3] + places[0], shown(poses, places[:1]).positions[:, 0], atol=2e-6)
+        assert not alone[:, 3:].any()
+
+    def test_a_marker_that_does_not_show_its_obstacle_is_refused(self):
+        recording = shown(np.zeros((50, 6)), np.zeros((1, 3)))
+        with pytest.raises(DataFileError, match="no marker or rigid body 'bar', which shows the motion of this"):
+            recorded(recording, "bar", 0.05)
+        recording.positions[:10, 0] = np.nan
+        assert not recorded(recording, "ball", 0.2).any()
+        with pytest.raises(DataFileError, match=r"'ball' is not seen in the first 0\.05 s"):
+            recorded(recording, "ball", 0.05)
+        recording.positions[:40:2, 0] = recording.positions[10:, 0] = np.nan
+        recording.positions[3, 0] = 0.0
+        with pytest.raises(DataFileError, match="'ball' moves, and its marker is seen in 2 % of the frames"):
+            recorded(recording, "ball", 0.05)
+
+    @pytest.mark.slow
+    def test_a_recorded_bar_pushes_the_beam_of_the_laboratory_and_of_the_models(self, tmp_path):
+        pushed = [
+            *("experiment=beam_pushed", "mesh.divisions=[6,1,1]", "laboratory.mesh.divisions=[6,1,1]"),
+            *("laboratory.time_step=0.01", "data.steps=40", "identify.max_evaluations=4", "identify.substeps=1"),
+            *("in_the_loop.epochs=1", "network.width=4", "simfree.trainer={epochs:4,rollout_every:2}"),
+            "simfree.network={position_modes:3,velocity_modes:3,layers:1,width:8}",
+            *("laboratory.train=[lift1,slide]", "laboratory.validation=[mixed]", "laboratory.test=[lift2]"),
+        ]
+        folder = run_without_report(tmp_path, *pushed)
+        dataset, configured = read_dataset(folder / "dataset.h5"), settings(*pushed)
+        poses = dataset.obstacles["bar"]
+        for row, name in enumerate(dataset.names):
+            trial = configured.laboratory.trials[name].obstacle_motion["bar"]
+            np.testing.assert_allclose(poses[row], prescribed(trial, 0.01 * np.arange(41)), atol=3e-4)
+        assert np.abs(poses[..., :3]).max() > 0.014
+        assert not poses[..., 3:].any()
+        errors = read_json(folder / "metrics.json")["errors_mm"]
+        assert errors["sysid"]["mean"] < 0.2 * errors["rest"]["mean"]
+        check_robots(folder, tolerance=1e-7)

@@ -1,7 +1,6 @@
 """The package of docs/examples in an experiment from YAML: all its classes act, and its parameters are identified."""
 
 import importlib.util
-import json
 import re
 import sys
 
@@ -12,14 +11,14 @@ from torch import nn
 
 import warp_resphys
 from support.configured import check, composed, settings
-from support.main_job import IN_RUN, run, without_reports
+from support.main_job import run_without_report
 from support.template import TEMPLATE, install
 from warp_resphys.energies.base import Energy
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.classes import ClassSettings, check_packages
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_checkpoint
+from warp_resphys.io.files import read_checkpoint, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import Stage, fingerprint
 from warp_resphys.learning.networks import OwnNetwork
@@ -28,16 +27,9 @@ from warp_resphys.settings.run import RunSettings
 from warp_resphys.studies.gradient_check import check_gradients
 
 OPTIONS = [
-    "experiment=magnetic_beam",
-    "budget=quick",
-    f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-    "mesh.divisions=[6,1,1]",
-    "laboratory.mesh.divisions=[6,1,1]",
-    "simfree.trainer.epochs=6",
-    "simfree.trainer.rollout_every=6",
-    "parallel.processes=1",
+    *("experiment=magnetic_beam", "budget=quick", f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]"),
+    *("mesh.divisions=[6,1,1]", "laboratory.mesh.divisions=[6,1,1]", "parallel.processes=1"),
+    *("simfree.trainer.epochs=6", "simfree.trainer.rollout_every=6"),
 ]
 
 
@@ -54,28 +46,24 @@ def installed(site, monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(site, tmp_path_factory):
-    place = tmp_path_factory.mktemp("magnetic")
-    with pytest.MonkeyPatch.context() as patch, without_reports():
+    with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
-        patch.chdir(place)
-        code, err = run(*OPTIONS, IN_RUN)
-    assert code == 0, err
-    return place / "run"
+        return run_without_report(tmp_path_factory.mktemp("magnetic"), *OPTIONS)
 
 
 @pytest.mark.slow
 def test_its_parameters_are_identified_and_its_network_trained(folder, installed):
     """Weight and magnet bend the beam of the laboratory, of 50 kPa and 24 kA/m, from 40 kPa and 30 kA/m."""
-    found = json.loads((folder / "identification.json").read_text())["sysid"]["parameters"]
+    found = read_json(folder / "identification.json")["sysid"]["parameters"]
     assert found["magnetisation"] / found["shear_modulus"] == pytest.approx(24.0 / 50.0, rel=0.05)
     assert found["shear_modulus"] == pytest.approx(50e3, rel=0.2)
-    errors = json.loads((folder / "metrics.json").read_text())["errors_mm"]
+    errors = read_json(folder / "metrics.json")["errors_mm"]
     assert errors["sysid"]["mean"] < 0.1 * errors["simulation"]["mean"]
     network = describe(folder, "resphys").learned.network
     assert isinstance(network.network, OwnNetwork)
     assert network.architecture["core"] == {"_target_": "my_robot_physics.sines.Sines", "width": 8}
     assert float(network.network.gain.detach().abs().max()) > 0.0
-    records = {path.stem: json.loads(path.read_text()) for path in (folder / "stages").glob("*.json")}
+    records = {path.stem: read_json(path) for path in (folder / "stages").glob("*.json")}
     assert {name for name, own in records.items() if own["packages"] != {"my-robot-physics": "0.1.0"}} == set()
 
 
@@ -162,50 +150,40 @@ def test_an_actuator_drives_the_body_as_its_energy_says(installed):
         assert float(end) > float(height(value, -0.01)) + 1e-3
 
 
-@pytest.mark.parametrize(
-    ("target", "base", "message"),
-    [
-        ("bad_physics.Unfinished", Energy, r"here: bad_physics\.Unfinished has no method points and no term: add it"),
-        ("bad_physics.Arrays", nn.Module, r"arguments of Arrays cannot be given in a configuration .*ndarray"),
-        (
-            "worse_physics.Any",
-            nn.Module,
-            r"worse_physics\.Any cannot be imported \(ZeroDivisionError: division by",
-        ),
-    ],
-)
-def test_other_classes_are_refused(tmp_path, monkeypatch, target, base, message):
-    (tmp_path / "bad_physics.py").write_text(
-        "import numpy as np\n"
-        "from torch import nn\n"
-        "from warp_resphys import Energy\n"
-        "class Unfinished(Energy):\n    pass\n"
-        "class Arrays(nn.Module):\n    def __init__(self, x: np.ndarray): pass\n"
-    )
-    (tmp_path / "worse_physics.py").write_text("1 / 0")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(InputError, match=message):
-        ClassSettings(target=target).factory(base, "here")
-
-
 class Wide(nn.Linear):
     def __init__(self, inputs, outputs):
         super().__init__(inputs, 7)
 
 
-def test_a_network_of_another_shape_is_refused():
-    core = ClassSettings(target=f"{__name__}.Wide")
-    with pytest.raises(InputError, match=r"network\.core: \S*Wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
-        OwnNetwork(core, 3, 2)
+MODULE = """
+import numpy as np
+from torch import nn
+from warp_resphys import Energy
+class Unfinished(Energy):
+    pass
+class Arrays(nn.Module):
+    def __init__(self, x: np.ndarray): pass
+"""
 
 
-def test_no_class_is_imported_or_called_that_is_not_expected(tmp_path):
-    """A robot's file may name anything; nothing of Python itself is imported, and no other class is called."""
-    file = tmp_path / "written"
+def test_classes_that_do_not_fit_are_refused_and_no_other_is_imported_or_called(tmp_path, monkeypatch):
+    """A robot's file may name anything; nothing of Python itself is imported."""
+    (tmp_path / "bad_physics.py").write_text(MODULE)
+    (tmp_path / "worse_physics.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for target, base, message in (
+        ("bad_physics.Unfinished", Energy, r"here: bad_physics\.Unfinished has no method points and no term: add it"),
+        ("bad_physics.Arrays", nn.Module, r"arguments of Arrays cannot be given in a configuration .*ndarray"),
+        ("worse_physics.Any", nn.Module, r"worse_physics\.Any cannot be imported \(ZeroDivisionError: division by"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ClassSettings(target=target).factory(base, "here")
     for target in ("subprocess.Popen", "pathlib.Path", "numpy.memmap"):
         with pytest.raises(InputError, match=target):
-            ClassSettings(target=target, filename=str(file), mode="w+", shape=3).factory(nn.Module, "here")
-    assert not file.exists()
+            ClassSettings(target=target, filename=str(tmp_path / "file"), mode="w+", shape=3).factory(nn.Module, "here")
+    assert not (tmp_path / "file").exists()
+    with pytest.raises(InputError, match=r"network\.core: \S*Wide maps \(2, 3\) to \(2, 7\): it must map to \(2, 2\)"):
+        OwnNetwork(ClassSettings(target=f"{__name__}.Wide"), 3, 2)
 
 
 def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
@@ -242,9 +220,6 @@ def test_the_tests_of_the_package_pass(installed, path):
     tests = [own for name, own in vars(module).items() if name.startswith("test_")]
     assert tests
     for own in tests:
-        for mark in getattr(own, "pytestmark", []):
-            for value in mark.args[1]:
-                own(value)
-            break
-        else:
-            own()
+        (values,) = [mark.args[1] for mark in getattr(own, "pytestmark", [])] or [[]]
+        for arguments in [(value,) for value in values] or [()]:
+            own(*arguments)

@@ -1,20 +1,17 @@
 """Poses under tendons, recorded without header, names or order of their markers, from a table to the report."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 import warp_resphys
-from support.configured import check, composed, settings
-from support.main_job import IN_RUN, run, run_without_report
+from support.configured import settings
+from support.main_job import finish, run_without_report
 from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.report.identification_section import own_table
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
@@ -23,66 +20,38 @@ from warp_resphys.stepping.inputs import Inputs
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
 OFFSETS = {"first": 1e-3, "second": -8e-4}  # m, around the axis, by which its tendons run elsewhere
 POSES = {"weak": (0.5, 0.0), "strong": (1.5, 0.0), "second": (0.0, 1.5), "other": (0.0, 1.0), "both": (1.0, 1.0)}
-STRONG = {"weak": (1.5, 0.0), "strong": (4.0, 0.0), "second": (0.0, 3.0), "other": (0.0, 4.0), "both": (3.0, 3.0)}
 TINY = [
-    "experiment=tentacle",
-    *("mesh.layers=4", "mesh.nodes=20", "tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6"),
-    *("data.folder=recordings", "data.folds=null", "data.validation=[other]"),
-    *("data.train=[weak,strong,second]", "data.test=[both]", "identify.max_evaluations=6"),
-    *(
-        "trainer={epochs:4,rollout_every:2,batch_size:16}",
-        "network={position_modes:1,force_modes:2,width:8}",
-        "in_the_loop.epochs=1",
-        "simfree.network.position_modes=1",
-    ),
-    *("~identify.parameters.density", "parallel.processes=1", "markers.patch=0.05"),
-    *(
-        "~identify.parameters.tendon_offset_2_first",
-        "~identify.parameters.tendon_offset_2_second",
-    ),  # weak poses do not show them
-    *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+    *("experiment=tentacle", "mesh.layers=4", "mesh.nodes=20", "parallel.processes=1", "markers.patch=0.05"),
+    *("tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6", "data.folder=recordings", "data.folds=null"),
+    *("data.train=[weak,strong,second]", "data.validation=[other]", "data.test=[both]", "identify.max_evaluations=6"),
+    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={position_modes:1,force_modes:2,width:8}"),
+    *("in_the_loop.epochs=1", "simfree.network.position_modes=1", "~identify.parameters.density"),
+    *(f"~identify.parameters.tendon_offset_2_{name}" for name in OFFSETS),  # weak poses do not show them
 ]
 
 
-def trials(poses):
-    table = ",".join(f"{name}: {{file: {name}.csv, inputs: {list(tensions)}}}" for name, tensions in poses.items())
-    return ["data.trials=null", f"+data.trials={{{table}}}"]
-
-
-TRIALS = trials(POSES)
-
-
-def moved(tendons):
-    """Tendons whose guides are where the recorded body has them: displaced along their first direction."""
-    routes = {}
-    for name, route in tendons.routes.items():
-        guides = np.array(route.guides) + OFFSETS[name] * np.array(route.offsets[0])
-        routes[name] = {"guides": guides.tolist(), "pieces": route.pieces}
-    return tendons.changed(routes=routes)
+def trials(tensions=POSES, sessions=None):
+    """Options with the trials of the poses."""
+    named = {name: f", session: {session}" for name, session in (sessions or {}).items()}
+    rows = (f"{n}: {{file: {n}.csv, inputs: {list(own)}{named.get(n, '')}}}" for n, own in tensions.items())
+    return ["data.trials=null", f"+data.trials={{{','.join(rows)}}}"]
 
 
 @pytest.fixture(scope="module")
 def poses():
-    """(R, 5, 3) where the markers of the poses are in the frame of the body [m]."""
-    run = settings(*TINY, *TRIALS)
-    return poses_of(run, moved(run.tendons))
-
-
-def poses_of(run, tendons, poses=POSES):
-    """(R, 5, 3) where the markers of the poses are in the frame of the body, pulled by some tendons [m]."""
-    simulator = build_simulator(run.changed(tendons=tendons), of_modulus(run, MODULUS))
-    markers = run.markers
-    places = np.array([*markers.tracked.values()])
-    read = bound_markers(markers, simulator.body.mesh, places, tuple(markers.tracked))
-    tensions = torch.tensor([*poses.values()], dtype=torch.float64)
+    """(5, 5, 3) where the markers of the poses are in the frame of the body [m]; its tendons run elsewhere."""
+    run = settings(*TINY, *trials())
+    routes = {}
+    for name, route in run.tendons.routes.items():
+        guides = np.array(route.guides) + OFFSETS[name] * np.array(route.offsets[0])
+        routes[name] = {"guides": guides.tolist(), "pieces": route.pieces}
+    material = MaterialSettings(**{**run.simulation.plain(), "youngs_modulus": MODULUS})
+    simulator = build_simulator(run.changed(tendons=run.tendons.changed(routes=routes)), material)
+    places = np.array([*run.markers.tracked.values()])
+    read = bound_markers(run.markers, simulator.body.mesh, places, tuple(run.markers.tracked))
+    tensions = torch.tensor([*POSES.values()], dtype=torch.float64)
     at = read(simulator.static_equilibrium(Inputs(tendon_tension=tensions)).q).numpy()
-    base = np.broadcast_to([*markers.reference.values()], (len(at), 1, 3))
-    return np.concatenate([at, base], 1)
-
-
-def of_modulus(run, modulus):
-    """The material of the simulator to correct, of another modulus [Pa]."""
-    return MaterialSettings(**{**run.simulation.plain(), "youngs_modulus": modulus})
+    return np.concatenate([at, np.broadcast_to([*run.markers.reference.values()], (len(at), 1, 3))], 1)
 
 
 def write(folder, places_of_poses):
@@ -97,42 +66,27 @@ def write(folder, places_of_poses):
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
 
 
-@pytest.mark.slow
-def test_poses_identify_the_friction_of_tendons(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    recorded = settings(*TINY, *TRIALS)
-    write(Path("recordings"), poses_of(recorded, recorded.tendons.changed(friction=0.3), STRONG))
-    offsets = [f"~identify.parameters.tendon_offset_1_{name}" for name in OFFSETS]
-    friction = ["tendons.friction=0.05", "+identify.parameters.tendon_friction={lower:0.0,upper:1.0}"]
-    run_without_report(tmp_path, *TINY, *trials(STRONG), *offsets, *friction, "mesh_check=null")
-    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
-    assert identified["tendon_friction"] == pytest.approx(0.3, abs=0.02)
-    assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
-    errors = json.loads(Path("run/metrics.json").read_text())["errors_mm"]
-    assert errors["sysid"]["mean"] < 0.3
-    check_robots("run")
-
-
-def test_poses_of_unnamed_markers_identify_the_body(poses, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(Path("recordings"), poses)
-    code, err = run(*TINY, *TRIALS)
-    assert (code, err[-500:] if code else "") == (0, "")
-    dataset = read_dataset(Path("run/dataset.h5"))
+def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
+    write(folder / "recordings", poses)
+    run = finish(*TINY, *trials())
+    dataset = read_dataset(run / "dataset.h5")
     rows = [dataset.names.index(name) for name in POSES]
     assert set(dataset.begins) == {"static"}
     np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=3e-4)  # named and turned back
     np.testing.assert_allclose(dataset.inputs["tendon_tension"][rows, 0], [*POSES.values()], atol=1e-12)
-    identified = json.loads(Path("run/identification.json").read_text())["sysid"]["parameters"]
+    identified = read_json(run / "identification.json")["sysid"]["parameters"]
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
     assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(OFFSETS, abs=2e-4)
-    assert "First offset of the tendon &#39;first&#39;" in Path("run/report.html").read_text()
-    metrics = json.loads(Path("run/metrics.json").read_text())
+    page, metrics = (run / "report.html").read_text(), read_json(run / "metrics.json")
+    assert "First offset of the tendon &#39;first&#39;" in page
     errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
-    check_of_the_mesh()
-    check_robots("run")
+    checked = metrics["mesh_check"]
+    assert checked["cells"][1] == 1.5 * checked["cells"][0] == 30
+    assert 0.1 < checked["moved_mm"] < 10.0
+    assert "cells, with the same constants, the markers of" in page
+    check_robots(run)
 
 
 @pytest.mark.slow
@@ -140,9 +94,6 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     """Between two sessions a marker moved by 4 mm; one tension is 7 % larger than its log says."""
     sessions = {"weak": "monday", "strong": "monday", "other": "friday", "second": "friday", "both": "friday"}
     logged = {**POSES, "strong": (1.5 / 1.07, 0.0)}
-    trials = ",".join(
-        f"{name}: {{file: {name}.csv, session: {sessions[name]}, inputs: {list(logged[name])}}}" for name in POSES
-    )
     moved = poses.copy()
     moved[[list(POSES).index(name) for name, session in sessions.items() if session == "friday"], 1, 2] -= 4e-3
     write(tmp_path / "recordings", moved)
@@ -150,13 +101,12 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     folder = run_without_report(
         tmp_path,
         *TINY,
-        "data.trials=null",
-        f"+data.trials={{{trials}}}",
+        *trials(logged, sessions),
         f"+identify.parameters.tendon_tension_factor={gain}",
         *("mesh_check=null", "identify.max_evaluations=8"),
     )
     assert dict(zip((data := read_dataset(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
-    found = json.loads((folder / "identification.json").read_text())["sysid"]
+    found = read_json(folder / "identification.json")["sysid"]
     own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["own"].items()}
     assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["own_deviation"]}
     assert own["strong"] - 0.5 * (own["weak"] + own["second"]) > 0.03
@@ -176,14 +126,6 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     assert float(shown.errors_mm(shown.play(robot)).mean()) < 20.0
 
 
-def check_of_the_mesh():
-    """The run tells what it did of a finer mesh."""
-    checked = json.loads(Path("run/metrics.json").read_text())["mesh_check"]
-    assert checked["cells"][1] == 1.5 * checked["cells"][0] == 30
-    assert 0.1 < checked["moved_mm"] < 10.0
-    assert "cells, with the same constants, the markers of" in Path("run/report.html").read_text()
-
-
 def test_a_finer_mesh_has_so_many_times_as_many_cells():
     box = HexahedralBox(kind="box_hexahedra", size=[0.1, 0.03, 0.03], divisions=[5, 2, 1])
     assert finer(box, 1.5) == box.changed(divisions=[8, 3, 2])
@@ -196,49 +138,17 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
         finer(FileMesh(kind="file", path="a.vtk"), 2.0)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["data.axes=[x,x,y]"], "data.axes is .*twice"),
-        (
-            [
-                "+identify.parameters.tendon_tension_factor={lower: 0.8, upper: 1.2, per: session, "
-                "prior: {mean: 1.0, deviation: 0.1}}"
-            ],
-            r"per is session, but no trial names one: set data\.trials\.NAME\.session",
-        ),
-        (["data.axes=null"], "markers.reference names 1: static poses need 3 .*, or data.axes and one"),
-        (
-            ["identify.parameters.tendon_offset_1_first.upper=0.03"],
-            "tendon_offset_1_first.upper: guide 1 .* outside of",
-        ),
-        (
-            ["+identify.parameters.tendon_offset_1={lower: -1e-3, upper: 1e-3}"],
-            "names tendon_offset_1 and its parts, tendon_offset_1_first, tendon_offset_1_second: choose one",
-        ),
-    ],
-)
-def test_what_cannot_be_told_from_the_table_is_refused(overrides, said, tmp_path, poses, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(Path("recordings"), poses)
-    with pytest.raises(InputError, match=said):
-        check(composed(*TINY, *TRIALS, *overrides))
-
-
 @pytest.mark.slow
 def test_intervals_of_another_session_come_from_poses_left_out_of_the_training(poses, tmp_path):
     """Without validation poses, and with markers that may sit 3.4 mm elsewhere in the session of the test pose."""
     write(tmp_path / "recordings", poses)
     sessions = dict.fromkeys(POSES, "monday") | {"both": "friday"}
-    table = ",".join(
-        f"{name}: {{file: {name}.csv, session: {sessions[name]}, inputs: {list(POSES[name])}}}" for name in POSES
-    )
     training = ["data.train=[weak,strong,second,other]", "data.validation=[]", "in_the_loop.hold_out=false"]
     quick = ["mesh_check=null", "trainer.epochs=1"]
-    folder = run_without_report(tmp_path, *TINY, "data.trials=null", f"+data.trials={{{table}}}", *training, *quick)
-    intervals = json.loads((folder / "errors.json").read_text())["intervals"]
+    folder = run_without_report(tmp_path, *TINY, *trials(POSES, sessions), *training, *quick)
+    intervals = read_json(folder / "errors.json")["intervals"]
     assert intervals["calibrated_on"] == "left_out"
-    found = json.loads((folder / "identification.json").read_text())["sysid"]
+    found = read_json(folder / "identification.json")["sysid"]
     assert [*found["uncertainty"]["left_out"]] == ["weak", "strong", "second", "other"]
     assert found["placement"]["new_session"][0][0] == pytest.approx(0.005 * np.sqrt(0.25 + 1.0 / 5.0))
     own = intervals["models"]["sysid"]

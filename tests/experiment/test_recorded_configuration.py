@@ -1,11 +1,9 @@
 """Configurations of experiments on recordings: what is refused, what a budget changes, and which choice wins."""
 
-import numpy as np
 import pytest
 
 from support.configured import check, composed, settings
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.experiment.recordings.reading import vertical
 from warp_resphys.experiment.trials import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 from warp_resphys.io.settings import parse
@@ -27,77 +25,49 @@ def changed(config, key, value):
 
 TRIALS = {"a": {"file": "a.c3d", "payload": 0.0}, "b": {"file": "b.c3d", "payload": 0.1}}
 WHOLE = {"lower": 0.0, "upper": 1.0}
+RECORDED = [
+    ("data/up", [0.0, 0.0, 0.0], "data.up is"),
+    ("data/base_motion", {"about": [0.0, 0.0, 0.0]}, "data.base_motion.file and swings: give one of them"),
+    ("data/base_motion", {"swings": {}}, "data.base_motion.swings is empty"),
+    ("data/payload_at", {"x": 0.07003}, "no vertex lies within"),
+    ("data/payload_at", {"x": 0.0}, "data.payload_at selects fixed vertices only"),
+    ("data/payload_at", None, "a trial has a payload, but data.payload_at is not set"),
+    ("data/trials", {}, "recordings is not a folder: set data.folder"),
+    ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.*a/b cannot name a trial"),
+    ("data/trials", {"a": {"payload": 0.0}}, "data.trials.a.file is missing"),
+    ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
+    ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs at least two trials"),
+    ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
+    ("data/seconds", None, "data.seconds is not set"),
+    ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
+    ("markers/reference/Tip - 1", [0.1, 0.0, 0.0], "markers.tracked and markers.reference both have 'Tip - 1'"),
+    ("markers", None, "markers is null, but data.kind is recorded"),
+    ("published/simulation/colour", 1.0, "published.simulation: corotated has no constant 'colour'"),
+    ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
+    ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
+    ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),
+    ("identify/parameters/density", {"lower": 2.0, "upper": 1.0}, "identify.parameters.density.lower is 2"),
+    ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50: .* from 0 to 10"),
+    ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
+]
+PLAYED = [
+    ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
+    ("data/rest", "file", "data.rest is file, but the simulated bodies are held undeformed"),
+    ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
+    ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
+    ("laboratory/test", [], "laboratory.test is empty: add at least one of laboratory.trials"),
+    ("laboratory/test", ["m10", "m99"], "laboratory.test names the trial 'm99'"),
+    ("laboratory/test", ["m10", "m20"], "the trial 'm20' is in laboratory.train and laboratory.test"),
+    ("laboratory/test", ["m10", "m10"], "the trial 'm10' is twice in laboratory.test"),
+]
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "offending"),
-    [
-        ("data/up", "up", "data.up is 'up': it must be one of x, -x"),
-        ("data/up", [0.0, 0.0, 0.0], "data.up is"),
-        ("data/base_motion", {"about": [0.0, 0.0, 0.0]}, "data.base_motion.file and swings: give one of them"),
-        ("data/base_motion", {"swings": {}}, "data.base_motion.swings is empty"),
-        ("data/payload_at", {"x": 0.07003}, "no vertex lies within"),
-        ("data/payload_at", {"x": 0.0}, "data.payload_at selects fixed vertices only"),
-        ("data/payload_at", None, "a trial has a payload, but data.payload_at is not set"),
-        ("data/trials", {}, "recordings is not a folder: set data.folder"),
-        ("data/trials", {"a/b": TRIALS["a"]}, "data.trials.*a/b cannot name a trial"),
-        ("data/trials", {"a": {"payload": 0.0}}, "data.trials.a.file is missing"),
-        ("data/trials", {"a": TRIALS["a"], "b": TRIALS["a"]}, "the trials 'a' and 'b' have the same file, a.c3d"),
-        ("data/trials", {"a": TRIALS["a"]}, "data.folds is leave_one_out, which needs at least two trials"),
-        ("data/rest", "file", "release.sideways is 0.002 m, but data.rest is file"),
-        ("data/seconds", None, "data.seconds is not set"),
-        ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
-        ("markers/tracked/Tip - 1", [0.1, 0.0], "markers.tracked.Tip - 1 is"),
-        ("markers/reference/Tip - 1", [0.1, 0.0, 0.0], "markers.tracked and markers.reference both have 'Tip - 1'"),
-        ("markers", None, "markers is null, but data.kind is recorded"),
-        ("published/simulation/colour", 1.0, "published.simulation: corotated has no constant 'colour'"),
-        ("published/simulation/poissons_ratio", 0.6, "published.simulation: poissons_ratio is 0.6"),
-        ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
-        ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
-        ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),
-        ("identify/parameters/density", {"lower": 2.0, "upper": 1.0}, "identify.parameters.density.lower is 2"),
-        ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50: .* from 0 to 10"),
-        ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
-    ],
+    ("base", "key", "value", "said"), [(REAL, *case) for case in RECORDED] + [(REAL[:1], *case) for case in PLAYED]
 )
-def test_configuration_of_recordings_is_checked(key, value, offending):
-    with pytest.raises(ResphysError, match=offending):
-        check(changed(composed(*REAL), key, value))
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "offending"),
-    [
-        ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
-        ("data/rest", "file", "data.rest is file, but the simulated bodies are held undeformed"),
-        ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
-        ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
-        ("laboratory/test", [], "laboratory.test is empty: add at least one of laboratory.trials"),
-        ("laboratory/test", ["m10", "m99"], "laboratory.test names the trial 'm99'"),
-        ("laboratory/test", ["m10", "m20"], "the trial 'm20' is in laboratory.train and laboratory.test"),
-        ("laboratory/test", ["m10", "m10"], "the trial 'm10' is twice in laboratory.test"),
-    ],
-)
-def test_configuration_of_a_simulated_laboratory_is_checked(key, value, offending):
-    with pytest.raises(ResphysError, match=offending):
-        check(changed(composed("experiment=beam_real"), key, value))
-
-
-def test_a_trial_without_a_payload_carries_none(tmp_path):
-    config = composed("experiment=beam_real", f"data.folder={tmp_path}", "data.rest=file", "release.sideways=0")
-    config["data"]["trials"] = {"a": "a.c3d", "b": {"file": "b.c3d", "payload": 0.1, "begins": "released"}}
-    run = parse(RunSettings, config)
-    check_run(run)
-    assert [(trial.payload, trial.begins) for trial in trials_of(run)] == [(0.0, "held"), (0.1, "released")]
-
-
-def test_a_folder_without_a_list_gives_all_its_recordings(tmp_path):
-    for name in ("b.c3d", "a.h5", "c.txt"):
-        (tmp_path / name).touch()
-    run = parse(RunSettings, changed(composed("experiment=beam_real", f"data.folder={tmp_path}"), "data/trials", {}))
-    check_run(run)
-    results = [(trial.name, trial.file) for trial in trials_of(run)]
-    assert results == [("a", str(tmp_path / "a.h5")), ("b", str(tmp_path / "b.c3d"))]
+def test_a_configuration_is_checked(base, key, value, said):
+    with pytest.raises(ResphysError, match=said):
+        check(changed(composed(*base), key, value))
 
 
 def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
@@ -108,6 +78,15 @@ def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
     for trial in pulled["laboratory"]["trials"].values():
         trial["pull"] = [0.0, 0.1, 0.0]
     check(changed(pulled, "data/rest", "file"))
+
+
+def test_a_folder_without_a_list_gives_all_its_recordings(tmp_path):
+    for name in ("b.c3d", "a.h5", "c.txt"):
+        (tmp_path / name).touch()
+    run = parse(RunSettings, changed(composed("experiment=beam_real", f"data.folder={tmp_path}"), "data/trials", {}))
+    check_run(run)
+    results = [(trial.name, trial.file) for trial in trials_of(run)]
+    assert results == [("a", str(tmp_path / "a.h5")), ("b", str(tmp_path / "b.c3d"))]
 
 
 def test_folds_and_splits(tmp_path):
@@ -171,20 +150,18 @@ def test_a_network_or_trainer_on_the_command_line_is_taken_whole(group, option):
     assert getattr(run, other) == getattr(settings("experiment=beam_synthetic"), other)
 
 
-@pytest.mark.parametrize("experiment", ["beam_oscillation", "sopra"])
-def test_a_material_may_leave_out_its_model_and_its_constants(experiment):
-    config = composed(f"experiment={experiment}")
-    for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):
-        check(config | {"simulation": material})
-    with pytest.raises(InputError, match=r"its own weight would strain it by .* or that of youngs_modulus not Pa"):
-        check(config | {"simulation": {"youngs_modulus": 264.0}})
-
-
-def test_a_material_without_youngs_modulus_is_believed_or_not():
+def test_a_material_may_leave_out_its_model_and_its_constants_and_is_believed_or_not():
     config = composed()
+    for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):
+        check(composed("experiment=sopra") | {"simulation": material})
+        check(config | {"simulation": material})
     check(config | {"simulation": {"model": "mooney_rivlin"}})
-    with pytest.raises(InputError, match=r"with E = 0.264 kPa its own weight would strain it by .* that of c10 not Pa"):
-        check(config | {"simulation": {"model": "mooney_rivlin", "c10": 36.0, "c01": 8.0}})
+    for soft, said in (
+        ({"youngs_modulus": 264.0}, "its own weight would strain it by .* or that of youngs_modulus not Pa"),
+        ({"model": "mooney_rivlin", "c10": 36.0, "c01": 8.0}, "with E = 0.264 kPa its own weight .* of c10 not Pa"),
+    ):
+        with pytest.raises(InputError, match=said):
+            check(config | {"simulation": soft})
 
 
 def test_an_experiment_may_choose_its_network(tmp_path):
@@ -196,8 +173,3 @@ def test_an_experiment_may_choose_its_network(tmp_path):
     own = (f"hydra.searchpath=[file://{tmp_path}]", "experiment=own")
     assert settings(*own).network == settings("network=reduced").network.changed(force_modes=4)
     assert settings(*own, "network=published").network.kind == "nodal"
-
-
-def test_vertical():
-    np.testing.assert_array_equal(vertical("-y"), [0.0, -1.0, 0.0])
-    np.testing.assert_array_equal(vertical([0.0, 0.0, 2.0]), vertical("z"))

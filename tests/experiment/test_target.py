@@ -32,7 +32,6 @@ OWN = (
     "target.muscles={bundles:{along:{direction:[1,0,0]}},stiffness:80e3,toe:0.02}",
 )
 COARSE = ("mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,2,2]}", "data.steps=3")
-PASSIVE = "laboratory.muscles={bundles:{along:{direction:[0,0,1]}},stiffness:80e3,toe:0.02}"
 
 
 def test_keys_that_are_left_out_are_those_of_the_simulator():
@@ -131,43 +130,6 @@ def test_the_marker_ablation_follows_its_target(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["target.time_step=0.004"], "time_step is 0.01 s and target.time_step 0.004 s: the first must be a multiple"),
-        (["target.tme_step=0.005"], r"target\.material: .*'tme_step'"),
-        (
-            ["target.fibres={angles:[8.0],stiffness:1e4}"],
-            r"target: fibres is set, but chambers is null",
-        ),
-        (["target.muscle={bundles:{}}"], "unknown key 'target.muscle', did you mean 'muscles'"),
-        (
-            ["target.mesh={kind:box_hexahedra,size:[0.08,0.03,0.03],divisions:[8,3,3]}", "data.load={x:0.08}"],
-            r"target\.mesh: the simulator's vertex at \(0\.1, .*\) m lies outside of this mesh: both must be",
-        ),
-        (
-            ["target.mesh={kind:box_hexahedra,size:[0.11,0.03,0.03],divisions:[8,3,3]}"],
-            r"data\.load: no vertex lies within 1e-09 m of x = 0\.1 m: the mesh reaches .*",
-        ),
-        (
-            ["target.regions={tip:{x:[0.05,0.1]}}", "target.rigid={tip:{}}", "target.integrator=midpoint"],
-            r"target: integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2",
-        ),
-        (
-            ["target.muscles={bundles:{a:{direction:[1,0,0]}},stiffness:0.0}"],
-            r"target\.muscles\.stiffness is 0, but not",
-        ),
-        (
-            ["experiment=beam_real", PASSIVE.replace("stiffness", "commanded:stress,stiffness")],
-            "laboratory: its body takes muscle_stress of 1 muscle, but that of the simulator takes no input",
-        ),
-    ],
-)
-def test_what_cannot_work_is_refused_in_a_sentence(overrides, message):
-    with pytest.raises(InputError, match=message):
-        check(composed(*overrides))
-
-
-@pytest.mark.parametrize(
     ("key", "value"), [("time_step", -1.0), ("mesh", {"kind": "rod"}), ("muscles", {"bundle": {}})]
 )
 def test_a_wrong_value_of_the_simulator_is_not_blamed_on_its_target(key, value):
@@ -175,11 +137,3 @@ def test_a_wrong_value_of_the_simulator_is_not_blamed_on_its_target(key, value):
     plain["target"] = plain["target"]["material"]
     with pytest.raises(InputError, match=f"^(unknown key ')?{key}"):
         parse(RunSettings, {**plain, key: value})
-
-
-def test_constants_directly_in_the_target_are_named_in_messages():
-    plain = composed()
-    with pytest.raises(InputError, match=r"^target\.youngs_modulus is 'soft': it must be a number"):
-        parse(
-            RunSettings, {**plain, "target": {**plain["target"]["material"], "youngs_modulus": "soft", "regions": {}}}
-        )

@@ -24,11 +24,10 @@ SHORT = [
     "trainer.epochs=40",
     "trainer.rollout_every=10",
     "network.width=32",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
 ]
 TINY = [*SMALL, *SHORT]
 IN_RUN = "hydra.run.dir=run"
+QUIET = ("hydra/job_logging=none", "hydra/hydra_logging=none")
 
 
 def end_of(program, *arguments):
@@ -47,17 +46,22 @@ def without_reports():
         yield
 
 
+def run(*arguments):
+    """Runs the command without a log in this process; returns exit code and stderr."""
+    return end_of(cli.main, "warp-resphys", *arguments, *QUIET)
+
+
+def finish(*arguments):
+    """Runs the command in the folder `run`, which it returns."""
+    code, err = run(*arguments, IN_RUN)
+    assert (code, err[-900:] if code else "") == (0, "")
+    return Path("run")
+
+
 def run_without_report(place, *arguments):
     """Runs a command without its report, and returns its run folder."""
     with without_reports(), contextlib.chdir(place):
-        code, err = run(*arguments)
-    assert (code, err[-900:] if code else "") == (0, "")
-    return place / "run"
-
-
-def run(*arguments):
-    """Runs the command in this process; returns exit code and stderr."""
-    return end_of(cli.main, "warp-resphys", *arguments)
+        return place / finish(*arguments)
 
 
 def metrics(folder="run"):

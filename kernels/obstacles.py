@@ -238,12 +238,3 @@ def measure_adjoint(
     a, w = by_distance[b, p, k], by_normal[b, p, k]
     position_out[b, p, k] = a * at.n + at.h * w
     turn_out[b, p, k] = turn_slope(o, b, k, x, at, a, w)
-
-
-@wp.kernel
-def from_surface(surface: wp.uint64, places: wp.array[wp.vec3], distance_out: wp.array[float]):
-    """Signed distances of places from a closed surface [m]."""
-    i = wp.tid()
-    query = wp.mesh_query_point_sign_winding_number(surface, places[i], 1.0e6)
-    nearest = wp.mesh_eval_position(surface, query.face, query.u, query.v)
-    distance_out[i] = query.sign * wp.length(places[i] - nearest)

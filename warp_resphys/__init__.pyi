@@ -13,10 +13,10 @@ from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Trajectory as Trajectory
 from .energies.base import Energy as Energy
 from .energies.catalogue import make_material as make_material
+from .energies.catalogue import read_material as read_material
+from .energies.catalogue import share_outside_law as share_outside_law
 from .energies.contact import Contact as Contact
 from .energies.fibres import Fibres as Fibres
-from .energies.law_files import read_material as read_material
-from .energies.law_files import share_outside_law as share_outside_law
 from .energies.materials import ConvexMaterial as ConvexMaterial
 from .energies.materials import Corotated as Corotated
 from .energies.materials import DensityMaterial as DensityMaterial
@@ -41,11 +41,11 @@ from .energies.surfaces import FrictionPair as FrictionPair
 from .energies.surfaces import SurfaceContact as SurfaceContact
 from .energies.tendons import Tendons as Tendons
 from .fem.body import Body as Body
+from .fem.body import Glue as Glue
 from .fem.body import PointMass as PointMass
-from .fem.rigid import Glue as Glue
-from .fem.rigid import Rigid as Rigid
+from .fem.body import Rigid as Rigid
+from .fem.coordinates import SymmetryPlane as SymmetryPlane
 from .fem.scene import Scene as Scene
-from .fem.symmetry import SymmetryPlane as SymmetryPlane
 from .io.errors import ConvergenceError as ConvergenceError
 from .io.errors import DataFileError as DataFileError
 from .io.errors import InputError as InputError
@@ -61,8 +61,8 @@ from .learning.library import evaluate as evaluate
 from .learning.library import fit_force as fit_force
 from .learning.library import identify as identify
 from .learning.library import reconstruct as reconstruct
+from .mesh.arm import ArmGeometry as ArmGeometry
 from .mesh.arm import mesh_arm as mesh_arm
-from .mesh.arm_geometry import ArmGeometry as ArmGeometry
 from .mesh.chambers import find_chambers as find_chambers
 from .mesh.mesh import Mesh as Mesh
 from .mesh.mesh import box_hexahedra as box_hexahedra

@@ -17,7 +17,7 @@ from rich.table import Table
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
-from .energies.law_files import law_path
+from .energies.catalogue import law_path
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run

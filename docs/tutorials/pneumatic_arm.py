@@ -67,7 +67,7 @@ for name, energies in {"without fibres": [Pressure(chambers)], "with fibres": [P
     simulator = arm(energies)
     states = simulator.static_equilibrium(Inputs(pressure=pressures), batch=len(pressures))
     bends[name] = 1e3 * (states.q[:, tip].mean(1) - states.q[0, tip].mean(0)).norm(dim=1)
-    volumes[name] = simulator.explicit_energy("pressure", batch=len(pressures)).conjugates(states.q)[:, 0]  # m^3
+    volumes[name] = energies[0].volumes(simulator.body.mesh, states.q)[:, 0]  # m^3
 
 figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
 for name, values in bends.items():

@@ -20,7 +20,7 @@ from warp_resphys import (
 )
 from warp_resphys.dynamics import equilibrium, hessian
 from warp_resphys.dynamics.corotation import Corotation
-from warp_resphys.fem.symmetry import SymmetryPlane
+from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import has_pardiso
 from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
 from warp_resphys.stepping.inputs import Inputs

@@ -20,7 +20,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.fem.rigid import Glue, Rigid
+from warp_resphys.fem.body import Glue, Rigid
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import central_difference
 

@@ -19,7 +19,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.fem.symmetry import SymmetryPlane
+from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import boundary_triangles
 from warp_resphys.studies.gradient_check import POSES, check_gradients

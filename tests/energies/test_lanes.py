@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, box_hexahedra, box_tetrahedra
 from warp_resphys.energies.catalogue import MATERIALS
-from warp_resphys.energies.placed import PlacedEnergy
+from warp_resphys.energies.placement import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid, SolidTerm
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warp_resphys as wr
-from warp_resphys.energies.law_files import LAW_FORMAT, law_path, read_law
+from warp_resphys.energies.catalogue import LAW_FORMAT, law_path, read_law
 
 SHIPPED = sorted(path.stem for path in (Path(wr.__file__).parent / "laws").glob("*.json"))
 

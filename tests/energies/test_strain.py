@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra
-from warp_resphys.energies.strain import GreenStrain, StrainTerm
+from warp_resphys.energies.viscosity import GreenStrain, StrainTerm
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (3, 1, 1))
 

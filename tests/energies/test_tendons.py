@@ -167,11 +167,6 @@ def test_the_hessian_has_what_couples_the_pieces_of_a_tendon(offset):
     torch.testing.assert_close(shifted.view(-1, 3), direction[0, free], rtol=1e-8, atol=1e-8)
 
 
-def test_a_tendon_has_no_energy_by_its_tension_alone():
-    with pytest.raises(InputError, match="tendon_tension depends on more than that input"):
-        simulator(route(0.018)).explicit_energy("tendon_tension", 1)
-
-
 def test_a_tendon_cannot_push():
     sim = simulator(route(0.018))
     with pytest.raises(InputError, match="tendon_tension is"):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warp_resphys.energies.law_files import unit_of
+from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.experiment.identify_law import _LawSearch
 from warp_resphys.experiment.law_trials import Score, branches_of, strong_names
 from warp_resphys.learning.law import LawClass, Library

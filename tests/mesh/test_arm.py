@@ -10,8 +10,7 @@ from scipy.integrate import trapezoid
 from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.arm import mesh_arm
-from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm import ArmGeometry
 from warp_resphys.mesh.arm_section import SOLID, Piece, Section, section_grids, section_quadrilaterals
 
 

@@ -8,8 +8,7 @@ from matplotlib.image import imread
 
 from support.command_line import refusal, settings_of
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.mesh.arm import mesh_arm, name_surfaces
-from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
 from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic, select_vertices
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, find_chambers
-from warp_resphys.mesh.arm import mesh_arm
-from warp_resphys.mesh.arm_geometry import ArmGeometry
+from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
 from warp_resphys.mesh.mesh import quadratic
 
 RUBBER = Corotated(264e3, 0.499, density=1070.0)

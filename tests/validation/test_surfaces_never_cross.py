@@ -48,10 +48,9 @@ from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Material
 from warp_resphys.energies.obstacles import Cylinder, HalfSpace
 from warp_resphys.energies.pairs import PairList, Surface
-from warp_resphys.mesh.boxes import boxes_hexahedra
 from warp_resphys.mesh.mesh import check_mesh
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.rod import rod
+from warp_resphys.mesh.rod import boxes_hexahedra, rod
 from warp_resphys.robot.gripper import thing_mesh
 
 FloatArray = NDArray[np.float64]

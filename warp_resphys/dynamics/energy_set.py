@@ -1,29 +1,31 @@
-"""All energies of a simulator as one: quantities, values of a step, and memory.
+"""All energies of a simulator as one: quantities, terms of the incremental potential, and memory.
 
 An energy has its own names (``youngs_modulus``). If a simulator has several energies of a kind, such as the solids of
 two regions, their names in the simulator have a prefix (``tip_youngs_modulus``), which is added and removed only here.
+Mass damping is linear in the solution, so it is merged with inertia and target.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 
-from ..energies.base import BoundEnergy, EnergySite, Memory, Term
+from ..energies.base import BoundEnergy, EnergySite, Memory
 from ..energies.contact import BoundContact, ContactForces
-from ..energies.explicit import ExplicitEnergy
-from ..energies.obstacle_surfaces import ObstacleMotion
-from ..energies.placed import PlacedEnergy
-from ..energies.surfaces import BoundSurfaceContact, SurfaceForces
+from ..energies.obstacles import ObstacleMotion
+from ..energies.placement import DEPENDENT, PlacedEnergy, Step
+from ..energies.potential import StepTerms
+from ..energies.surfaces import BoundSurfaceContact
 from ..fem.body import Body
+from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
 from ..stepping.constants import Constants, Mass
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import ImplicitStage, State
+from ..stepping.state import State
 
 
 class EnergySet:
@@ -32,6 +34,7 @@ class EnergySet:
     Args:
         placed: the energies, with their points and prefixes.
         body: the body.
+        coordinates: its coordinates.
         rest_positions: (N, 3) [m], with the simulator's device and dtype.
         method: the integrator.
         time_step: h [s].
@@ -49,12 +52,12 @@ class EnergySet:
         self,
         placed: Sequence[PlacedEnergy],
         body: Body,
+        coordinates: DeviceCoordinates,
         rest_positions: torch.Tensor,
         method: Integrator,
         time_step: float,
     ) -> None:
-        self.placed, self._rest_positions = tuple(placed), rest_positions
-        self._explicit: dict[tuple[int, str], ExplicitEnergy] = {}
+        self.placed, self._coordinates = tuple(placed), coordinates
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}
@@ -103,7 +106,7 @@ class EnergySet:
     def _pairs(self) -> Iterable[tuple[PlacedEnergy, BoundEnergy]]:
         return zip(self.placed, self._bound, strict=True)
 
-    def values(self, constants: Constants, inputs: Inputs, batch: int) -> dict[str, torch.Tensor | None]:
+    def _values(self, constants: Constants, inputs: Inputs, batch: int) -> dict[str, torch.Tensor | None]:
         """Returns the values that follow from parameters and inputs, by name; missing inputs are zero."""
         values = dict(constants.values)
         for name in self.inputs:
@@ -111,81 +114,87 @@ class EnergySet:
             values[name] = constants.gravity.new_zeros(batch, self.counts[name]) if value is None else value
         return values
 
-    def loads(self, constants: Constants, inputs: Inputs, batch: int, static: bool) -> Iterator[torch.Tensor]:
-        """Yields dead loads (1 or B, N, 3), independent of the positions [N]."""
-        for _, (placed, bound) in self._loading:
-            load = bound.load(placed.own_inputs(inputs), placed.own_constants(constants), batch, static)
-            if load is not None:
-                yield load
-
-    def begin_step(
-        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, terms: Sequence[Term]
-    ) -> dict[str, torch.Tensor | None]:
-        """Returns the values that depend on the step, by name."""
-        values: dict[str, torch.Tensor | None] = {}
+    def step_terms(self, step: Step) -> StepTerms:
+        """Returns the terms of a step, differentiable."""
+        batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
+        damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
+        mass, force = constants.mass, self._loads(step, False)
+        if step.inputs.attached_mass is not None:
+            mass = mass + step.inputs.attached_mass
+        values = self._values(constants, step.inputs, batch)
         for i, (placed, bound) in self._stepping:
-            values |= placed.named(bound.begin_step(placed.step(state, stage, inputs, constants, terms[i])))
-        return values
+            values |= placed.named(bound.begin_step(placed.step(step, i)))
+        target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
+        inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
+        if self._coordinates.depends:
+            dependent = self._coordinates.dependent
+            values[f"{DEPENDENT}inertia"] = inertia[:, dependent]
+            values[f"{DEPENDENT}target"] = target[:, dependent]
+        return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
-    def at_rest(
-        self, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]
-    ) -> dict[str, torch.Tensor | None]:
-        """Returns these values for a static equilibrium after a state."""
-        values = {k: v for p, bound in self._pairs for k, v in p.named(bound.at_rest(state.batch)).items()}
+    def rest_terms(self, step: Step, share: float, near: torch.Tensor | None = None) -> StepTerms:
+        """Returns the terms of a static equilibrium under a fraction of all loads, differentiable.
+
+        Args:
+            step: the equilibrium after a state, whose memory friction continues, and whose positions and forces that of
+                contact; its inputs are constant.
+            share: the fraction.
+            near: (B, N, 3) positions of forces that depend on the pose; without, these are left out [m].
+        """
+        state, batch = step.state, step.state.batch
+        values = self._values(step.constants, step.inputs, batch)
+        for name in self.inputs:
+            value = values[name]
+            values[name] = None if value is None else share * value
+        values |= {k: v for placed, bound in self._pairs for k, v in placed.named(bound.at_rest(batch)).items()}
         for i, (placed, bound) in self._rate_independent:
-            step = placed.step(state, _endless_stage(state), inputs, constants, terms[i])
-            values |= placed.named(bound.begin_step(step))
-        return values
+            values |= placed.named(bound.begin_step(placed.step(step, i)))
+        if near is not None:
+            for _, (placed, bound) in self._posing:
+                own = {name: value for name, value in placed.own(values).items() if value is not None}
+                values |= placed.named(bound.at_pose(near, own))
+        force = self._coordinates.reduce(self._loads(step, True).expand(batch, -1, -1))
+        return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
+
+    def _loads(self, step: Step, static: bool) -> torch.Tensor:
+        """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
+        constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
+        if inputs.attached_mass is not None:
+            mass = mass + inputs.attached_mass
+        force = mass[..., None] * constants.gravity[:, None]
+        if inputs.external_force is not None:
+            force = force + inputs.external_force
+        for _, (placed, bound) in self._loading:
+            own = placed.own_inputs(inputs), placed.own_constants(constants)
+            if (load := bound.load(*own, step.state.batch, static)) is not None:
+                force = force + load
+        return force
 
     @property
     def follow_pose(self) -> bool:
         """Whether values of a static equilibrium depend on its positions."""
         return bool(self._posing)
 
-    def at_pose(self, q: torch.Tensor, values: Mapping[str, torch.Tensor | None]) -> dict[str, torch.Tensor | None]:
-        """Returns these values at positions (B, N, 3) [m], with the other values by name."""
-        posed: dict[str, torch.Tensor | None] = {}
-        for _, (placed, bound) in self._posing:
-            own = {name: value for name, value in placed.own(values).items() if value is not None}
-            posed |= placed.named(bound.at_pose(q, own))
-        return posed
+    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each.
 
-    def end_step(
-        self,
-        state: State,
-        stage: ImplicitStage,
-        inputs: Inputs,
-        constants: Constants,
-        terms: Sequence[Term],
-        x: torch.Tensor,
-        q: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:
-        """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each."""
-        return self._remembered(self._remembering, state, stage, inputs, constants, terms, x, q)
+        After a static equilibrium these are the ones of energies without rate.
+        """
+        remembering = self._remembering if math.isfinite(step.stage.step) else self._rate_independent
+        memory: dict[str, torch.Tensor] = {}
+        for i, (placed, bound) in remembering:
+            memory |= placed.named(bound.end_step(placed.step(step, i), x, q))
+        return memory
 
-    def end_pose(
-        self, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term], q: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
-        """Returns the memory variables of a static equilibrium (B, N, 3) after a state."""
-        return self._remembered(self._rate_independent, state, _endless_stage(state), inputs, constants, terms, q, q)
-
-    def contacts(
-        self,
-        state: State,
-        stage: ImplicitStage,
-        inputs: Inputs,
-        constants: Constants,
-        terms: Sequence[Term],
-        x: torch.Tensor,
-    ) -> dict[str, ContactForces | SurfaceForces]:
+    def contacts(self, step: Step, x: torch.Tensor) -> dict[str, ContactForces]:
         """Returns the contact of a step with solution x (B, N, 3) by name (`Simulator.contacts`)."""
-        out: dict[str, ContactForces | SurfaceForces] = {}
+        out: dict[str, ContactForces] = {}
         for i, (placed, bound) in enumerate(self._pairs):
             if isinstance(bound, BoundContact | BoundSurfaceContact):
                 name = (
                     placed.prefix.removesuffix("_") if isinstance(bound, BoundContact) else f"{placed.prefix}surfaces"
                 )
-                out[name] = bound.forces(placed.step(state, stage, inputs, constants, terms[i]), x)
+                out[name] = bound.forces(placed.step(step, i), x)
         return out
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
@@ -205,34 +214,6 @@ class EnergySet:
                 q = bound.outside(q, state, placed.own_constants(constants))
         return q
 
-    @staticmethod
-    def _remembered(
-        remembering: Sequence[tuple[int, tuple[PlacedEnergy, BoundEnergy]]],
-        state: State,
-        stage: ImplicitStage,
-        inputs: Inputs,
-        constants: Constants,
-        terms: Sequence[Term],
-        x: torch.Tensor,
-        q: torch.Tensor,
-    ) -> dict[str, torch.Tensor]:
-        memory: dict[str, torch.Tensor] = {}
-        for i, (placed, bound) in remembering:
-            memory |= placed.named(bound.end_step(placed.step(state, stage, inputs, constants, terms[i]), x, q))
-        return memory
-
-    def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
-        """Returns the energy with the named input for a batch size, made at its first use; see `Simulator`."""
-        if (batch, name) not in self._explicit:
-            placed = next((item for item in self.placed if name in item.input_names), None)
-            if placed is None:
-                accepted = ", ".join(self.inputs) or "none"
-                raise InputError(f"Unknown input {name}. The energies of this body accept {accepted}.")
-            energy, (points,) = placed.energy, placed.all_points or placed.points
-            q = self._rest_positions
-            self._explicit[batch, name] = ExplicitEnergy(energy, points, len(q), batch, q.device)
-        return self._explicit[batch, name]
-
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
         """Raises InputError for an unknown memory variable, a wrong shape or dtype, or values that are not finite."""
         for name, values in memory.items():
@@ -242,8 +223,3 @@ class EnergySet:
                     f"Unknown memory {name!r} of the state. The energies of this body remember {names}; leave it out."
                 )
             self.memory[name].check(values, batch, like)
-
-
-def _endless_stage(state: State) -> ImplicitStage:
-    """Returns the stage of a static equilibrium after a state: a step without end, in which inertia has no part."""
-    return ImplicitStage(math.inf, state.q, state.q, ())

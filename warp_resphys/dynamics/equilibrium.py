@@ -10,7 +10,7 @@ from torch.autograd import forward_ad
 from typing_extensions import override
 
 from ..energies.launcher import lasting
-from ..energies.placed import PlacedEnergy
+from ..energies.placement import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError

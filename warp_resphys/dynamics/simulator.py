@@ -9,12 +9,10 @@ import numpy as np
 import torch
 
 from ..energies.contact import ContactForces
-from ..energies.explicit import ExplicitEnergy
 from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
-from ..energies.obstacle_surfaces import ObstacleMotion
-from ..energies.placement import Materials, joined_names, place_energies
-from ..energies.surfaces import SurfaceForces
+from ..energies.obstacles import ObstacleMotion
+from ..energies.placement import Materials, Step, joined_names, place_energies
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
@@ -24,14 +22,13 @@ from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import ImplicitStage, State
+from ..stepping.state import State
 from .assembly import BlockPattern
 from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
 from .nonlinear_solver import SolveReport, SolverSettings, check_converged
 from .plausibility import warn_of_implausible
-from .potential_terms import PotentialTerms
 from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
 from .trajectory import Trajectory
 
@@ -121,8 +118,8 @@ class Simulator:
         placed = place_energies(body, self.material)
         if any(item.energy.is_barrier for item in placed):
             self._check_barriers()
-        energies = EnergySet(placed, body, self.rest_positions, self.method, self.time_step)
-        self._energies, self._terms = energies, PotentialTerms(energies, self._coordinates)
+        where = (body, self._coordinates, self.rest_positions, self.method, self.time_step)
+        self._energies = energies = EnergySet(placed, *where)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
         sets = [points for item in placed for points in item.points]
         pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
@@ -205,14 +202,6 @@ class Simulator:
             self._workspaces[batch] = workspace
         return self._workspaces[batch]
 
-    def explicit_energy(self, name: str, batch: int) -> ExplicitEnergy:
-        """Returns the energy with the named input, for evaluation at given positions.
-
-        Raises:
-            InputError: no energy of the body has that input, or one that has several values.
-        """
-        return self._energies.explicit_energy(name, batch)
-
     def rest_state(self, batch: int = 1) -> State:
         """Returns the undeformed body at rest, for a batch of one or more environments."""
         _check_count("batch", batch)
@@ -273,42 +262,35 @@ class Simulator:
         self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None = None
     ) -> tuple[State, SolveReport, torch.Tensor]:
         """Returns the next state, and report and solution (B, N, 3) of its solve [m]."""
-        stage = self.method.stage(state, self.time_step)
-        workspace = self.workspace(state.batch)
-        terms = self._terms.of_step(state, stage, inputs, constants, workspace.potential.energies)
-        clamped = self._fixed_at(state, stage, inputs)
-        follows = workspace.follows(state.q)
-        start = stage.target if near is None else self.method.solution_for(state, near).detach()
+        step, workspace = self._step(state, inputs, constants), self.workspace(state.batch)
+        terms, clamped, follows = self._energies.step_terms(step), self._fixed_at(step), workspace.follows(state.q)
+        start = step.stage.target if near is None else self.method.solution_for(state, near).detach()
         x, report = equilibrium(workspace, "dynamics", self.settings, terms, start, clamped, follows)
         x = self._coordinates.expand(x)
-        new = self._finish(state, stage, inputs, constants, x)
+        new = self._finish(step, x)
         workspace.record_positions(new.q)
         return new, report, x
 
-    def _fixed_at(self, state: State, stage: ImplicitStage, inputs: Inputs) -> torch.Tensor:
-        """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
-        now = state.q[:, self.fixed]
-        return now if inputs.fixed_positions is None else now + stage.end * (inputs.fixed_positions - now)
+    def _step(self, state: State, inputs: Inputs, constants: Constants) -> Step:
+        """Returns a time step from a state."""
+        terms = self.workspace(state.batch).potential.energies
+        return Step(state, self.method.stage(state, self.time_step), inputs, constants, terms)
 
-    def _finish(
-        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor
-    ) -> State:
+    def _fixed_at(self, step: Step) -> torch.Tensor:
+        """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
+        now, fixed = step.state.q[:, self.fixed], step.inputs.fixed_positions
+        return now if fixed is None else now + step.stage.end * (fixed - now)
+
+    def _finish(self, step: Step, x: torch.Tensor) -> State:
         """Returns the new state from the solution x of the stage."""
-        new = self.method.finish(state, x, self.time_step)
-        new = replace(new, memory=self._end_step(state, stage, inputs, constants, x, new.q))
-        if stage.end == 1.0 or not len(self.fixed):
+        new = self.method.finish(step.state, x, self.time_step)
+        new = replace(new, memory=self._energies.end_step(step, x, new.q))
+        if step.stage.end == 1.0 or not len(self.fixed):
             return new
         # Prescribed motions have a known velocity; extrapolation from mid-step would oscillate.
-        now = state.q[:, self.fixed]
-        moved = torch.zeros_like(now) if inputs.fixed_positions is None else inputs.fixed_positions - now
+        now, fixed = step.state.q[:, self.fixed], step.inputs.fixed_positions
+        moved = torch.zeros_like(now) if fixed is None else fixed - now
         return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
-
-    def _end_step(
-        self, state: State, stage: ImplicitStage, inputs: Inputs, constants: Constants, x: torch.Tensor, q: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
-        """Returns the memory variables after a step with solution x and final positions q."""
-        terms = self.workspace(state.batch).potential.energies
-        return self._energies.end_step(state, stage, inputs, constants, terms, x, q)
 
     def remember(self, state: State, q: torch.Tensor, constants: Constants, inputs: Inputs | None = None) -> State:
         """Returns a state at given positions, with the memory variables after a step to these positions.
@@ -319,9 +301,8 @@ class Simulator:
             constants: constants from `prepare`.
             inputs: inputs during the step.
         """
-        stage = self.method.stage(state, self.time_step)
-        x = self.method.solution_for(state, q)
-        return State(q, state.v, memory=self._end_step(state, stage, inputs or _NO_INPUTS, constants, x, q))
+        step = self._step(state, inputs or _NO_INPUTS, constants)
+        return State(q, state.v, memory=self._energies.end_step(step, self.method.solution_for(state, q), q))
 
     def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
         """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.
@@ -339,7 +320,7 @@ class Simulator:
 
     def contacts(
         self, state: State, after: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
-    ) -> dict[str, ContactForces | SurfaceForces]:
+    ) -> dict[str, ContactForces]:
         """Returns gaps, forces, slides and sticking at the end of a step, differentiable.
 
         Args:
@@ -356,8 +337,7 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
         """
         inputs, constants = self._checked(state, inputs, parameters)
-        terms, stage = self.workspace(state.batch).potential.energies, self.method.stage(state, self.time_step)
-        return self._energies.contacts(state, stage, inputs, constants, terms, after.q)
+        return self._energies.contacts(self._step(state, inputs, constants), after.q)
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -374,7 +354,7 @@ class Simulator:
         with torch.no_grad():
             moved = replace(state, q=state.q + _SHIFT)
             contacts = self.contacts(state, moved, inputs, parameters).values()
-            rubbing = [own.friction for own in contacts if isinstance(own, ContactForces)]
+            rubbing = [own.friction for own in contacts if own.obstacles]
             return any(bool(((own != 0.0).any(-1).any(-1).sum(-1) >= _HELD_BY).all()) for own in rubbing)
 
     def obstacle_motions(
@@ -402,11 +382,10 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
         """
         inputs, constants = self._checked(state, inputs, parameters)
-        stage, workspace = self.method.stage(state, self.time_step), self.workspace(state.batch)
-        terms = self._terms.of_step(state, stage, inputs, constants, workspace.potential.energies)
-        clamped, finish = self._fixed_at(state, stage, inputs), partial(self._finish, state, stage, inputs, constants)
+        step, workspace = self._step(state, inputs, constants), self.workspace(state.batch)
+        terms, clamped, finish = self._energies.step_terms(step), self._fixed_at(step), partial(self._finish, step)
         name = self.settings.linear_solver
-        return Linearisation(workspace, terms, stage, clamped, self._coordinates, finish, name)
+        return Linearisation(workspace, terms, step.stage, clamped, self._coordinates, finish, name)
 
     def static_equilibrium(
         self,
@@ -452,7 +431,8 @@ class Simulator:
                 "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle "
                 "with friction, within the distance of contact."
             )
-        solve = partial(self._balance, inputs, constants, state)
+        step = Step.endless(state, inputs, constants, self.workspace(batch).potential.energies)
+        solve = partial(self._balance, step)
         limited = self.settings.max_iterations < MOST_ITERATIONS
         rest = self.rest_positions.expand_as(state.q)
         guess = state.q.detach() if start is None else start.detach()
@@ -464,7 +444,7 @@ class Simulator:
             x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
         else:
             x = find_equilibrium(solve, rest, guess, limited)
-        return self._resting(state, inputs, constants, x)
+        return self._resting(step, x)
 
     def linearise_equilibrium(
         self, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None, batch: int = 1
@@ -485,9 +465,8 @@ class Simulator:
         state = self.rest_state(batch)
         inputs, constants = self._checked(state, inputs, parameters)
         workspace, stage = self.workspace(batch), self.method.stage(state, self.time_step)
-        terms = self._terms.at_rest(state, inputs, constants, workspace.potential.energies, 1.0)
-        clamp = self._fixed_at(state, replace(stage, end=1.0), inputs)
-        finish = partial(self._resting, state, inputs, constants)
+        step = Step.endless(state, inputs, constants, workspace.potential.energies)
+        terms, clamp, finish = self._energies.rest_terms(step, 1.0), self._fixed_at(step), partial(self._resting, step)
         return Linearisation(workspace, terms, stage, clamp, self._coordinates, finish, self.settings.linear_solver)
 
     @property
@@ -495,30 +474,23 @@ class Simulator:
         """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
         return self._energies.follow_pose
 
-    def _resting(self, state: State, inputs: Inputs, constants: Constants, x: torch.Tensor) -> State:
+    def _resting(self, step: Step, x: torch.Tensor) -> State:
         """Returns the state in an equilibrium (B, N, 3) after a state [m]."""
-        terms = self.workspace(state.batch).potential.energies
-        return State(x, torch.zeros_like(x), memory=self._energies.end_pose(state, inputs, constants, terms, x))
+        return State(x, torch.zeros_like(x), memory=self._energies.end_step(step, x, x))
 
     def _balance(
-        self,
-        inputs: Inputs,
-        constants: Constants,
-        state: State,
-        share: float,
-        start: torch.Tensor,
-        near: torch.Tensor | None = None,
+        self, step: Step, share: float, start: torch.Tensor, near: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, SolveReport]:
         """Returns the equilibrium (B, N, 3) [m] after a state, under a share of loads, inputs and the clamp's motion.
 
         Forces that depend on the pose without a potential are those ``near`` (B, N, 3); without, they are left out.
         """
-        workspace = self.workspace(state.batch)
-        clamp = self.rest_positions[self.fixed].expand(state.batch, -1, -1)
+        batch, fixed = step.state.batch, step.inputs.fixed_positions
+        workspace, clamp = self.workspace(batch), self.rest_positions[self.fixed].expand(batch, -1, -1)
         most = min(self.settings.max_iterations, MOST_ITERATIONS)
         settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
-        at = clamp if inputs.fixed_positions is None else torch.lerp(clamp, inputs.fixed_positions, share)
-        terms = self._terms.at_rest(state, inputs, constants, workspace.potential.energies, share, near)
+        at = clamp if fixed is None else torch.lerp(clamp, fixed, share)
+        terms = self._energies.rest_terms(step, share, near)
         with progress_of(workspace.parts[0][1].potential, share, most):
             x, report = equilibrium(workspace, "statics", settings, terms, start, at)
         check_converged(settings, report, x)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..energies.obstacle_surfaces import ObstacleMotion
+from ..energies.obstacles import ObstacleMotion
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create

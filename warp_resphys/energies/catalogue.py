@@ -1,13 +1,35 @@
-"""Materials by the names that they have in configurations."""
+"""Materials by name, and files of identified laws: those of runs, and of silicones that come with the package."""
 
+import math
+from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fem.elements import principal_stretches, share_outside
 from ..io.classes import imported
-from ..io.errors import InputError
-from .materials import ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
+from ..io.errors import DataFileError, InputError, listed
+from ..io.files import read_json
+from ..mesh.mesh import Mesh
+from .materials import MASS_DAMPING, ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 
 MATERIALS: Final[dict[str, type[Material]]] = {
     kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial)
+}
+LAW_FORMAT: Final = 1
+_LAWS: Final = Path(__file__).parents[1] / "laws"
+_UNITS: Final = {
+    "density": "kg/m^3",
+    "mass": "1/s",
+    "damping": "s",
+    "viscosity": "Pa s",
+    "time": "s",
+    "azimuth": "rad",
+    "elevation": "rad",
+    "ratio": "",
+    "slack": "",
+    "toe": "",
 }
 
 
@@ -29,3 +51,105 @@ def make_material(model: str = "corotated", **constants: Any) -> Material:
         )
     material: Material = imported(model, Material).from_constants(constants)
     return material
+
+
+def law_path(name: str) -> Path:
+    """Path of a law: a file, or the name of a silicone whose law comes with the package.
+
+    Raises:
+        DataFileError: there is neither.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    known = {shipped.stem: shipped for shipped in _LAWS.glob("*.json")}
+    if name not in known:
+        raise DataFileError(f"there is no law {name}: give the law.json of a run, or one of {listed(sorted(known))}.")
+    return known[name]
+
+
+def read_law(name: str) -> dict[str, Any]:
+    """Contents of a law that `identify_law` wrote, with at least its ``model`` and its ``constants``.
+
+    Args:
+        name: as for `law_path`.
+
+    Raises:
+        DataFileError: the file is missing, damaged or of another version.
+    """
+    path = law_path(name)
+    content = read_json(path)
+    known = content if isinstance(content, dict) else {}
+    constants, of_today = known.get("constants"), known.get("format") == LAW_FORMAT and known["format"] is not True
+    if not (of_today and isinstance(known.get("model"), str) and isinstance(constants, dict) and constants):
+        raise DataFileError(
+            f"{path} is not a law of this version: give a law.json that a run with the group law has written."
+        )
+    units = known.get("units", {})
+    if not isinstance(units, dict):
+        raise DataFileError(f"{path}: units is {units!r}: give the unit of each constant, or leave it out.")
+    for key, value in constants.items():
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise DataFileError(
+                f"{path}: constants.{key} is {value!r}: a law has a finite number there; identify it again."
+            )
+        if (unit := units.get(key, unit_of(key))) != unit_of(key):
+            raise DataFileError(f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there.")
+    if "stretches" in known and not _is_range(known["stretches"]):
+        raise DataFileError(
+            f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
+        )
+    absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
+    return {**known, "constants": absent | constants}
+
+
+def unit_of(name: str) -> str:
+    """Unit of a constant of a law."""
+    words = {*name.split("_")}
+    return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
+
+
+def _is_range(values: object) -> bool:
+    """Whether these are two stretches in order."""
+    match values:
+        case [float() | int() as low, float() | int() as high]:
+            return bool not in (type(low), type(high)) and 0.0 < low <= high < math.inf
+    return False
+
+
+def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:
+    """The share of cells and states in which a law extrapolates, by the stretches at the centres of cells.
+
+    Args:
+        name: as for `law_path`.
+        mesh: undeformed mesh.
+        positions: (S, N, 3) vertices of some states [m], of which at most 400 are looked at, evenly chosen.
+
+    Raises:
+        DataFileError: as for `read_law`, or the file does not have the stretches.
+        InputError: no state is finite.
+    """
+    law = read_law(name)
+    if "stretches" not in law:
+        raise DataFileError(f"{law_path(name)} has no stretches: identify the law again, which writes them.")
+    stretches = principal_stretches(mesh, positions)
+    if not np.isfinite(stretches).any():
+        raise InputError("positions has no finite state, so that there are no stretches: give states of a motion.")
+    return share_outside(stretches, *law["stretches"])
+
+
+def read_material(name: str) -> Material:
+    """The material of a law: the law.json of a run, or a silicone whose law comes with the package.
+
+    Args:
+        name: path of the file, or name of the silicone, such as ``dragon_skin_10``.
+
+    Returns:
+        The material, with the density of the law; its damping by mass, which is of the robot, is left out.
+
+    Raises:
+        DataFileError: the file is missing, damaged or of another version.
+        InputError: a constant that the material does not have, or a value out of range.
+    """
+    law = read_law(name)
+    return make_material(law["model"], **{key: x for key, x in law["constants"].items() if key != MASS_DAMPING})

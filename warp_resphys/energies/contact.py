@@ -50,8 +50,7 @@ from ..stepping.state import State
 from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
-from .obstacle_surfaces import ObstacleMotion
-from .obstacles import DistanceGrid, Obstacle, ObstacleSet, Pose
+from .obstacles import DistanceGrid, Obstacle, ObstacleMotion, ObstacleSet, Pose
 
 log = logging.getLogger(__name__)
 
@@ -215,8 +214,10 @@ def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float
 class ContactForces:
     """Contact at the end of a step, for every vertex of the surface and every obstacle, differentiable.
 
+    That between surfaces has no axis of obstacles, and is with the nearest others.
+
     Attributes:
-        obstacles: names of the O obstacles.
+        obstacles: names of the O obstacles; none for contact between surfaces.
         vertices: (P,) vertices of the surface.
         gap: (B, P, O) distances [m].
         normal: (B, P, O, 3) forces of the barrier on the vertices [N].

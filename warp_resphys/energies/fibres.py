@@ -21,7 +21,7 @@ from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher
-from .part_terms import PartPoints, ReadingTerm
+from .pointwise import PartPoints, ReadingTerm
 
 _CAP = 0.7  # cosine between face normal and chamber axis above which a face is an end cap, without fibres
 _ALIGNED = 0.8  # smallest cosine between a chamber's principal direction and the given axis

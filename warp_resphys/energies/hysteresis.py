@@ -42,7 +42,7 @@ from ..mesh.mesh import Mesh
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
 from .solid import PointModuli, Solid
-from .strain import GreenStrain, StrainTerm
+from .viscosity import GreenStrain, StrainTerm
 
 PLASTIC_STRAIN: Final = "plastic_strain"
 

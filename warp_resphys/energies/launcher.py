@@ -27,6 +27,13 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def launch(kernel: Any, dim: Sequence[int], inputs: list[Any], outputs: list[Any], device: torch.device) -> None:
+    """Launches a kernel once, on torch's stream."""
+    with shareable():
+        options: dict[str, Any] = {"block_dim": BLOCK, "device": str(device), "stream": launch_stream(device)}
+        wp.launch(kernel, dim=tuple(dim), inputs=inputs, outputs=outputs, **options)
+
+
 @contextmanager
 def lasting() -> Iterator[None]:
     """Makes tensors that serve outside of ``torch.inference_mode`` too, without gradient if made there."""

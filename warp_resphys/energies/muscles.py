@@ -27,7 +27,7 @@ from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher
-from .part_terms import PartPoints, ReadingTerm
+from .pointwise import PartPoints, ReadingTerm
 
 STRESS = Quantity(
     *("muscle_stress", "Pa"), per="muscle", typical=1e4, words="stress", shown_unit="kPa", shown_factor=1e-3

@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import scipy.ndimage
@@ -16,15 +16,21 @@ from typing_extensions import override
 
 from ..io.errors import InputError, MeshError
 from ..kernels import obstacles as kernels
+from ..kernels.triangles import from_surface
+from ..mesh.motion_files import MovingSurface
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
-from .launcher import Launcher, warp_view
+from .launcher import launch, warp_view
 
 Vector = tuple[float, float, float]
 # Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
 # it, and a third above, from the coefficients of the node before, itself and the one behind.
 _VALUES = np.array([[2.0, 4.0, 0.0], [1.0, 4.0, 1.0], [0.0, 4.0, 2.0]]) / 6.0
 _SLOPES = np.array([[-5.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [-1.0, -4.0, 5.0]]) / 6.0
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+_CORNERS: Final = 64  # of a circle
+_PLATE: Final = (1.5, 0.02)  # edge and thickness of the plate that stands for a half-space, over the body's size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +281,7 @@ def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLik
     indices: Any = wp.array(np.asarray(triangles).ravel(), dtype=int, device="cpu")
     surface = wp.Mesh(corners, indices, support_winding_number=True)
     out = wp.zeros(len(arrays[1]), dtype=float, device="cpu")
-    wp.launch(kernels.from_surface, out.size, [surface.id, points], [out], device="cpu")
+    wp.launch(from_surface, out.size, [surface.id, points], [out], device="cpu")
     return np.asarray(out.numpy(), dtype=np.float64)
 
 
@@ -314,7 +320,6 @@ class ObstacleSet:
         self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
         self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
         self._reach = reach
-        self._measurements: dict[tuple[int, int, int], _Measurement] = {}
         grids = [o if isinstance(o, DistanceGrid) else None for o in obstacles]
         parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
         firsts = np.cumsum([0, *(len(part) for part in parts)])
@@ -337,43 +342,8 @@ class ObstacleSet:
 
     def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
-        size = batch, points, count = (*x.shape[:2], pose.place.shape[1])
-        if size not in self._measurements:
-            self._measurements[size] = _Measurement(self, batch, points, count, x.device)
-        d, n = _Distances.apply(self._measurements[size], x, pose.place, pose.turn, pose.growth)
+        d, n = _Distances.apply(self, x, pose.place, pose.turn, pose.growth)
         return d, n
-
-
-class _Measurement(Launcher):
-    """Buffers and launches of `kernels.obstacles.measure` and its adjoint for one size of a batch."""
-
-    def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
-        super().__init__(batch, device)
-        self._size = (points, count)
-        self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
-        x, *pose = self.inputs
-        self._given = [shapes.at(*pose), warp_view(x, wp.vec3d)]
-        self.results, views = self._pair()
-        self.measure = self.record(kernels.measure, (batch, *self._size), self._given, views)
-
-    def _pair(self) -> tuple[list[torch.Tensor], list[Any]]:
-        """Returns buffers of distances and normals, and Warp's views of them."""
-        buffers = [self.zeros(*self._size), self.zeros(*self._size, 3)]
-        return buffers, [warp_view(buffer, kind) for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)]
-
-    @cached_property
-    def adjoint(self) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, Any]:
-        """Buffers of derivatives by the results, by positions and by rotations, and the launch; made when needed."""
-        by_results, views = self._pair()
-        position, turn = self.zeros(*self._size, 3), self.zeros(*self._size, 3, 3)
-        slopes = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
-        inputs = [*self._given, *views]
-        return (
-            by_results,
-            position,
-            turn,
-            self.record(kernels.measure_adjoint, (self.batch, *self._size), inputs, slopes),
-        )
 
 
 class _Distances(torch.autograd.Function):
@@ -381,24 +351,99 @@ class _Distances(torch.autograd.Function):
 
     @override
     @staticmethod
-    def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        for buffer, value in zip(own.inputs, given, strict=True):
-            buffer.copy_(value.detach())
-        own.launch(own.measure)
-        ctx.own = own
-        ctx.save_for_backward(*given)
-        d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
-        return d, n
+    def forward(ctx: Any, shapes: ObstacleSet, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x, *pose = (value.detach().double().contiguous() for value in given)
+        distance = x.new_empty(*x.shape[:2], pose[0].shape[1])
+        normal = x.new_empty(*distance.shape, 3)
+        out = [warp_view(distance, wp.float64), warp_view(normal, wp.vec3d)]
+        launch(kernels.measure, distance.shape, [shapes.at(*pose), warp_view(x, wp.vec3d)], out, x.device)
+        ctx.shapes = shapes
+        ctx.save_for_backward(x, *pose)
+        return distance.to(given[0].dtype), normal.to(given[0].dtype)
 
     @override
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        own = ctx.own
-        buffers, position, turn, command = own.adjoint
-        for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
-            buffer.copy_(value)
-        own.launch(command)
-        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
+        x, *pose = ctx.saved_tensors
+        by_distance, by_normal = (value.double().contiguous() for value in by_results)
+        position, turn = torch.empty_like(by_normal), x.new_empty(*by_distance.shape, 3, 3)
+        given = [ctx.shapes.at(*pose), warp_view(x, wp.vec3d)]
+        given += [warp_view(by_distance, wp.float64), warp_view(by_normal, wp.vec3d)]
+        out = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
+        launch(kernels.measure_adjoint, by_distance.shape, given, out, x.device)
+        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -by_distance.sum(1))
         needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
         return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleMotion:
+    """Motion of an obstacle in a roll-out of T steps.
+
+    Attributes:
+        name: of the obstacle, with that of its body if there are several.
+        obstacle: its shape.
+        beside: (N, 3) vertices of the body at rest, beside which the plate of a half-space lies [m].
+        poses: (T + 1,) poses of B environments, of this obstacle alone.
+    """
+
+    name: str
+    obstacle: Obstacle
+    beside: FloatArray
+    poses: tuple[Pose, ...]
+
+    def surface(self, environment: int) -> MovingSurface:
+        """Returns the moving triangles of an environment."""
+        growth = float(self.poses[0].growth[environment, 0].detach())
+        own, triangles = surface_of(self.obstacle, growth, self.beside)
+        local = torch.as_tensor(own)[None, :, None]
+        points = []
+        for pose in self.poses:
+            here = (value[environment, None].detach().cpu().double() for value in (pose.place, pose.turn, pose.growth))
+            points.append(Pose(*here).world(local)[0, :, 0].numpy())
+        return MovingSurface(self.name, np.stack(points), triangles)
+
+
+def surface_of(obstacle: Obstacle, growth: float, beside: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Returns points (P, 3) [m] and triangles (S, 3) of an obstacle in its axes, with normals that point outwards.
+
+    Args:
+        obstacle: its shape.
+        growth: by which its surface lies further out [m].
+        beside: (N, 3) vertices of the body, beside which the plate of a half-space lies [m].
+    """
+    import trimesh
+
+    x, y, z = obstacle.size
+    place = np.zeros(3)
+    match obstacle:
+        case DistanceGrid():
+            return _contour(obstacle, growth)
+        case HalfSpace():
+            edge, thickness = np.multiply(_PLATE, np.ptp(beside, axis=0).max())
+            middle = (beside.mean(axis=0) - obstacle.position) @ obstacle.turn
+            solid, place = (
+                trimesh.creation.box((edge, edge, thickness)),
+                np.append(middle[:2], growth - 0.5 * thickness),
+            )
+        case Box():
+            solid = trimesh.creation.box(2.0 * (np.array([x, y, z]) + growth))
+        case Sphere():
+            solid = trimesh.creation.uv_sphere(radius=x + growth, count=(_CORNERS // 4, _CORNERS))
+        case Capsule():
+            solid = trimesh.creation.capsule(2.0 * z, x + growth, count=(_CORNERS // 4, _CORNERS))
+        case Cylinder():
+            solid = trimesh.creation.cylinder(x + growth, 2.0 * (z + growth), sections=_CORNERS)
+        case _:
+            raise TypeError(f"{type(obstacle).__name__} has no surface to draw")
+    return np.asarray(solid.vertices - solid.bounds.mean(axis=0) + place), np.asarray(solid.faces, dtype=np.int64)
+
+
+def _contour(grid: DistanceGrid, growth: float) -> tuple[FloatArray, IntArray]:
+    """Returns the points (P, 3) [m] and triangles (S, 3) at a distance from the surface of a grid."""
+    import pyvista
+
+    image = pyvista.ImageData(dimensions=grid.distances.shape, spacing=(grid.spacing,) * 3, origin=grid.low)
+    surface = image.contour([growth], scalars=grid.distances.ravel(order="F"))
+    return np.asarray(surface.points, dtype=float), np.asarray(surface.faces, dtype=np.int64).reshape(-1, 4)[:, :0:-1]

@@ -22,7 +22,7 @@ from ..kernels import points as kernels
 from ..kernels import reductions
 from .base import PairTangents, PointSet, Term
 from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
-from .placed import PlacedEnergy
+from .placement import PlacedEnergy
 
 
 def _do_nothing() -> None:

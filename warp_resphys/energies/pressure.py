@@ -22,7 +22,7 @@ from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import Adjoint, Energy, PointSet, Values
 from .launcher import Launcher, warp_view
-from .part_terms import PartPoints, PartTerm
+from .pointwise import PartPoints, PartTerm
 
 PRESSURE = Quantity(
     *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
@@ -72,6 +72,17 @@ class Pressure(Energy):
         operators = np.broadcast_to(operator, (len(nodes), *operator.shape)).copy()
         part = np.repeat(np.arange(self.count), [len(chamber.faces) * len(weights) for chamber in self.chambers])
         return (PartPoints(nodes, operators, part, np.tile(weights / 3.0, len(nodes))),)
+
+    def volumes(self, mesh: Mesh, positions: torch.Tensor) -> torch.Tensor:
+        """Returns the volumes (B, chambers) at positions (B, N, 3) of the vertices of a mesh, differentiable [m^3].
+
+        A volume is minus the derivative of the energy by the pressure.
+        """
+        (points,) = self.points(mesh)
+        operators, weights = (torch.as_tensor(x).to(positions) for x in (points.gradients, points.weights))
+        f = torch.einsum("cqkw,bcki->bcqiw", operators, positions[:, torch.as_tensor(points.nodes)])
+        parts = -torch.linalg.det(f).flatten(1) * weights
+        return parts.new_zeros(len(parts), self.count).index_add(1, torch.as_tensor(points.part).to(f.device), parts)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PressureTerm":

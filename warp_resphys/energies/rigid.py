@@ -21,10 +21,9 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.body import Body
+from ..fem.body import Body, Rigid
 from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, physical_gradients
-from ..fem.rigid import Rigid
 from ..kernels import rigid as kernels
 from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh

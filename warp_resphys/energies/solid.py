@@ -34,8 +34,7 @@ from .base import (
 )
 from .launcher import Launcher, warp_view
 from .materials import Material
-from .strain import GreenStrain, StrainTerm
-from .viscosity import Viscosity
+from .viscosity import GreenStrain, StrainTerm, Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
 VISCOUS: Final = ("viscosity", "strain_offset", "dilation_offset")  # values of a step (`energies.viscosity`)

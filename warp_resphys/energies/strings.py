@@ -34,7 +34,7 @@ from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher
-from .part_terms import PartPoints, ReadingTerm
+from .pointwise import PartPoints, ReadingTerm
 
 PAYLOAD = Quantity(
     "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3

@@ -32,6 +32,7 @@ from ..io.errors import InputError, MeshError
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, value_of
+from .contact import ContactForces
 from .launcher import Launcher
 from .pairs import PairList, Surface
 from .surface_term import FRICTION, STIFFNESS, SurfacePoints, SurfaceTerm
@@ -137,29 +138,6 @@ class SurfaceContact(Energy):
         return BoundSurfaceContact(self, site)
 
 
-@dataclass(frozen=True)
-class SurfaceForces:
-    """Contact between surfaces at the end of a step, for every vertex of the surface, differentiable.
-
-    Attributes:
-        vertices: (P,) vertices of the surface.
-        gap: (B, P) least distances [m]; the distance at which contact begins, where nothing is nearer.
-        normal: (B, P, 3) forces of the barrier on the vertices [N].
-        friction: (B, P, 3) forces of friction on them [N].
-        slide: (B, P) size of the velocity of sliding at the end of the step, times the effective step h_e, the largest
-            of those against others [m]; see `energies.contact.ContactForces`.
-        sticks: (B, P) whether a vertex that is pressed against others slides less than friction needs to be fully
-            developed.
-    """
-
-    vertices: torch.Tensor
-    gap: torch.Tensor
-    normal: torch.Tensor
-    friction: torch.Tensor
-    slide: torch.Tensor
-    sticks: torch.Tensor
-
-
 class BoundSurfaceContact(BoundEnergy):
     """Contact of surfaces in a simulator."""
 
@@ -224,11 +202,14 @@ class BoundSurfaceContact(BoundEnergy):
             "surface_place": state.q.detach(),
         }
 
-    def forces(self, step: EnergyStep, x: torch.Tensor) -> SurfaceForces:
-        """Returns the forces at the solution x (B, N, 3) of a step's implicit stage [m]."""
+    def forces(self, step: EnergyStep, x: torch.Tensor) -> ContactForces:
+        """Returns the forces at the solution x (B, N, 3) of a step's implicit stage [m].
+
+        Gaps are the least of a vertex, the distance at which contact begins where none is nearer; slides the largest.
+        """
         assert isinstance(step.term, SurfaceTerm)
         shared = {q.name: step.constants.value(q.name).expand(step.state.batch, -1) for q in (STIFFNESS, FRICTION)}
         values = {n: v.double() for n, v in {**shared, **self.begin_step(step)}.items() if v is not None}
         gap, normal, friction, slide = (out.to(x) for out in step.term.forces(values, x.double()))
         sticks = (slide >= 0.0) & (slide < value_of(values, "surface_slip").to(x))
-        return SurfaceForces(self._vertices, gap, normal, friction, slide.clamp_min(0.0), sticks)
+        return ContactForces((), self._vertices, gap, normal, friction, slide.clamp_min(0.0), sticks)

@@ -23,6 +23,7 @@ P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,18 +33,37 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..kernels import tendons as kernels
-from ..kernels.modules import launch_stream
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
-from .launcher import BLOCK, warp_view
+from .launcher import launch, warp_view
+from .pointwise import PartPoints
 from .strings import thread_pull
-from .tendon_routes import OFFSETS, TendonPoints, offset_vector
 
+TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
+CONTRACTION = Quantity(
+    *("tendon_contraction", "m"), per="tendon", typical=1e-3, words="contraction", shown_unit="mm", shown_factor=1e3
+)
+STIFFNESS = Quantity("tendon_stiffness", "N/m", 0.0, closed=True, per="tendon")
+OFFSETS = tuple(Quantity(f"tendon_offset_{k}", "m", per="tendon", typical=1e-3) for k in (1, 2))
 FRICTION = Quantity("tendon_friction", "", 0.0, closed=True, per="tendon")
 BRISTLE = Quantity("tendon_bristle_length", "m", 0.0, per="tendon")
 SEGMENT_TENSION = "tendon_segment_tension"
 STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")
 _STRAIGHT = 1e-4  # rad: angles are rounded off below it, so that they have a derivative at zero
+
+
+@dataclass(frozen=True)
+class TendonPoints(PartPoints):
+    """Segments of tendons between guides, tendon after tendon, with the operators of F (`kernels.tendons`)."""
+
+    rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
+    anchors: NDArray[np.float64]  # (P, 3, 3) part of F due to guides that are fixed in the world [m]
+
+
+def offset_vector(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Returns the vectors c (1 or B, T, 3) of `kernels.tendons` for offsets by name."""
+    first, second = torch.broadcast_tensors(*(values[offset.name] / kernels.OFFSET_UNIT for offset in OFFSETS))
+    return torch.stack([torch.ones_like(first), first, second], -1)
 
 
 def friction_after(
@@ -178,7 +198,8 @@ class _Stick(torch.autograd.Function):
     def forward(ctx: Any, runs: Any, begin: torch.Tensor, held: torch.Tensor, growth: torch.Tensor) -> torch.Tensor:
         given = [x.detach().double().expand(len(held), -1).contiguous() for x in (begin, held, growth)]
         segments = torch.zeros_like(given[1])
-        _launch(kernels.stick, given[0], runs, *given, segments)
+        views = [warp_view(value, wp.float64) for value in (*given, segments)]
+        launch(kernels.stick, given[0].shape, [runs, *views], [], segments.device)
         ctx.runs, ctx.shared = runs, [len(x) < len(held) for x in (begin, held, growth)]
         ctx.save_for_backward(*given, segments)
         return segments.to(held.dtype)
@@ -189,17 +210,11 @@ class _Stick(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         *given, segments = ctx.saved_tensors
         slopes = [torch.zeros_like(x) for x in given]
-        _launch(kernels.stick_adjoint, given[0], ctx.runs, *given, segments, gradient.double().contiguous(), *slopes)
+        tensors = (*given, segments, gradient.double().contiguous(), *slopes)
+        inputs = [ctx.runs, *(warp_view(value, wp.float64) for value in tensors)]
+        launch(kernels.stick_adjoint, given[0].shape, inputs, [], segments.device)
         pairs = zip(slopes, ctx.shared, strict=True)
         return None, *((x.sum(0, keepdim=True) if shared else x).to(gradient.dtype) for x, shared in pairs)
-
-
-def _launch(kernel: Any, like: torch.Tensor, runs: Any, *tensors: torch.Tensor) -> None:
-    """Launches a kernel with a thread for each tendon (B, T)."""
-    views, device = [warp_view(x, wp.float64) for x in tensors], like.device
-    wp.launch(
-        kernel, dim=like.shape, inputs=[runs, *views], device=str(device), stream=launch_stream(device), block_dim=BLOCK
-    )
 
 
 def beyond(part: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -35,9 +35,20 @@ from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
-from .part_terms import PartTerm
-from .tendon_friction import BRISTLE, FRICTION, STEP_VALUES, BoundTendons, beyond, friction_after
-from .tendon_routes import CONTRACTION, OFFSETS, STIFFNESS, TENSION, TendonPoints
+from .pointwise import PartTerm
+from .tendon_friction import (
+    BRISTLE,
+    CONTRACTION,
+    FRICTION,
+    OFFSETS,
+    STEP_VALUES,
+    STIFFNESS,
+    TENSION,
+    BoundTendons,
+    TendonPoints,
+    beyond,
+    friction_after,
+)
 
 
 @dataclass(frozen=True)

@@ -21,18 +21,15 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
 from ..energies.materials import Material
-from ..fem.body import Body
-from ..fem.rigid import Glue, Rigid
-from ..fem.symmetry import SymmetryPlane
+from ..fem.body import Body, Glue, Rigid
+from ..fem.coordinates import SymmetryPlane
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError
 from ..io.machine import find_device
-from ..mesh.arm import mesh_arm
-from ..mesh.arm_geometry import ArmGeometry
-from ..mesh.boxes import boxes_hexahedra
+from ..mesh.arm import ArmGeometry, mesh_arm
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, quadratic, select_cells, select_vertices
 from ..mesh.readers import read_mesh
-from ..mesh.rod import rod
+from ..mesh.rod import boxes_hexahedra, rod
 from ..mesh.tetrahedra import fill_surface
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
 from ..settings.mesh import (

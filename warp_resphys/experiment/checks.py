@@ -17,7 +17,7 @@ from ..data.markers import MarkerMap
 from ..dynamics.plausibility import mean_of, small_strain_stiffness
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
-from ..energies.law_files import read_law
+from ..energies.catalogue import read_law
 from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body

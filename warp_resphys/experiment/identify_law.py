@@ -18,7 +18,7 @@ import numpy as np
 
 from ..data.rigid_bodies import independent
 from ..dynamics.simulator import Simulator
-from ..energies.law_files import LAW_FORMAT, read_law, unit_of
+from ..energies.catalogue import LAW_FORMAT, read_law, unit_of
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions

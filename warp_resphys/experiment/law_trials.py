@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
-from ..energies.law_files import unit_of
+from ..energies.catalogue import unit_of
 from ..energies.materials import MASS_DAMPING
-from ..fem.stretches import principal_stretches
+from ..fem.elements import principal_stretches
 from ..learning.bounds import Bounds, Prior
 from ..learning.law import VISCOSITIES
 from ..learning.replay import Replay, Start

@@ -16,7 +16,7 @@ from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
-from ..fem.stretches import principal_stretches, share_outside
+from ..fem.elements import principal_stretches, share_outside
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..fem.stretches import principal_stretches, share_outside
+from ..fem.elements import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress

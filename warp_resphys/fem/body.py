@@ -12,12 +12,36 @@ from numpy.typing import ArrayLike, NDArray
 from ..io.errors import InputError
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
-from .coordinates import Coordinates, rigid_weights
+from .coordinates import Coordinates, SymmetryPlane, rigid_weights
 from .elements import Discretisation, Points, discretise
-from .rigid import Glue, Rigid
-from .symmetry import SymmetryPlane
 
 MASS_MODES = ("row_sum", "per_vertex")
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert.
+
+    Raises:
+        InputError: a stiffness that is not positive.
+    """
+
+    density: float | Sequence[float] | Any = 1200.0  # [kg/m^3], a number or (B, 1) values
+    stiffness: float = 1e9  # kappa of the energy kappa V |F - R(F)|^2 [Pa]
+
+    def __post_init__(self) -> None:
+        """Checks the stiffness."""
+        if not (np.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise InputError(f"the stiffness of a rigid part is {self.stiffness:g}: it must be positive, in Pa.")
+
+
+@dataclass(frozen=True)
+class Glue:
+    """Vertices glued to a region of the mesh whose cells need not match theirs."""
+
+    vertices: ArrayLike  # (n,) glued vertices
+    to: str  # region they are glued to
+    tolerance: float = 1e-3  # largest distance from the region [m]; gaps are kept
 
 
 class BodyEnergy(Protocol):

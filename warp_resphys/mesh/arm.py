@@ -3,20 +3,119 @@
 An arm is clamped at z = 0 and hangs along -z. `mesh_arm` fills it with hexahedra, or with tetrahedra by gmsh.
 """
 
-from math import pi
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite, pi
+from typing import Any
 
 import numpy as np
 
 from ..io.errors import MeshError
-from .arm_geometry import ArmGeometry, numbers
-from .arm_section import SOLID, section_grids, section_quadrilaterals
-from .arm_tetrahedra import tetrahedra
+from .arm_section import SOLID, ComplexArray, Section, section_grids, section_quadrilaterals
 from .chambers import find_chambers
 from .mesh import IntArray, Mesh, boundary_faces, check_mesh
+from .tetrahedra import tetrahedra_by_gmsh
 
+_PROFILES = ("half_disc", "disc", "sector")
+_OUTLINES = ("lobed", "round")
+_MOST_CHAMBERS = 8  # per segment
 CELLS = ("hexahedra", "tetrahedra")
 _SLENDER = 2.5  # default height of a layer of hexahedra over their size in the section
 _MOST_CELLS = 2_000_000
+
+
+@dataclass(frozen=True)
+class ArmGeometry:
+    """Dimensions of a pneumatic arm; defaults are those of SoPrA (Toshimitsu et al. 2021).
+
+    From base to tip, solid caps alternate with the chambers of a segment, beginning and ending with a cap. The arm
+    tapers linearly along chambers; caps are cylinders.
+
+    Raises:
+        MeshError: a dimension that is not positive, sequences of inconsistent length, or chambers that do not fit.
+    """
+
+    chamber_lengths: Sequence[float] = (0.120, 0.120)  # length of the chambers of each segment [m]
+    caps: Sequence[float] = (0.010, 0.021, 0.005)  # heights of the solid caps [m]; one more than segments
+    # largest radius of the outline before the first chambers and after those of each segment [m]
+    radii: Sequence[float] = (0.0283923, 0.0212942, 0.0165622)
+    chambers: int = 3  # chambers per segment, 2 to 8
+    profile: str = (
+        "half_disc"  # of a chamber: half_disc, with the flat side towards the axis; disc; sector of an annulus
+    )
+    outline: str = "lobed"  # lobed, parallel to each chamber at the distance `wall`; or round, a circle
+    wall: float = 0.004  # thickness between a chamber and the outline [m]
+    web: float = 0.004  # smallest thickness between neighbouring chambers [m]
+    core: float | None = (
+        None  # distance of the chambers from the axis at the base [m], scales with the radius; None: min
+    )
+    # rotation of each segment's chambers about the axis [deg], counter-clockwise seen from the base; empty: none
+    rotations: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        """Checks all dimensions, and stores sequences as tuples."""
+        for name in ("chamber_lengths", "caps", "radii", "rotations"):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), positive=name != "rotations"))
+        count = len(self.chamber_lengths)
+        if not count:
+            raise MeshError("the arm's chamber_lengths are empty: give one length for each segment.")
+        needed = {"caps": count + 1, "radii": count + 1, "rotations": count if self.rotations else 0}
+        for name, number in needed.items():
+            given = len(getattr(self, name))
+            if given != number:
+                raise MeshError(f"the arm's {name} are {given} numbers, but {count} chamber_lengths need {number}.")
+        for name in ("wall", "web", "core"):
+            numbers(name, (getattr(self, name),) if getattr(self, name) is not None else ())
+        for name, choices in (("profile", _PROFILES), ("outline", _OUTLINES)):
+            if getattr(self, name) not in choices:
+                raise MeshError(f"the arm's {name} is {getattr(self, name)!r}: choose {', '.join(choices)}.")
+        if type(self.chambers) is not int or not 2 <= self.chambers <= _MOST_CHAMBERS:
+            raise MeshError(
+                f"the arm's chambers are {self.chambers!r} a segment: choose a whole number, 2 to {_MOST_CHAMBERS}."
+            )
+        if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
+            what = "sectors" if self.profile == "sector" else "rotations"
+            raise MeshError(f"a lobed outline does not go with {what}: set the arm's outline to round.")
+        for radius in self.radii:
+            self.section(radius).check()
+
+    @property
+    def length(self) -> float:
+        """Length from base to tip [m]."""
+        return float(sum(self.chamber_lengths) + sum(self.caps))
+
+    @property
+    def stations(self) -> tuple[float, ...]:
+        """Heights of the ends of caps and chambers, from 0 at the base down to the tip [m]; an even number."""
+        parts = [self.caps[0]]
+        for chamber, cap in zip(self.chamber_lengths, self.caps[1:], strict=True):
+            parts += [chamber, cap]
+        return (0.0, *(-np.cumsum(parts)).tolist())
+
+    def section(self, radius: float) -> Section:
+        """Returns the unrotated cross-section with a given outline radius [m]."""
+        core = None if self.core is None else self.core * radius / self.radii[0]
+        return Section(radius, self.chambers, self.profile, self.outline, self.wall, self.web, core)
+
+    def radius_at(self, height: float) -> float:
+        """Returns the radius of the outline at a height [m], which is 0 at the base and negative below."""
+        ends = np.array(self.stations[1:-1])
+        return float(np.interp(-height, -ends, np.repeat(self.radii, 2)[1:-1]))
+
+
+def numbers(name: str, given: Sequence[Any], positive: bool = True) -> tuple[float, ...]:
+    """Returns a dimension as a tuple, or raises MeshError for values that are not finite or not positive."""
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise MeshError(f"the arm's {name} are {given!r}: give a list of numbers.")
+    for value in given:
+        good = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+        if not good or (positive and value <= 0.0):
+            unit = "a positive number, in metres" if positive else "a number, in degrees"
+            raise MeshError(f"the arm's {name} has {value!r}: it must be {unit}.")
+    return tuple(float(value) for value in given)
 
 
 def mesh_arm(
@@ -109,3 +208,41 @@ def _hexahedra(geometry: ArmGeometry, size: float, layer: float) -> Mesh:
         cells.append(np.concatenate([upper + len(place), upper], axis=1))
     used, numbered = np.unique(np.concatenate(cells), return_inverse=True)
     return Mesh(vertices.reshape(-1, 3)[used], numbered.reshape(-1, 8))
+
+
+def tetrahedra(geometry: ArmGeometry, size: float) -> Mesh:
+    """Returns an arm of 4-node tetrahedra of a given size [m], with vertices numbered from the base down.
+
+    Raises:
+        MeshError: gmsh is missing or fails.
+    """
+    return tetrahedra_by_gmsh(lambda gmsh: _build(gmsh.model.occ, geometry, size), size, "an arm")
+
+
+def _build(occ: Any, geometry: ArmGeometry, size: float) -> None:
+    """Builds the body, lofted along caps and segments, with the chambers cut out."""
+    heights = geometry.stations
+    divisions = geometry.section(0.5 * (geometry.radii[0] + geometry.radii[-1])).divisions(size)
+    sections = [geometry.section(geometry.radius_at(height)) for height in heights]
+    body, chambers = [], []
+    for part, (top, bottom) in enumerate(pairwise(heights)):
+        ends = [(sections[part], top), (sections[part + 1], bottom)]
+        body.append(_loft(occ, [(section.body_polygon(divisions), height, 0.0) for section, height in ends]))
+        if part % 2 == 1:
+            rotation = math.radians(geometry.rotations[part // 2]) if geometry.rotations else 0.0
+            for number in range(geometry.chambers):
+                angle = rotation + 2.0 * math.pi * number / geometry.chambers
+                chambers.append(_loft(occ, [(s.chamber_polygon(divisions), height, angle) for s, height in ends]))
+    fused, _ = occ.fuse(body[:1], body[1:])
+    occ.cut(fused, chambers)
+    occ.synchronize()
+
+
+def _loft(occ: Any, ends: Sequence[tuple[ComplexArray, float, float]]) -> tuple[int, int]:
+    """Returns a solid between two polygons with given heights [m] and angles about the axis [rad]."""
+    wires = []
+    for polygon, height, angle in ends:
+        tags = [occ.addPoint(point.real, point.imag, height) for point in polygon * cmath.exp(1j * angle)]
+        wires.append(occ.addWire([occ.addLine(a, b) for a, b in zip(tags, tags[1:] + tags[:1], strict=True)]))
+    ((dimension, tag),) = (e for e in occ.addThruSections(wires, makeSolid=True, makeRuled=True) if e[0] == 3)
+    return dimension, tag

@@ -1,20 +1,22 @@
 """Detection of open cavities, which may have been intended as closed chambers."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import warp as wp
 
-from ..io.progress import QUIET_SECONDS, Progress
+from ..io.kernel_cache import ensure_kernel_cache
+from ..kernels.triangles import blocked
 from .chambers import find_chambers
 from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
 
-MOST_TRIANGLES = 10_000  # largest surface that is examined
 _DIRECTIONS = 24  # rays per triangle, over the hemisphere of its normal
 _HIDDEN = 0.2  # fraction of unobstructed rays below which a triangle is inside a cavity
 _LEAST_AREA = 0.01  # smallest area of a cavity, over that of the outer surface
-_LIFT = 1e-6  # distance of a ray's start from the surface, over the diagonal of the mesh
-_RAYS = 200_000  # ray-triangle pairs processed together
+_LIFT = 1e-5  # distance of a ray's start from the surface, over the diagonal of the mesh; beyond float32's rounding
+
+ensure_kernel_cache()  # before Warp is first used
 
 
 @dataclass(frozen=True)
@@ -25,34 +27,34 @@ class OpenCavity:
     area: float  # [m^2]
 
 
-def open_cavities(mesh: Mesh) -> list[OpenCavity] | None:
+def open_cavities(mesh: Mesh) -> list[OpenCavity]:
     """Finds deep hollows in the outer surface, such as a chamber with a hole in its wall or without an end.
 
     Rays in uniformly distributed directions start from the centre of each triangle; if few of them leave the body
-    without hitting it, the triangle is hidden. Connected hidden triangles form a cavity.
-
-    Returns:
-        The cavities, largest first; None if the surface has more than `MOST_TRIANGLES`.
+    without hitting it, the triangle is hidden. Connected hidden triangles form a cavity. Largest cavities come first.
     """
-    import trimesh
-
     triangles = boundary_triangles(mesh)
-    if len(triangles) > MOST_TRIANGLES:
-        return None
     inner = [chamber.vertices for chamber in find_chambers(mesh)]
     outer = triangles[~np.isin(triangles[:, 0], np.concatenate(inner))] if inner else triangles
-    surface = trimesh.Trimesh(mesh.vertices, outer, process=False)
-    centres, normals, areas = surface.triangles_center, surface.face_normals, surface.area_faces
-    starts = centres + _LIFT * surface.scale * normals
-    hidden = np.flatnonzero(_blocked(starts, normals, surface.triangles))  # candidates: obstructed along the normal
-    directions = _half_sphere(normals[hidden]).reshape(-1, 3)
-    blocked = _blocked(np.repeat(starts[hidden], _DIRECTIONS, axis=0), directions, surface.triangles)
-    hidden = hidden[1.0 - blocked.reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN]
-    parts = connected_parts(outer[hidden])
-    cavities = []
+    corners = mesh.vertices[outer]
+    normals, centres = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+    sizes = np.linalg.norm(normals, axis=1)
+    normals /= sizes[:, None]
+    starts = centres + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
+    directions = _half_sphere(normals).reshape(-1, 3)
+    rays: list[Any] = [
+        wp.array(own, dtype=wp.vec3, device="cpu") for own in (np.repeat(starts, _DIRECTIONS, axis=0), directions)
+    ]
+    points: Any = wp.array(mesh.vertices, dtype=wp.vec3, device="cpu")
+    surface = wp.Mesh(points, wp.array(outer.ravel(), dtype=int, device="cpu"))
+    hits: Any = wp.zeros(len(directions), dtype=float, device="cpu")
+    wp.launch(blocked, len(directions), [surface.id, *rays], [hits], device="cpu")
+    hidden = np.flatnonzero(1.0 - hits.numpy().reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN)
+    parts, cavities = connected_parts(outer[hidden]), []
     for own in (hidden[parts == part] for part in np.unique(parts)):
-        if areas[own].sum() >= _LEAST_AREA * areas.sum():
-            cavities.append(OpenCavity(np.average(centres[own], axis=0, weights=areas[own]), float(areas[own].sum())))
+        if sizes[own].sum() >= _LEAST_AREA * sizes.sum():
+            centre = np.average(centres[own], axis=0, weights=sizes[own])
+            cavities.append(OpenCavity(centre, 0.5 * float(sizes[own].sum())))
     return sorted(cavities, key=lambda cavity: -cavity.area)
 
 
@@ -66,29 +68,3 @@ def _half_sphere(normals: FloatArray) -> FloatArray:
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     axes = np.stack([first, np.cross(normals, first)], axis=1)  # (T, 2, 3)
     return np.asarray(np.einsum("dk,tkj->tdj", local, axes) + heights[:, None] * normals[:, None])
-
-
-def _blocked(starts: FloatArray, directions: FloatArray, corners: FloatArray) -> FloatArray:
-    """Returns 1 for rays (R,) that hit any triangle (T, 3, 3), else 0."""
-    hit = np.zeros(len(starts))
-    chunk = max(1, _RAYS // len(corners))
-    with Progress("open cavities", len(starts), "rays", after=QUIET_SECONDS) as progress:
-        for begin in range(0, len(starts), chunk):
-            own = slice(begin, begin + chunk)
-            hit[own] = _hits(starts[own], directions[own], corners).any(axis=1)
-            progress.advance(len(hit[own]))
-    return hit
-
-
-def _hits(starts: FloatArray, directions: FloatArray, corners: FloatArray) -> NDArray[np.bool_]:
-    """Returns whether rays (R,) hit triangles (T, 3, 3), (R, T) (Moeller and Trumbore 1997)."""
-    origin, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    rays, offset = directions[:, None], starts[:, None] - origin
-    across = np.cross(rays, second)
-    determinant = (across * first).sum(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = (across * offset).sum(axis=-1) / determinant
-        around = np.cross(offset, first)
-        v = (around * rays).sum(axis=-1) / determinant
-        distance = (around * second).sum(axis=-1) / determinant
-        return np.asarray((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..data.rigid import RigidTransform
 from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
-from ..energies.obstacle_surfaces import surface_of
+from ..energies.obstacles import surface_of
 from ..fem.body import Body
 from .render import FloatArray, IntArray
 

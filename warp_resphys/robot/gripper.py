@@ -15,8 +15,7 @@ from ..energies.surfaces import SurfaceContact
 from ..experiment.build import build_body
 from ..experiment.laboratory import make_setup
 from ..experiment.simulate import target_settings
-from ..fem.body import Body
-from ..fem.rigid import Rigid
+from ..fem.body import Body, Rigid
 from ..io.settings import NotNegative, Positive, Settings, parse, setting
 from ..io.stages import finished_record
 from ..mesh.mesh import Mesh, box_hexahedra

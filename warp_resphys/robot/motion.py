@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..energies.obstacle_surfaces import ObstacleMotion
+from ..energies.obstacles import ObstacleMotion
 from ..io.errors import InputError, number_of
 from ..learning.replay import sample
 from ..mesh.motion_files import MovingSurface, input_columns, write_csv, write_usd, write_vtk

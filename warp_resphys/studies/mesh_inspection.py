@@ -9,7 +9,7 @@ import numpy as np
 from ..experiment.build import build_mesh
 from ..io.errors import MeshError
 from ..mesh.arm import name_surfaces
-from ..mesh.cavities import MOST_TRIANGLES, open_cavities
+from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import FloatArray, IntArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
 from ..mesh.quality import scaled_jacobian
@@ -75,10 +75,9 @@ def inspect_mesh(
 
 def _cavities(mesh: Mesh) -> str:
     """Describes open cavities: area and centre of their openings."""
-    cavities = open_cavities(mesh)
-    if cavities is None:
-        return f"not looked for on a boundary of more than {MOST_TRIANGLES:,} triangles"
-    places = [f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in cavities]
+    places = [
+        f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in open_cavities(mesh)
+    ]
     return f"{'; '.join(places)}: pressure needs a closed chamber" if places else "none"
 
 

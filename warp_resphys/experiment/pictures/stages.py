@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ...data.camera import CORRECTIONS, PlacedCamera
-from ...energies.law_files import LAW_FORMAT, unit_of
+from ...energies.catalogue import LAW_FORMAT, unit_of
 from ...io.errors import InputError
 from ...io.files import atomic_hdf5, create, read_json, write_json
 from ...io.progress import Progress

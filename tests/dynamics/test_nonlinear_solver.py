@@ -11,7 +11,7 @@ from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.catalogue import MATERIALS
-from warp_resphys.energies.launcher import warp_view
+from warp_resphys.energies.launcher import struct_of, warp_view
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.kernels import minimisation as kernels
 from warp_resphys.kernels.lbfgs import lbfgs_kernels
@@ -261,8 +261,9 @@ def test_directions_equal_the_bfgs_formula():
     generator = torch.Generator().manual_seed(0)
     vertex_at = np.setdiff1d(np.arange(BODY.n_vertices), BODY.fixed_vertices)[::-1].copy()
     inverse = 2e-3 * (1.0 + torch.rand(2, free, 3, generator=generator, dtype=torch.float64))
-    metric = DiagonalMetric(inverse, vertex_at)
-    minimiser = Minimiser(potential, metric, torch.float64, memory, 1e-12, 1e-12, 2e-16, 1000, None)
+    metric, limits = DiagonalMetric(inverse, vertex_at), {"relative": 1e-12, "absolute": 1e-12, "epsilon": 2e-16}
+    limits = struct_of(kernels.Tolerances, **limits, max_iterations=1000, refactor_after=kernels.NEVER)
+    minimiser = Minimiser(potential, metric, torch.float64, memory, limits)
     start = s.rest_positions + 1e-3 * torch.randn(2, BODY.n_vertices, 3, generator=generator, dtype=torch.float64)
     start[:, s.fixed] = s.rest_positions[s.fixed]
     state = minimiser.begin(start)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..energies.launcher import CapturedGraph, issue, warp_view
+from ..energies.launcher import CapturedGraph, issue, struct_of, warp_view
 from ..energies.potential import IncrementalPotential
 from ..kernels import line_search
 from ..kernels import minimisation as kernels
@@ -82,12 +82,8 @@ class Minimiser:
         hessian: matrix of the global step.
         dtype: dtype of L-BFGS pairs and right-hand sides.
         memory: number of L-BFGS pairs; 0 for Newton's method.
-        relative_tolerance: residual over balancing forces at which an environment has converged.
-        absolute_tolerance: residual at which it has converged in any case [N].
-        epsilon: machine epsilon of the states' dtype.
-        max_iterations: number of directions after which an environment has failed.
-        refactor_after: number of directions after which the next solve starts with a new factor, and three times of
-            which force a new factor within a solve; 0: always, None: never.
+        tolerances: a ``kernels.minimisation.Tolerances``. After `refactor_after` directions the next solve starts with
+            a new factor, and three times as many force a new factor within a solve; 0: always.
     """
 
     def __init__(
@@ -96,11 +92,7 @@ class Minimiser:
         hessian: HessianApproximation,
         dtype: torch.dtype,
         memory: int,
-        relative_tolerance: float,
-        absolute_tolerance: float,
-        epsilon: float,
-        max_iterations: int,
-        refactor_after: int | None,
+        tolerances: Any,
     ) -> None:
         p, b, n = potential, potential.batch, potential.n_vertices
         self._potential, self._hessian = p, hessian
@@ -110,40 +102,26 @@ class Minimiser:
         self._summary, self._seen = summary, summary if p.device.type == "cpu" else summary.cpu().pin_memory()
         self._shown = self._seen.numpy()
 
-        double = dtype == torch.float64
-        scalar, vector = (wp.float64, wp.vec3d) if double else (wp.float32, wp.vec3f)
-        own = lbfgs_kernels(scalar)
-        progress, pairs, search = kernels.SolverProgress(), own.Pairs(), kernels.LineSearch()
-        evaluation, tolerances = kernels.Evaluation(), kernels.Tolerances()
-        self._progress: dict[str, torch.Tensor] = {}
-        for name, variable in kernels.SolverProgress.vars.items():
-            kind = variable.type.dtype
-            self._progress[name] = torch.zeros(b, device=p.device, dtype=wp.dtype_to_torch(kind))
-            setattr(progress, name, warp_view(self._progress[name], kind))
-        size = max(memory, 1)
-        self._refactors = refactor_after is not None
-        self._history_counts = [torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(3)]
-        self._pair_counts = torch.zeros(b, device=p.device, dtype=torch.int32)
-        pairs.count = warp_view(self._pair_counts, wp.int32)
-        pairs.last = wp.zeros(b, dtype=int, device=str(p.device))
-        pairs.s, pairs.y = (
-            warp_view(torch.zeros(b, size, n, 3, device=p.device, dtype=dtype), vector) for _ in range(2)
+        scalar, vector = (wp.float64, wp.vec3d) if dtype == torch.float64 else (wp.float32, wp.vec3f)
+        own, size = lbfgs_kernels(scalar), max(memory, 1)
+        self._progress = {
+            name: torch.zeros(b, device=p.device, dtype=wp.dtype_to_torch(variable.type.dtype))
+            for name, variable in kernels.SolverProgress.vars.items()
+        }
+        progress = struct_of(kernels.SolverProgress, **self._progress)
+        self._refactors = tolerances.refactor_after != kernels.NEVER
+        *self._history_counts, self._pair_counts, last = (
+            torch.zeros(b, device=p.device, dtype=torch.int32) for _ in range(5)
         )
-        pairs.r = warp_view(p.zeros(size, size), wp.float64)
-        pairs.a, pairs.b = (warp_view(p.zeros(size), wp.float64) for _ in range(2))
-        evaluation.energy, evaluation.size = warp_view(p.energy, wp.float64), warp_view(p.energy_size, wp.float64)
-        evaluation.balance, evaluation.norm = warp_view(p.balance, wp.float64), warp_view(p.residual_norm, wp.float64)
-        evaluation.residual = warp_view(p.residual, wp.vec3d)
-        tolerances.relative, tolerances.absolute = wp.float64(relative_tolerance), wp.float64(absolute_tolerance)
-        tolerances.epsilon, tolerances.max_iterations = wp.float64(epsilon), max_iterations
-        tolerances.refactor_after = kernels.NEVER if refactor_after is None else refactor_after
-
-        history = kernels.History()
-        history.stored, history.newest, history.order = (warp_view(x, wp.int32) for x in self._history_counts)
-        history.start, history.correction = warp_view(p.zeros(n, 3), wp.vec3d), warp_view(p.zeros(3, n, 3), wp.vec3d)
-
-        search.positions = warp_view(p.positions, wp.vec3d)
-        search.origin, search.direction, search.gradient = (warp_view(p.zeros(n, 3), wp.vec3d) for _ in range(3))
+        s, y = (torch.zeros(b, size, n, 3, device=p.device, dtype=dtype) for _ in range(2))
+        places = {"count": self._pair_counts, "last": last, "r": p.zeros(size, size)}
+        pairs = struct_of(own.Pairs, **places, s=s, y=y, a=p.zeros(size), b=p.zeros(size))
+        sums = {"energy": p.energy, "size": p.energy_size, "balance": p.balance, "norm": p.residual_norm}
+        evaluation = struct_of(kernels.Evaluation, **sums, residual=p.residual)
+        counts = dict(zip(("stored", "newest", "order"), self._history_counts, strict=True))
+        history = struct_of(kernels.History, **counts, start=p.zeros(n, 3), correction=p.zeros(3, n, 3))
+        fields = {name: p.zeros(n, 3) for name in ("origin", "direction", "gradient")}
+        search = struct_of(kernels.LineSearch, positions=p.positions, **fields)
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         begin = p.record_blocks(kernels.begin, b, [*loads, tolerances, search, progress, history], [])
@@ -155,8 +133,8 @@ class Minimiser:
         inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation]
         inputs += [warp_view(hessian.clamped, wp.bool), search, progress, pairs, history]
         accept = p.record_blocks(line_search.accept_kernel(scalar), b, inputs, [])
-        counts = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
-        summarise = p.record_blocks(kernels.summarise, 1, [progress], counts)
+        seen = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
+        summarise = p.record_blocks(kernels.summarise, 1, [progress], seen)
         evaluate = [*p.evaluation, accept, summarise]
         shorten_start, shorten_step = self._record_bounds(progress, search)
         start, first_trial = [begin, *shorten_start], [set_direction, *shorten_step]

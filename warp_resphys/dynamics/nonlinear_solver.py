@@ -27,8 +27,10 @@ from typing import Literal, get_args
 
 import torch
 
+from ..energies.launcher import struct_of
 from ..energies.potential import IncrementalPotential
 from ..io.errors import ConvergenceError, InputError
+from ..kernels.minimisation import NEVER, Tolerances
 from ..linalg.choice import LINEAR_SOLVERS, make_linear_solver
 from .assembly import BlockPattern
 from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
@@ -135,17 +137,20 @@ class NonlinearSolver:
             self.hessian = ExactHessian(potential, pattern, linear)
         # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
         quasi = 0 if linear.iterates else settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
-        after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": None}
+        after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}
         self._minimiser = Minimiser(
             potential,
             self.hessian,
             torch.float32 if linear.keeps_factors and not potential.couples_cells else factors,
-            memory=0 if after[settings.name] == 0 else settings.memory,
-            relative_tolerance=settings.relative_tolerance,
-            absolute_tolerance=settings.absolute_tolerance,
-            epsilon=torch.finfo(dtype).eps,
-            max_iterations=settings.max_iterations,
-            refactor_after=after[settings.name],
+            0 if after[settings.name] == 0 else settings.memory,
+            struct_of(
+                Tolerances,
+                relative=settings.relative_tolerance,
+                absolute=settings.absolute_tolerance,
+                epsilon=torch.finfo(dtype).eps,
+                max_iterations=settings.max_iterations,
+                refactor_after=after[settings.name],
+            ),
         )
 
     def solve(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> SolveReport:

@@ -49,7 +49,7 @@ from ..stepping.rotations import rotations
 from ..stepping.state import State
 from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, struct_of, warp_view
 from .obstacles import DistanceGrid, Obstacle, ObstacleMotion, ObstacleSet, Pose
 
 log = logging.getLogger(__name__)
@@ -575,11 +575,10 @@ class ContactTerm(Term):
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        friction, types = kernels.Friction(), (wp.float64, wp.vec3d, wp.vec3d)
-        friction.coefficient = warp_view(value_of(values, FRICTION.name), wp.float64)
-        friction.slip = warp_view(value_of(values, "contact_slip"), wp.float64)
-        for name, kind in zip(FRICTION_VALUES, types, strict=True):
-            setattr(friction, name.removeprefix("contact_"), warp_view(value_of(values, name), kind))
+        names = {"coefficient": FRICTION.name} | {
+            n.removeprefix("contact_"): n for n in ("contact_slip", *FRICTION_VALUES)
+        }
+        friction = struct_of(kernels.Friction, **{name: value_of(values, given) for name, given in names.items()})
         stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
         area = warp_view(self._area, wp.float64)
         obstacles = self._obstacles(values)
@@ -603,14 +602,10 @@ class ContactTerm(Term):
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
-        slopes, out = kernels.Slopes(), dict[str, torch.Tensor]()
         names = ("place", "turn", "growth", "stiffness", "coefficient", "load", "normal", "reference")
-        extra: dict[str, tuple[tuple[int, ...], Any]] = {"turn": ((3, 3), wp.mat33d)}
-        extra |= dict.fromkeys(("place", "normal", "reference"), ((3,), wp.vec3d))
-        for name in names:
-            shape, kind = extra.get(name, ((), wp.float64))
-            out[name] = own.zeros(*size, *shape)
-            setattr(slopes, name, warp_view(out[name], kind))
+        shapes = {"turn": (3, 3), **dict.fromkeys(("place", "normal", "reference"), (3,))}
+        out = {name: own.zeros(*size, *shapes.get(name, ())) for name in names}
+        slopes = struct_of(kernels.Slopes, **out)
         inputs = self._arguments(s, values, warp_view(positions, wp.vec3d))
         command = own.record(kernels.adjoint, (own.batch, *size), [*inputs, warp_view(direction, wp.vec3d), slopes], [])
 

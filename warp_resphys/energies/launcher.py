@@ -27,6 +27,17 @@ def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def struct_of(kind: Any, /, **fields: Any) -> Any:
+    """Returns a Warp struct, whose arrays are on the memory of contiguous tensors."""
+    out = kind()
+    for name, value in fields.items():
+        declared = kind.vars[name].type
+        if isinstance(value, torch.Tensor):
+            value = warp_view(value, declared.dtype)
+        setattr(out, name, value)
+    return out
+
+
 def launch(kernel: Any, dim: Sequence[int], inputs: list[Any], outputs: list[Any], device: torch.device) -> None:
     """Launches a kernel once, on torch's stream."""
     with shareable():

@@ -20,7 +20,7 @@ from ..kernels.triangles import from_surface
 from ..mesh.motion_files import MovingSurface
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
-from .launcher import launch, warp_view
+from .launcher import launch, struct_of, warp_view
 
 Vector = tuple[float, float, float]
 # Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
@@ -316,10 +316,6 @@ class ObstacleSet:
     """
 
     def __init__(self, obstacles: tuple[Obstacle, ...], reach: float, device: torch.device) -> None:
-        kinds, sizes = np.array([o.kind for o in obstacles], dtype=np.int32), np.array([o.size for o in obstacles])
-        self._kinds: Any = wp.array(kinds, dtype=int, device=str(device))
-        self._sizes: Any = wp.array(sizes, dtype=wp.vec3d, device=str(device))
-        self._reach = reach
         grids = [o if isinstance(o, DistanceGrid) else None for o in obstacles]
         parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
         firsts = np.cumsum([0, *(len(part) for part in parts)])
@@ -327,18 +323,19 @@ class ObstacleSet:
             (0,) * 4 if g is None else (*g.distances.shape, first) for g, first in zip(grids, firsts, strict=False)
         ]
         low = [(0.0,) * 3 if grid is None else grid.low for grid in grids]
-        self._nodes: Any = wp.array(np.array(nodes, dtype=np.int32), dtype=wp.vec4i, device=str(device))
-        self._low: Any = wp.array(np.array(low), dtype=wp.vec3d, device=str(device))
-        self._coefficients: Any = wp.array(np.concatenate(parts), dtype=wp.float64, device=str(device))
+        arrays = {
+            "kind": np.array([o.kind for o in obstacles], dtype=np.int32),
+            "size": np.array([o.size for o in obstacles]),
+            "low": np.array(low),
+            "nodes": np.array(nodes, dtype=np.int32),
+            "coefficients": np.concatenate(parts),
+        }
+        self._fixed = {name: torch.as_tensor(values, device=device) for name, values in arrays.items()}
+        self._reach = reach
 
     def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
         """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
-        o = kernels.Obstacles()
-        o.kind, o.size, o.reach = self._kinds, self._sizes, wp.float64(self._reach)
-        o.nodes, o.low, o.coefficients = self._nodes, self._low, self._coefficients
-        o.place, o.turn = warp_view(place, wp.vec3d), warp_view(turn, wp.mat33d)
-        o.growth = warp_view(growth, wp.float64)
-        return o
+        return struct_of(kernels.Obstacles, **self._fixed, reach=self._reach, place=place, turn=turn, growth=growth)
 
     def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""

@@ -14,7 +14,7 @@ from ..kernels import broad_phase
 from ..kernels import surfaces as kernels
 from ..kernels.modules import launch_stream
 from ..mesh.mesh import Mesh, boundary_triangles
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, struct_of, warp_view
 from .obstacles import signed_distances
 
 _FIRST_CAPACITY = 4096
@@ -198,17 +198,21 @@ class PairList:
         own, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
         self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
-        motion = broad_phase.Sweep()
-        motion.origin, motion.reach = warp_view(self._origin, wp.vec3d), wp.float64(self.reach)
-        motion.outer, motion.inner = warp_view(outer, wp.float64), warp_view(inner, wp.float64)
-        motion.piece = self._piece_array
+        motion = struct_of(
+            broad_phase.Sweep,
+            origin=self._origin,
+            outer=outer,
+            inner=inner,
+            piece=self._piece_array,
+            reach=self.reach,
+        )
         triangles, edges = self._hierarchy(motion, self._triangle_array), self._hierarchy(motion, self._edge_array)
         size = len(surface.vertices) * len(surface.triangles)
         total = size + len(surface.edges) ** 2
         while True:
-            pair_keys, count = broad_phase.PairKeys(), torch.zeros(1, device=own.device, dtype=torch.int32)
+            count = torch.zeros(1, device=own.device, dtype=torch.int32)
             keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
-            pair_keys.count, pair_keys.keys = warp_view(count, wp.int32), warp_view(keys, wp.int64)
+            pair_keys = struct_of(broad_phase.PairKeys, count=count, keys=keys)
             inputs = [triangles.id, motion, self.vertex_array, self._triangle_array, wp.int64(total), pair_keys]
             own.launch(own.record(broad_phase.vertex_triangle_pairs, (own.batch, len(surface.vertices)), inputs, []))
             inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), pair_keys]
@@ -249,11 +253,9 @@ class PairList:
         self.parallel = _PARALLEL * a.square().sum(1) * b.square().sum(1)
         self.start, self.incident = self.incidence(self.environment, self.nodes)
         self.count, self.version = len(keys), self.version + 1
-        self._kept = [x.to(torch.int32).contiguous() for x in (self.environment, self.kind, self.nodes)]
-        self.pairs = kernels.Pairs()
-        self.pairs.environment, self.pairs.kind = (warp_view(x, wp.int32) for x in self._kept[:2])
-        self.pairs.nodes, self.pairs.degree = warp_view(self._kept[2], wp.vec4i), warp_view(self.degree, wp.vec4d)
-        self.pairs.area, self.pairs.parallel = warp_view(self.area, wp.float64), warp_view(self.parallel, wp.float64)
+        whole = {"environment": self.environment, "kind": self.kind, "nodes": self.nodes}
+        whole = {name: value.to(torch.int32).contiguous() for name, value in whole.items()}
+        self.pairs = struct_of(kernels.Pairs, **whole, area=self.area, degree=self.degree, parallel=self.parallel)
 
     def incidence(self, environment: torch.Tensor, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `start` and `incident` of pairs (C,) and (C, 4)."""
@@ -320,9 +322,7 @@ class PairList:
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
         own = self._launcher
-        motion = broad_phase.Sweep()
-        kept = positions.contiguous(), own.zeros(positions.shape[1])
-        motion.origin, motion.outer = warp_view(kept[0], wp.vec3d), warp_view(kept[1], wp.float64)
+        motion = struct_of(broad_phase.Sweep, origin=positions.contiguous(), outer=own.zeros(positions.shape[1]))
         hierarchy = self._hierarchy(motion, self._triangle_array)
         count, edge = (torch.full((own.batch,), k, device=own.device, dtype=torch.int32) for k in (0, 2**31 - 1))
         inputs = [hierarchy.id, motion, self._edge_array, self._triangle_array]

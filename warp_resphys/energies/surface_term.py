@@ -16,7 +16,7 @@ from ..kernels import surfaces as kernels
 from ..stepping.quantity import Quantity
 from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, PairTangents, PointSet, Term, Values, value_of
-from .launcher import HostLaunches, Launcher, warp_view
+from .launcher import HostLaunches, Launcher, struct_of, warp_view
 from .pairs import PairList, Surface
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
@@ -138,7 +138,7 @@ class SurfaceTerm(Term):
         start = value_of(values, "surface_start")
         self._bounded, self._grips = False, None
         slides = self.sliding(values, start, value_of(values, STIFFNESS.name))
-        self._grips = None if slides is None else Grips.of(self.launcher, self._list, slides)
+        self._grips = None if slides is None else Grips.of(self._list, slides)
         self._steps += 1
 
     @override
@@ -295,11 +295,10 @@ class SurfaceTerm(Term):
     def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> "_Near":
         """Returns the geometry of chosen pairs at positions (B, N, 3), differentiable."""
         own, ours = self.launcher, self._list
-        indices, features = chosen.to(torch.int32), kernels.Features()
+        indices = chosen.to(torch.int32)
         w, t, s = (self._force.new_zeros(len(chosen), _FEATURES, 4) for _ in range(3))
         part = self._force.new_zeros(len(chosen), _FEATURES)
-        features.coefficient = warp_view(part, wp.float64)
-        features.w, features.t, features.s = (warp_view(values, wp.vec4d) for values in (w, t, s))
+        features = struct_of(kernels.Features, coefficient=part, w=w, t=t, s=s)
         inputs = [warp_view(indices, wp.int32), ours.pairs, wp.float64(self._reach), warp_view(x, wp.vec3d), features]
         own.launch(own.record(kernels.pair_features, (len(chosen), _FEATURES), inputs, []))
         environment, nodes = ours.environment[chosen], ours.nodes[chosen]
@@ -429,7 +428,6 @@ class Grips:
         struct: arrays for the kernels.
         outputs: arrays of gradients and energies.
         incidence: for ``kernels.surfaces.gather``.
-        kept: tensors that own the memory.
     """
 
     environment: torch.Tensor
@@ -437,7 +435,6 @@ class Grips:
     struct: Any
     outputs: list[Any]
     incidence: list[Any]
-    kept: tuple[torch.Tensor, ...]
 
     @property
     def count(self) -> int:
@@ -445,29 +442,16 @@ class Grips:
         return len(self.environment)
 
     @classmethod
-    def of(
-        cls,
-        launcher: Launcher,
-        pairs: PairList,
-        sliding: Sliding,
-    ) -> "Grips":
+    def of(cls, pairs: PairList, sliding: Sliding) -> "Grips":
         """Returns friction of pairs (G, ...) (`kernels.surfaces.FrictionPairs`)."""
-        struct = kernels.FrictionPairs()
-        environment, nodes, weights, normal, load, regions = sliding
-        kept = [*(x.to(torch.int32) for x in (environment, nodes)), *(x.contiguous() for x in (weights, normal, load))]
-        kept.append(regions.to(torch.int32))
-        types = {
-            "environment": wp.int32,
-            "nodes": wp.vec4i,
-            "weights": wp.vec4d,
-            "normal": wp.vec3d,
-            "load": wp.float64,
-            "regions": wp.int32,
+        environment, nodes, load = sliding.environment, sliding.nodes, sliding.load
+        kept = {
+            name: (value if value.is_floating_point() else value.to(torch.int32)).contiguous()
+            for name, value in sliding._asdict().items()
         }
-        for (name, kind), value in zip(types.items(), kept, strict=True):
-            setattr(struct, name, warp_view(value, kind))
+        struct = struct_of(kernels.FrictionPairs, **kept)
         sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
         incidence = pairs.incidence(environment, nodes)
         outputs = [warp_view(sums[0], kernels.Corners), warp_view(sums[1], wp.float64)]
         own = [warp_view(x, wp.int32) for x in incidence]
-        return cls(environment, nodes, struct, outputs, own, (*kept, *sums, *incidence))
+        return cls(environment, nodes, struct, outputs, own)

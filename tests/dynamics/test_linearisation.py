@@ -10,6 +10,7 @@ from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, sel
 from warp_resphys.dynamics.energy_set import EnergySet
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.energies.placement import place_energies
+from warp_resphys.fem.coordinates import DeviceCoordinates
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import Mesh, box_hexahedra
 from warp_resphys.stepping.integrators import INTEGRATORS
@@ -74,7 +75,8 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     body = Body(mesh, select_vertices(mesh, x=0.0), energies=[tendon])
     materials = {"root": Corotated(1e5, density=1000.0), "tip": Corotated(2e5, density=500.0)}
     rest = torch.as_tensor(mesh.vertices)
-    energies = EnergySet(place_energies(body, materials), body, rest, INTEGRATORS["bdf2"], 0.01)
+    where = (body, DeviceCoordinates(body.coordinates, rest), rest, INTEGRATORS["bdf2"], 0.01)
+    energies = EnergySet(place_energies(body, materials), *where)
     assert energies.constants["tip_youngs_modulus"] == 2e5
     assert {"root_density", "tip_density", "tendon_friction"} <= set(energies.parameters)
     given = {
@@ -90,4 +92,4 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
             energies.check_memory(wrong, 2, rest)
     twice = 2 * place_energies(body, materials)
     with pytest.raises(InputError, match="two energies depend on"):
-        EnergySet(twice, body, rest, INTEGRATORS["bdf2"], 0.01)
+        EnergySet(twice, *where)

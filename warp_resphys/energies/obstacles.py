@@ -427,9 +427,9 @@ def surface_of(obstacle: Obstacle, growth: float, beside: FloatArray) -> tuple[F
         case Box():
             solid = trimesh.creation.box(2.0 * (np.array([x, y, z]) + growth))
         case Sphere():
-            solid = trimesh.creation.uv_sphere(radius=x + growth, count=(_CORNERS // 4, _CORNERS))
+            solid = trimesh.creation.uv_sphere(radius=x + growth, count=(_CORNERS // 2, _CORNERS))
         case Capsule():
-            solid = trimesh.creation.capsule(2.0 * z, x + growth, count=(_CORNERS // 4, _CORNERS))
+            solid = trimesh.creation.capsule(2.0 * z, x + growth, count=(_CORNERS // 2, _CORNERS))
         case Cylinder():
             solid = trimesh.creation.cylinder(x + growth, 2.0 * (z + growth), sections=_CORNERS)
         case _:

@@ -20,7 +20,7 @@ from support.configured import composed, settings
 from support.main_job import IN_RUN, QUIET
 from support.tags import draw_tag
 from warp_resphys.data.camera import Lens, PlacedCamera
-from warp_resphys.energies.law_files import read_law
+from warp_resphys.energies.catalogue import read_law
 from warp_resphys.experiment.pictures.laboratory import depth_image, noisy_mask
 from warp_resphys.experiment.pictures.stages import picture_stages
 from warp_resphys.io.errors import InputError

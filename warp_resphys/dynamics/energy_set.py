@@ -15,7 +15,7 @@ import torch
 from ..energies.base import BoundEnergy, EnergySite, Memory
 from ..energies.contact import BoundContact, ContactForces
 from ..energies.obstacles import ObstacleMotion
-from ..energies.placement import DEPENDENT, PlacedEnergy, Step
+from ..energies.placement import DEPENDENT, PlacedEnergy, SimulatorStep
 from ..energies.potential import StepTerms
 from ..energies.surfaces import BoundSurfaceContact
 from ..fem.body import Body
@@ -114,7 +114,7 @@ class EnergySet:
             values[name] = constants.gravity.new_zeros(batch, self.counts[name]) if value is None else value
         return values
 
-    def step_terms(self, step: Step) -> StepTerms:
+    def step_terms(self, step: SimulatorStep) -> StepTerms:
         """Returns the terms of a step, differentiable."""
         batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
@@ -132,7 +132,7 @@ class EnergySet:
             values[f"{DEPENDENT}target"] = target[:, dependent]
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
-    def rest_terms(self, step: Step, share: float, near: torch.Tensor | None = None) -> StepTerms:
+    def rest_terms(self, step: SimulatorStep, share: float, near: torch.Tensor | None = None) -> StepTerms:
         """Returns the terms of a static equilibrium under a fraction of all loads, differentiable.
 
         Args:
@@ -156,7 +156,7 @@ class EnergySet:
         force = self._coordinates.reduce(self._loads(step, True).expand(batch, -1, -1))
         return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
 
-    def _loads(self, step: Step, static: bool) -> torch.Tensor:
+    def _loads(self, step: SimulatorStep, static: bool) -> torch.Tensor:
         """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
         constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
         if inputs.attached_mass is not None:
@@ -175,7 +175,7 @@ class EnergySet:
         """Whether values of a static equilibrium depend on its positions."""
         return bool(self._posing)
 
-    def end_step(self, step: Step, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
+    def end_step(self, step: SimulatorStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         """Returns the memory variables after a step with solution x and final positions q, (B, N, 3) each.
 
         After a static equilibrium these are the ones of energies without rate.
@@ -186,7 +186,7 @@ class EnergySet:
             memory |= placed.named(bound.end_step(placed.step(step, i), x, q))
         return memory
 
-    def contacts(self, step: Step, x: torch.Tensor) -> dict[str, ContactForces]:
+    def contacts(self, step: SimulatorStep, x: torch.Tensor) -> dict[str, ContactForces]:
         """Returns the contact of a step with solution x (B, N, 3) by name (`Simulator.contacts`)."""
         out: dict[str, ContactForces] = {}
         for i, (placed, bound) in enumerate(self._pairs):

@@ -12,7 +12,7 @@ from ..energies.contact import ContactForces
 from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
 from ..energies.obstacles import ObstacleMotion
-from ..energies.placement import Materials, Step, joined_names, place_energies
+from ..energies.placement import Materials, SimulatorStep, joined_names, place_energies
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
@@ -271,17 +271,17 @@ class Simulator:
         workspace.record_positions(new.q)
         return new, report, x
 
-    def _step(self, state: State, inputs: Inputs, constants: Constants) -> Step:
+    def _step(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
         """Returns a time step from a state."""
         terms = self.workspace(state.batch).potential.energies
-        return Step(state, self.method.stage(state, self.time_step), inputs, constants, terms)
+        return SimulatorStep(state, self.method.stage(state, self.time_step), inputs, constants, terms)
 
-    def _fixed_at(self, step: Step) -> torch.Tensor:
+    def _fixed_at(self, step: SimulatorStep) -> torch.Tensor:
         """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
         now, fixed = step.state.q[:, self.fixed], step.inputs.fixed_positions
         return now if fixed is None else now + step.stage.end * (fixed - now)
 
-    def _finish(self, step: Step, x: torch.Tensor) -> State:
+    def _finish(self, step: SimulatorStep, x: torch.Tensor) -> State:
         """Returns the new state from the solution x of the stage."""
         new = self.method.finish(step.state, x, self.time_step)
         new = replace(new, memory=self._energies.end_step(step, x, new.q))
@@ -431,7 +431,7 @@ class Simulator:
                 "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle "
                 "with friction, within the distance of contact."
             )
-        step = Step.endless(state, inputs, constants, self.workspace(batch).potential.energies)
+        step = SimulatorStep.endless(state, inputs, constants, self.workspace(batch).potential.energies)
         solve = partial(self._balance, step)
         limited = self.settings.max_iterations < MOST_ITERATIONS
         rest = self.rest_positions.expand_as(state.q)
@@ -465,7 +465,7 @@ class Simulator:
         state = self.rest_state(batch)
         inputs, constants = self._checked(state, inputs, parameters)
         workspace, stage = self.workspace(batch), self.method.stage(state, self.time_step)
-        step = Step.endless(state, inputs, constants, workspace.potential.energies)
+        step = SimulatorStep.endless(state, inputs, constants, workspace.potential.energies)
         terms, clamp, finish = self._energies.rest_terms(step, 1.0), self._fixed_at(step), partial(self._resting, step)
         return Linearisation(workspace, terms, stage, clamp, self._coordinates, finish, self.settings.linear_solver)
 
@@ -474,12 +474,12 @@ class Simulator:
         """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
         return self._energies.follow_pose
 
-    def _resting(self, step: Step, x: torch.Tensor) -> State:
+    def _resting(self, step: SimulatorStep, x: torch.Tensor) -> State:
         """Returns the state in an equilibrium (B, N, 3) after a state [m]."""
         return State(x, torch.zeros_like(x), memory=self._energies.end_step(step, x, x))
 
     def _balance(
-        self, step: Step, share: float, start: torch.Tensor, near: torch.Tensor | None = None
+        self, step: SimulatorStep, share: float, start: torch.Tensor, near: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, SolveReport]:
         """Returns the equilibrium (B, N, 3) [m] after a state, under a share of loads, inputs and the clamp's motion.
 

@@ -25,8 +25,8 @@ DEPENDENT = "dependent_"  # prefix of the inertia of dependent vertices
 
 
 @dataclass(frozen=True)
-class Step:
-    """One time step of a simulator, or a static equilibrium after a state: a step without end (`Step.endless`)."""
+class SimulatorStep:
+    """One time step of a simulator, or a static equilibrium after a state: a step without end (`endless`)."""
 
     state: State  # state at the start
     stage: ImplicitStage  # the implicit solve of the step
@@ -35,7 +35,7 @@ class Step:
     terms: Sequence[Term]  # kernels of all energies for the state's batch
 
     @classmethod
-    def endless(cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]) -> "Step":
+    def endless(cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]) -> "SimulatorStep":
         """Returns a static equilibrium, in which inertia has no part."""
         return cls(state, ImplicitStage(math.inf, state.q, state.q, ()), inputs, constants, terms)
 
@@ -86,7 +86,7 @@ class PlacedEnergy:
         """Returns the inputs of the energy, with its names."""
         return Inputs(**self.own(inputs.actuation)) if self.prefix else inputs
 
-    def step(self, step: Step, number: int) -> EnergyStep:
+    def step(self, step: SimulatorStep, number: int) -> EnergyStep:
         """Returns a step as the energy sees it, whose number among all is given."""
         state = replace(step.state, memory=self.own(step.state.memory)) if self.prefix else step.state
         inputs, constants = self.own_inputs(step.inputs), self.own_constants(step.constants)

@@ -78,7 +78,6 @@ from .settings.stages import (
     BaselinesStage,
     DriveStage,
     EvaluateStage,
-    FoldsReportStage,
     IdentifyLawStage,
     IdentifyStage,
     ImportStage,
@@ -89,9 +88,9 @@ from .settings.stages import (
     PlayedSettings,
     ReconstructStage,
     ReduceStage,
+    ReportStage,
     ShapesStage,
     SimulateStage,
-    SplitReportStage,
     TimeStage,
     TrainStage,
 )
@@ -241,7 +240,7 @@ def learning_stages(
     if run.control is not None:
         stages += control_stages(run, run.control, common, workers)
     last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))
-    shown = SplitReportStage(config=run, acquired=acquired)
+    shown = ReportStage(config=run, acquired=acquired)
     stages.append(Stage("report", make_report, (REPORT,), shown, last))
     return stages
 
@@ -332,7 +331,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     if folds is not None:
         errors = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
-        reported = FoldsReportStage(config=run, folds=errors)
+        reported = ReportStage(config=run, folds=errors)
         run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
     _print(metrics, folder, run)
 

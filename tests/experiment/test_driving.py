@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.experiment.driving import driving, since_change
-from warp_resphys.experiment.files import Dataset
+from warp_resphys.experiment.files import Dataset, driving, since_change
 
 TIMES = 0.1 * np.arange(6)
 

@@ -20,7 +20,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import MotionStage
+from warp_resphys.settings.stages import AblationStage
 from warp_resphys.stepping.inputs import Inputs
 
 SIZE = (0.1, 0.03, 0.03)
@@ -120,7 +120,11 @@ def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
 
 def test_the_marker_ablation_follows_its_target(tmp_path):
     run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
-    generate_motion(StageContext("generate", tmp_path, "fingerprint", MotionStage.of(run, files={})))
+    generate_motion(
+        StageContext(
+            "generate", tmp_path, "fingerprint", AblationStage.of(run, files={}, counts=(), draws=1, modes=None)
+        )
+    )
     assert (tmp_path / MOTION).is_file()
     seen, uncorrected = read_motion(tmp_path)
     mesh, q, _ = by_hand(0.2, 6)

@@ -18,13 +18,13 @@ from typing_extensions import override
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
-from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json, write_text
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.page import number_text
 from ..settings.run import RunSettings
-from ..settings.stages import AblationStage, DrawSettings, MotionStage, ReportStage
+from ..settings.stages import AblationStage, ReportStage
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
@@ -35,7 +35,6 @@ from .simulate import build_target, held_state
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
 SUMMARY = "ablation.json"
-TABLE = "ablation.csv"
 _STAGES = ("generate", "ablation", "report")
 _MM = 1e3
 
@@ -45,15 +44,15 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
 
     Args:
         run: settings with the group ``ablation``.
-        files: see `SimulationStage`.
+        files: of the bodies, see `settings.stages.SimulationStage`.
     """
     assert run.ablation is not None
     own = run.ablation
     workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
-    work, settings = partial(ablate, workers=workers), AblationStage.of(run, files=files, drawn=DrawSettings.of(own))
+    settings = AblationStage.of(run, files=files, counts=own.counts, draws=own.draws, modes=own.modes)
     return [
-        Stage("generate", generate_motion, (MOTION,), MotionStage.of(run, files=files)),
-        Stage("ablation", work, (DRAWS, SUMMARY, TABLE), settings, ("generate",)),
+        Stage("generate", generate_motion, (MOTION,), settings),
+        Stage("ablation", partial(ablate, workers=workers), (DRAWS, SUMMARY), settings, ("generate",)),
         Stage("report", report_ablation, (REPORT,), ReportStage(config=run), ("ablation",)),
     ]
 
@@ -73,7 +72,7 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
 
 def generate_motion(context: StageContext) -> None:
     """Writes motion.h5: q (T + 1, N, 3) from the held state on, by the target and the uncorrected simulator."""
-    settings: MotionStage = context.settings
+    settings: AblationStage = context.settings
     data = settings.data
     target, simulation = build_target(settings, settings.target), build_simulator(settings, settings.simulation)
     with torch.no_grad():
@@ -88,12 +87,12 @@ def generate_motion(context: StageContext) -> None:
 
 
 def ablate(context: StageContext, workers: Workers = ALONE) -> None:
-    """Writes ablation.h5, with the marker sets and their errors at every step, and tables of the errors.
+    """Writes ablation.h5, with the marker sets and their errors at every step, and a table of the errors.
 
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
     """
-    counts = list(context.settings.drawn.counts)
+    counts = list(context.settings.counts)
     motion, uncorrected = read_motion(context.run_dir)
     parts = {}
     for count in sorted(counts, reverse=True):  # Longest first, to balance the load of the processes.
@@ -109,10 +108,6 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     distance = np.linalg.norm(uncorrected[1:] - motion[1:], axis=-1).mean()
     rows = [summarise_draws(count, e, m) for count, e, m in zip(counts, error, misfit, strict=True)]
     write_json(context.run_dir / SUMMARY, {"uncorrected_mm": _MM * float(distance), "by_markers": rows})
-    lines = ["markers,draw,error_mm,misfit_mm"]
-    for count, e, m in zip(counts, error, misfit, strict=True):
-        lines += [f"{count},{i},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(e, m, strict=True))]
-    write_text(context.run_dir / TABLE, "\n".join(lines) + "\n")
     remove_parts(context)
 
 
@@ -130,16 +125,16 @@ class _FromMarkers(Reconstructing):
 
     def __init__(self, part: TrialPart) -> None:
         settings: AblationStage = part.context.settings
-        self._count, draws = part.more, settings.drawn.draws
+        self._count, draws = part.more, settings.draws
         simulator = build_simulator(settings, settings.simulation)
         like = simulator.rest_positions
         self._motion = simulator.tensor(read_motion(part.context.run_dir)[0])
         self._vertices = draw_markers(simulator, self._count, draws, settings.seed)
         self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=like.device), like.dtype)
-        more = dict(settings.reconstruction) | {"modes": settings.drawn.modes}
+        more = dict(settings.reconstruction) | {"modes": settings.modes}
         self.method = make_reconstructor(simulator, **more, observation=self._markers)
         self.force = like.new_zeros(draws, *like.shape)
-        self._padding = max(settings.drawn.counts) - self._count
+        self._padding = max(settings.counts) - self._count
         self.frames, self.units = len(self._motion), {"error": "m", "misfit": "m"}
 
     @override

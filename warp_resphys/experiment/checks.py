@@ -145,7 +145,7 @@ def _check_control(run: RunSettings, body: Body) -> None:
 
 
 def _check_memory(run: RunSettings) -> None:
-    """Refuses meshes and networks that do not fit into the free memory."""
+    """Refuses meshes that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
     meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in run.bodies.items()}
     for key, body in run.bodies.items():
@@ -158,13 +158,6 @@ def _check_memory(run: RunSettings) -> None:
                 f"{key}.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
                 "free: use fewer."
             )
-    network = run.network
-    weights = network.blocks * (network.layers + 1) * network.width**2
-    if 16 * weights / 2**30 > limit:  # weights, gradients and two moments of Adam in single precision
-        raise InputError(
-            f"network.width, layers and blocks make {weights:,} weights, which take {16 * weights / 2**30:.3g} GiB to "
-            f"train, but {limit:.3g} GiB are free: use a smaller network."
-        )
 
 
 def _check_identification(identify: IdentifySettings, identifiable: Sequence[str], simulator: Simulator) -> None:

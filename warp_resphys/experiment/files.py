@@ -16,6 +16,7 @@ from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
+from ..learning.intervals import time_since_change
 from ..mesh.mesh import select_vertices
 from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
@@ -329,3 +330,27 @@ def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArr
         raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)
     return {"attached_mass": masses}
+
+
+def driving(dataset: Dataset, names: Sequence[str]) -> dict[str, FloatArray]:
+    """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
+    rows = dataset.rows(names)
+    series = {name: values[rows] for name, values in dataset.inputs.items()}
+    series |= {} if dataset.base is None else {"base": dataset.base[rows]}
+    series |= {f"obstacle {name}": poses[rows] for name, poses in dataset.obstacles.items()}
+    steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
+    posed = np.array([dataset.begins[row] == STATIC for row in rows])
+    steps[posed] = np.iinfo(np.int64).max
+    return {
+        name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)
+        for name, values in series.items()
+    }
+
+
+def since_change(dataset: Dataset, names: Sequence[str]) -> FloatArray:
+    """Returns the times (R, T) since the last change of the inputs [s], see `learning.intervals.time_since_change`."""
+    rows = dataset.rows(names)
+    acting = [np.moveaxis(values, 0, 1) for values in driving(dataset, names).values()]
+    since = time_since_change(dataset.times[rows].T, acting).T
+    since[[dataset.begins[row] == STATIC for row in rows]] = np.inf
+    return since

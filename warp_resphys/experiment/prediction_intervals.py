@@ -14,9 +14,8 @@ from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Covered, Intervals, Predicted, coverage
 from ..settings.stages import EvaluateStage
-from .driving import since_change
 from .experiment import Experiment
-from .files import ROLLOUTS, Dataset, read_dataset
+from .files import ROLLOUTS, Dataset, read_dataset, since_change
 from .free_fits import free_fits
 from .models import SIMFREE
 from .sensitivity import Sensitivity, sensitivities

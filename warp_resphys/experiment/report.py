@@ -38,7 +38,6 @@ from ..report.obstacles import ObstacleSurface
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
-from .driving import since_change
 from .experiment import LEARNED
 from .files import (
     CONTROL,
@@ -63,6 +62,7 @@ from .files import (
     fold_folder,
     read_dataset,
     read_if_there,
+    since_change,
     training_file,
 )
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, predictions
 from ..learning.release import least_delays
 from ..learning.replay import sample
-from .driving import driving
 from .experiment import Experiment
-from .files import GIVEN, RESTING
+from .files import GIVEN, RESTING, driving
 
 FloatArray = NDArray[np.float64]
 

@@ -25,11 +25,11 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
-from ..settings.pictures import LEAST_MOVING
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_LEAST_MOVING = 3  # frames after a release, from which its motion is seen
 _SPECKS = 2  # px, of an opening that removes them
 _HEADS = ("scorer", "individuals", "bodyparts", "coords")
 _RIGID = 1e-3  # of a rotation
@@ -164,9 +164,9 @@ def check_times(scene: SceneFile, release: float) -> None:
                 f"{before[1]:g} s: the times of a camera must increase."
             )
         last[frame.lens] = (frame.number, frame.time)
-    if sum(frame.time is not None and frame.time > release for frame in scene.frames) < LEAST_MOVING:
+    if sum(frame.time is not None and frame.time > release for frame in scene.frames) < _LEAST_MOVING:
         raise DataFileError(
-            f"{scene.path} has fewer than {LEAST_MOVING} different frames after the release at {release:g} s: check "
+            f"{scene.path} has fewer than {_LEAST_MOVING} different frames after the release at {release:g} s: check "
             "the times, the release (data.poses) and the chosen frames, or leave the release out of a body at rest."
         )
 

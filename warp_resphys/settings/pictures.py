@@ -10,8 +10,6 @@ from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Set
 from .mesh import LengthUnit, PlaceSettings
 from .trials import LimitSettings, MotionSettings, different
 
-LEAST_MOVING = 3  # frames after a release, from which its motion is seen
-
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 _Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]
 
@@ -115,16 +113,6 @@ class SimulatedCamera(Settings):
     place: Vector = setting(description="position of the camera", unit="m")
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
 
-    def check_release(self, pose: str, time: float) -> None:
-        """Checks that a pose shows enough of the motion after its release at a time [s]."""
-        time += self.corrections.get("release_delay", 0.0)
-        last = (self.frames - 1) / self.frame_rate
-        if sum(n / self.frame_rate > time for n in range(self.frames)) < LEAST_MOVING:
-            raise ValueError(
-                f"{pose} has fewer than {LEAST_MOVING} frames after its release at {time:g} s, as the simulated camera "
-                f"takes its last at {last:.3g} s: set an earlier release.time, or more data.simulated.frames."
-            )
-
 
 class PictureData(Settings):
     """Bodies before a camera, at rest or released: outlines and tracked points in pictures."""
@@ -161,12 +149,6 @@ class PictureData(Settings):
             raise ValueError(
                 f"points is empty, and data.poses.{pointed[0]} has some: give their places, {{tip: [x, y, z]}}."
             )
-        for name, pose in self.poses.items():
-            if pose.release is not None and (pose.cloud is not None or pose.clamp_turn):
-                raise ValueError(
-                    f"poses.{name} has a release beside a scan, which shows no time, or a turned clamp: make another "
-                    "pose without a release."
-                )
         used = {pose.material for pose in self.poses.values()} - {None}
         if used and (missing := sorted(str(name) for name in used if name not in self.materials)):
             raise ValueError(f"materials lacks '{missing[0]}', which a pose names: give it, or {{}}.")
@@ -192,10 +174,6 @@ class PictureData(Settings):
                         f"poses.{name} has a mesh, a material, a scan or a turned clamp, which the simulated camera "
                         "does not play: leave them out."
                     )
-                if pose.points is not None and not pose.points.endswith(".csv"):
-                    raise ValueError(f"poses.{name}.points is {pose.points}: the simulated camera writes a .csv table.")
-                if pose.release is not None:
-                    self.simulated.check_release(f"poses.{name}", pose.release.time)
             if [*self.lenses] != [""]:
                 raise ValueError("lens must be a single one for the simulated camera.")
             if len({pose.folder for pose in self.poses.values()}) < len(self.poses):

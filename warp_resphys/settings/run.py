@@ -283,18 +283,20 @@ class RunSettings(SimulatorSettings):
 
     @model_validator(mode="after")
     def _times(self) -> Self:
-        for key, motion in self.motions().items():
-            for name, swing in (motion.swings or {}).items():
-                if 2.0 * swing.frequency * self.time_step >= 1.0:
-                    raise ValueError(
-                        f"{key}.swings.{name}.frequency is {swing.frequency:g}: steps of {self.time_step:g} s resolve "
-                        f"less than {0.5 / self.time_step:g} Hz."
-                    )
-        data = self.recorded
-        if data is not None and data.cutoff is not None and not data.cutoff < 0.5 / self.time_step:
-            raise ValueError(
-                f"data.cutoff is {data.cutoff:g} Hz: it must be below {0.5 / self.time_step:g} Hz, half of the steps."
-            )
+        data, trials = self.recorded, {} if self.laboratory is None else self.laboratory.trials
+        frequencies = {
+            f"{key}.swings.{name}.frequency": swing.frequency
+            for key, motion in self.motions().items()
+            for name, swing in (motion.swings or {}).items()
+        }
+        waves = {name: trial.waves for name, trial in trials.items() if trial.waves is not None}
+        frequencies |= {f"laboratory.trials.{name}.waves.frequency": own.frequency for name, own in waves.items()}
+        frequencies |= {} if data is None or data.cutoff is None else {"data.cutoff": data.cutoff}
+        for key, frequency in frequencies.items():
+            if 2.0 * frequency * self.time_step >= 1.0:
+                raise ValueError(
+                    f"{key} is {frequency:g} Hz: it must be below {0.5 / self.time_step:g} Hz, half of the steps."
+                )
         return self
 
     def motions(self) -> dict[str, MotionSettings]:

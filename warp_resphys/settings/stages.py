@@ -221,44 +221,24 @@ class DriveStage(LearningStage):
     played: PlayedSettings
 
 
-class MotionStage(SimulationStage):
-    """The motion of a marker ablation."""
+class AblationStage(SimulationStage):
+    """The motion of a marker ablation, and its reconstructions from random sets of markers."""
 
     target: TargetSettings
     simulation: MaterialSettings
     data: ReleaseFromLoad
-
-
-class DrawSettings(Settings):
-    """Random sets of markers."""
-
+    reconstruction: ReconstructionSettings
+    seed: int
     counts: Many[int]
     draws: int
     modes: int | None
-
-
-class AblationStage(SimulationStage):
-    """Reconstructions of the motion from sets of markers."""
-
-    simulation: MaterialSettings
-    reconstruction: ReconstructionSettings
-    seed: int
-    drawn: DrawSettings
 
 
 class ReportStage(Settings):
     """A report, which shows the whole configuration."""
 
     config: RunSettings
-
-
-class SplitReportStage(ReportStage):
-    """The report of a split."""
-
-    acquired: str  # fingerprint of the stage that wrote the dataset
-
-
-class FoldsReportStage(ReportStage):
-    """The report over the folds of a cross-validation."""
-
-    folds: dict[str, Any]  # errors of the models, by the trial that is left out
+    acquired: str = ""  # fingerprint of the stage that wrote the dataset, for the report of a split
+    folds: dict[str, Any] = Field(
+        default={}
+    )  # errors of the models of a cross-validation, by the trial that is left out

@@ -1,7 +1,6 @@
 """Checks of experiments that observe their bodies through markers, before the first stage."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
@@ -118,21 +117,7 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
             f"{listed(owners(nowhere))} of markers.tracked or rigid_bodies is in no data.trials.NAME.labels: add it "
             "there, or leave it out."
         )
-    if markers.frame == "own":
-        _check_sets(trials, tracked)
     marker_view_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
-
-
-def _check_sets(trials: Sequence[Trial], tracked: Sequence[str]) -> None:
-    """Refuses trials that have some but not all markers in common, if markers are seen in their own frame."""
-    has = {trial.name: {tracked[number] for number in trial.tracked(tracked)} for trial in trials}
-    for one, other in combinations(has, 2):
-        common, single = has[one] & has[other], has[one] ^ has[other]
-        if common and single:
-            raise InputError(
-                f"the trials '{one}' and '{other}' both have {listed(sorted(common))}, but only one has "
-                f"{listed(sorted(single))}: with markers.frame own they must have the same markers, or none in common."
-            )
 
 
 def _check_release(run: RunSettings, data: RecordedData) -> None:
@@ -163,20 +148,13 @@ def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None)
     for trial in trials:
         if trial.waves is None:
             continue
-        key = f"{'laboratory' if run.is_laboratory else 'data'}.trials.{trial.name}.waves"
-        if not run.is_laboratory:
-            raise InputError(f"{key} is of simulated trials, and recordings have their own inputs: leave it out.")
+        key = f"laboratory.trials.{trial.name}.waves"
         if drive is None or trial.begins not in RESTING:
             why = "the body has no inputs" if drive is None else f"the trial begins {trial.begins}"
             raise InputError(f"{key} is set, but {why}: leave it out.")
         count, wanted = len(trial.waves.phases), number_of(len(drive.parts), drive.per)
         if count != len(drive.parts):
             raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give as many phases.")
-        if 2.0 * trial.waves.frequency * run.time_step >= 1.0:
-            raise InputError(
-                f"{key}.frequency is {trial.waves.frequency:g}: steps of {run.time_step:g} s resolve less than "
-                f"{0.5 / run.time_step:g} Hz."
-            )
     without = [trial.name for trial in trials if trial.begins in RESTING and not trial.is_driven]
     if without and any(trial.waves is not None for trial in trials):
         raise InputError(f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it.")

@@ -35,9 +35,9 @@ from .trials import evenly
 _LEAST_SECONDS = 60.0  # of the estimates that are shown
 _SHORT = 8e6  # steps times vertices that take less than that
 _RECONSTRUCTION = 8.0  # steps that take as long as a reconstructed one, before that is timed
-_VARIED, _GRADIENT = 0.2, 1.5  # time of one more set of parameters, and of a step with its gradient, over a step's
-_ITERATION = 1.3  # losses in an iteration of L-BFGS
-_BATCH, _RATE = 1e-3, 5e10  # time of a batch of a small network [s], and operations a second
+_VARIED = 0.2  # time of one more set of parameters, over that of a step
+_ITERATION = 2.0  # of L-BFGS: losses with their gradients, over roll-outs
+_BATCH = 1e-3  # time of a batch of a small network [s]
 _SUPPORTED, _MOST_TRIALS = 0.2, 16  # share of the weight, and trials that are timed
 
 
@@ -90,43 +90,36 @@ def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
         case IdentifyStage(identify=wanted):
             names = train if wanted.trials is None else evenly(train, wanted.trials)
             evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
-            candidates = wanted.candidates if wanted.starts > 1 else 0
-            searches = {"sysid": len(wanted.parameters), "sysid_elastic": len(wanted.elastic or {})}
-            each = {m: evaluations * (1.0 + _VARIED * number) + candidates for m, number in searches.items() if number}
+            searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
+            each = {model: evaluations * (1.0 + _VARIED * len(own)) for model, own in searches.items() if own}
             return sum(number * steps_of(experiment, m, names) for m, number in each.items()), 0.0, 0.0
         case ReconstructStage():
             return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
         case TrainStage(model=model, training=training):
             trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
-            looped, loop = 0.0, training.in_the_loop
-            if loop is not None and model != SIMFREE:
+            looped, loop, trainer = 0.0, training.in_the_loop, training.trainer
+            if loop is not None:
                 held_out = loop.start == "zero" and loop.hold_out and not settings.split.validation
-                epoch = _ITERATION * _GRADIENT * trained + rolled
-                looped = (loop.epochs + 1) * epoch * (len(train) if held_out else 1)
+                looped = (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1)
                 if loop.start == "zero":
                     return looped, 0.0, 0.0
-            network, trainer = training.network, training.trainer
-            coder = 9 * experiment.body.n_vertices if network.kind == "nodal" else 0
-            weights = network.width * (network.blocks * network.layers * network.width + coder)
-            batch = _BATCH + 6.0 * weights * trainer.batch_size / _RATE
             replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
-            return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * batch
+            return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
         case EvaluateStage():
             tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
             return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
-        case TimeStage():  # Three rows, one trial at a time, which takes about twice as long.
-            return 6.0 * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
-        case MeshCheckStage():
-            finer = 1.0 + settings.mesh_check**3
-            return finer * steps_of(experiment, "simulation", settings.groups["1"]), 0.0, 0.0
+        case (
+            TimeStage() | MeshCheckStage()
+        ):  # Three rows, one trial at a time, which takes twice as long; a finer mesh.
+            times = 6.0 if isinstance(settings, TimeStage) else 1.0 + settings.mesh_check**3
+            return times * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
     return None
 
 
 def steps_of(experiment: Experiment, model: str, names: Sequence[str]) -> float:
     """Returns the number of steps of a model's simulator in trials, the longest of those that begin alike; 1 a pose."""
-    settings, total = experiment.settings, 0.0
-    kind = MODELS[model][0]
-    time_step = experiment.settings_of("simulation" if kind == "law" else kind).time_step
+    settings, kind = experiment.settings, MODELS[model][0]
+    time_step, total = experiment.settings_of("simulation" if kind == "law" else kind).time_step, 0.0
     for batch in experiment.batches(names):
         limits = [float(experiment.trials(batch).times.max()), settings.trial_seconds]
         limits += [settings.identify.seconds] if isinstance(settings, IdentifyStage) else []

@@ -202,7 +202,7 @@ class TestArms:
         (page_data,) = shown
         sagged = page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()
         assert sagged == pytest.approx(0.004, abs=1e-6)
-        nominal = dict(zip(page_data.recordings.labels, page_data.recordings.nominal[:, 2], strict=True))
+        nominal = {label: place[2] for label, place in page_data.recordings.nominal.items()}
         assert nominal["Base - 1"] == BASE["Base - 1"][2]
         for label, moved in (("Ring 3 - 1", -0.004), ("Ring 1 - 1", -0.001)):
             assert nominal[label] - settings.markers.tracked[label][2] == pytest.approx(moved, abs=3e-4)
@@ -316,11 +316,11 @@ class TestBeams:
     def test_the_trial_that_fits_worst_is_drawn(self, tmp_path):
         write_recordings(tmp_path)
         recordings = read_recordings(tmp_path, BEAM, box_hexahedra(divisions=(3, 1, 1)), {})
-        assert recordings.drawn == "load101"
-        assert recordings.outliers == ("Base - 3",)
-        assert recordings.labels == (*TRACKED, "Base - 1", "Base - 2", "Base - 3")
-        assert recordings.nominal[0].tolist() == TRACKED["Tip - 1"]
-        np.testing.assert_allclose(recordings.feet[0], [0.1, 0.0153, 0.03], atol=1e-12)
+        assert recordings.worst == "load101"
+        fit = recordings.registered["load101"]
+        assert fit["outliers"] == ["Base - 3"]
+        assert [*fit["positions"]] == [*TRACKED, "Base - 1", "Base - 2", "Base - 3"]
+        assert recordings.nominal["Tip - 1"].tolist() == TRACKED["Tip - 1"]
 
     def test_trials_in_order_of_their_errors(self, tmp_path):
         write_recordings(tmp_path)

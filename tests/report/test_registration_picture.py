@@ -16,8 +16,12 @@ POINTS = np.array([[0.1, 0.01, 0.04], [0.1, -0.01, 0.02], [0.1, 0.04, 0], [0, -0
 
 def drawn(measured, path, **options):
     registered = register_markers(measured, POINTS, NAMES, source="swing.c3d", **options)
-    found = (registered.names, registered.positions, 1e3 * registered.residual, registered.outliers)
-    draw_registration(path, Recordings({}, {}, "Beam", *found, POINTS, POINTS, MESH), select_vertices(MESH, x=0.0))
+    places = [None if np.isnan(place).any() else place.tolist() for place in registered.positions]
+    fit = {"positions": places, "residual_mm": 1e3 * registered.residual}
+    fit = {key: dict(zip(registered.names, values, strict=True)) for key, values in fit.items()}
+    fits = {"Beam": {**fit, "rms_mm": 0.0, "outliers": registered.outliers}}
+    nominal = dict(zip(NAMES, POINTS, strict=True))
+    draw_registration(path, Recordings({}, fits, nominal, (), MESH), select_vertices(MESH, x=0.0))
     return imread(path)[..., :3]
 
 

@@ -13,8 +13,7 @@ from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic, select_vertices
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from warp_resphys.studies.inspection import Inspection, inspect
-from warp_resphys.studies.mesh_inspection import inspect_mesh
+from warp_resphys.studies.inspection import Inspection, inspect, inspect_mesh
 
 
 def inspected(*overrides):

@@ -23,7 +23,6 @@ from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
-from ..mesh.surface import closest_points
 from ..report.data import (
     MODELS,
     Driven,
@@ -86,9 +85,14 @@ def make_report(context: StageContext) -> None:
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
     assert run.tip is not None
+    names = {name for model in identification.values() for name in model.get("parameters", {})}
+    simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
     no_vertices = np.empty(0, dtype=np.int64)
     data = RunReport(
-        **_common_parts(run, metrics, body),
+        metrics=metrics,
+        settings=run,
+        mesh=body.mesh,
+        fixed=body.fixed_vertices,
         tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
@@ -101,9 +105,11 @@ def make_report(context: StageContext) -> None:
         identification=identification,
         law=law,
         **(read_stretches(folder, mesh, trials, film) if law else {}),
-        start=data_sheet(run, identification),
+        start=configured_parameters(simulator, sorted(names)),
         truth={**truth.get("material", {}), **true_contact(run)},
-        training=_histories(folder),
+        training={
+            model: epochs for model in LEARNED if (epochs := read_if_there(folder / training_file(model)).get("epochs"))
+        },
         followed=read_followed(folder, run),
     )
     run_page.write_report(folder / REPORT, data)
@@ -121,32 +127,19 @@ def make_folds_report(context: StageContext) -> None:
     metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
     body = build_body(run, run.payload_at)
     data = RunReport(
-        **_common_parts(run, metrics, body),
+        metrics=metrics,
+        settings=run,
+        mesh=body.mesh,
+        fixed=body.fixed_vertices,
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
         recordings=read_recordings(folder, run, body.mesh, {}),
     )
     run_page.write_report(folder / REPORT, data)
 
 
-def _common_parts(run: RunSettings, metrics: Mapping[str, Any], body: Body) -> dict[str, Any]:
-    """Data that all pages show."""
-    return {
-        "metrics": metrics,
-        "settings": run,
-        "mesh": body.mesh,
-        "fixed": body.fixed_vertices,
-    }
-
-
 def common_folder(folder: Path) -> Path:
     """Folder of the files that do not depend on the fold: the folder itself, or the parent of a fold's folder."""
     return folder if (folder / DATASET).is_file() else folder.parent
-
-
-def _histories(folder: Path) -> dict[str, Any]:
-    """Training histories by model."""
-    files = {model: folder / training_file(model) for model in LEARNED}
-    return {model: read_json(path)["epochs"] for model, path in files.items() if path.is_file()}
 
 
 def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> dict[str, Any]:
@@ -185,13 +178,6 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
     }
-
-
-def data_sheet(run: RunSettings, identification: Mapping[str, Any]) -> dict[str, float]:
-    """Configured values of the identified parameters."""
-    names = {name for model in identification.values() for name in model.get("parameters", {})}
-    simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
-    return configured_parameters(simulator, sorted(names))
 
 
 def true_contact(run: RunSettings) -> dict[str, float]:
@@ -407,7 +393,7 @@ def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh,
 
 
 def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
-    """Quality and registration of all trials, with the worst registration in detail; None without recordings.
+    """Quality and registration of all trials; None without recordings.
 
     Args:
         folder: folder of the split.
@@ -417,31 +403,8 @@ def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[s
     """
     if run.markers is None:
         return None
-    path = common_folder(folder) / REGISTRATION
-    residuals = read_json(path)
-    worst = max(residuals, key=lambda trial: residuals[trial]["rms_mm"])
-    drawn = residuals[worst]
-    if "positions" not in drawn:
-        raise DataFileError(f"{path} has no positions: delete it and run the same command again.")
-    nominal: dict[str, Any] = {**run.markers.tracked, **run.markers.reference}
-    labels = [label for label in drawn["positions"] if label in nominal]
-    # Markers that were not seen are null in JSON.
-    places = np.array([drawn["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
-    seen = np.isfinite(places).all(axis=1)
-    feet = np.full_like(places, np.nan)
-    feet[seen] = closest_points(mesh, places[seen]).points
-    if run.fixed is None:  # Reference markers stand beside the body.
-        standing = np.isin(labels, [*run.markers.reference])
-        feet[standing] = places[standing]
-    return Recordings(
-        quality=read_json(path.with_name(QUALITY)),
-        residuals=residuals,
-        drawn=worst,
-        labels=tuple(labels),
-        positions=places,
-        residual_mm=np.array([drawn["residual_mm"].get(label) for label in labels], dtype=np.float64),
-        outliers=tuple(drawn["outliers"]),
-        nominal=np.array([np.add(nominal[label], moved.get(label, 0.0)) for label in labels], dtype=np.float64),
-        feet=feet,
-        mesh=mesh,
-    )
+    beside = [] if run.fixed is not None else [*run.markers.reference]
+    known: dict[str, Any] = {**run.markers.tracked, **run.markers.reference}
+    nominal = {label: np.add(place, moved.get(label, 0.0)) for label, place in known.items()}
+    quality, registered = (read_json(common_folder(folder) / name) for name in (QUALITY, REGISTRATION))
+    return Recordings(quality, registered, nominal, beside, mesh)

@@ -17,6 +17,7 @@ from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.quality import cell_volumes
+from ..mesh.surface import closest_points
 from .bodies import face_edges, obstacle_layers, sharp_edges, stems
 from .data import Recordings
 from .figures import CHAMBER_COLOURS, in_style
@@ -29,7 +30,6 @@ from .render import (
     FloatArray,
     IntArray,
     Layer,
-    Pixels,
     Renderer,
     RenderScene,
     View,
@@ -95,25 +95,41 @@ def draw_mesh(
     Raises:
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
-    axes = view_axes(TOWARDS_VIEWER)
     dots = np.empty((0, 3)) if markers is None else markers
     shown = dots[np.isfinite(dots).all(axis=1)]
     radius = _DOT * float(np.ptp(summary.mesh.vertices, axis=0).max())
     around = summary.obstacles.near(summary.mesh.vertices)
-    focus, half = frame_of(
-        np.concatenate([summary.mesh.vertices, shown - radius, shown + radius, around]), axes, _MARGIN
-    )
-    half = np.maximum(half, _NARROWEST * half.max())
-    size = picture_size(half, _LONGER_SIDE)
-    views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, max(1.0, size[1] / 900.0))]
-    (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
+    points = np.concatenate([summary.mesh.vertices, shown - radius, shown + radius, around])
+    ((axes, focus),), half, size = _framed(points, [TOWARDS_VIEWER])
+    views = [View(layers, axes, focus, half) for layers in _layers(summary, dots, _line(size))]
     labels = [
         f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
         for chamber in summary.chambers
     ]
     labels += [name.replace("_", " ") for name in summary.tendons]
     handles = [Patch(color=tone, label=label) for label, tone in zip(labels, cycle(CHAMBER_COLOURS), strict=False)]
-    figure = _with_titles(picture, ["Outside", "Cut open", summary.inside][: len(views)], handles)
+    titles = ["Outside", "Cut open", summary.inside][: len(views)]
+    _save(_with_titles(views, size, titles, handles, renderer), path)
+
+
+def _framed(
+    points: FloatArray, towards_viewer: Sequence[Sequence[float]]
+) -> tuple[list[tuple[FloatArray, FloatArray]], float, list[int]]:
+    """Returns axes and middle of each view of points (P, 3), half the height of all views [m], and their size [px]."""
+    turned = [view_axes(towards) for towards in towards_viewer]
+    frames = [frame_of(points, axes, _MARGIN) for axes in turned]
+    half = np.max([own for _, own in frames], axis=0)
+    half = np.maximum(half, _NARROWEST * half.max())
+    placed = [(axes, focus) for axes, (focus, _) in zip(turned, frames, strict=True)]
+    return placed, float(half[1]), picture_size(half, _LONGER_SIDE)
+
+
+def _line(size: Sequence[int]) -> float:
+    """Returns the width of a thin line [px] in views of a size."""
+    return max(1.0, size[1] / 900.0)
+
+
+def _save(figure: Figure, path: Path) -> None:
     with atomic_path(path) as target:
         figure.savefig(target, format="png", dpi=_DPI)
 
@@ -127,7 +143,7 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
 
     Args:
         path: The PNG file to write.
-        recordings: With the markers; those that were not seen are not drawn.
+        recordings: Of which the trial that fits worst is drawn, without markers that were not seen.
         fixed: Vertices of the clamped region.
         renderer: Process that draws, in place of a new one.
 
@@ -135,51 +151,18 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
         DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
         DataFileError: The file cannot be written.
     """
-    mesh, markers = recordings.mesh, recordings.positions
+    mesh, fit = recordings.mesh, recordings.registered[recordings.worst]
+    labels = [label for label in fit["positions"] if label in recordings.nominal]
+    # Markers that were not seen are null in JSON.
+    markers = np.array([fit["positions"][label] or (None,) * 3 for label in labels], dtype=np.float64)
+    nominal = np.stack([recordings.nominal[label] for label in labels])
     radius = _DOT * float(np.ptp(mesh.vertices, axis=0).max())
-    ends = np.concatenate([markers, recordings.nominal])
+    ends = np.concatenate([markers, nominal])
     shown = np.concatenate([mesh.vertices, ends - _RING * radius, ends + _RING * radius])
-    turned = [view_axes(towards) for towards in _SIDES.values()]
-    frames = [frame_of(shown, axes, _MARGIN) for axes in turned]
-    half = np.max([own for _, own in frames], axis=0)
-    half = np.maximum(half, _NARROWEST * half.max())
-    size = picture_size(half, _LONGER_SIDE)
-    seen = np.isfinite(markers).all(axis=1)
-    away = seen & (np.linalg.norm(markers - recordings.nominal, axis=1) > _RING * radius)
-    layers = _registered(recordings, fixed, away, radius, max(1.0, size[1] / 900.0))
-    views = [View(layers, axes, focus, half[1]) for axes, (focus, _) in zip(turned, frames, strict=True)]
-    (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer=renderer)
-    none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
-    handles = [
-        Line2D([], [], **none, color=MEASURED, label="measured"),
-        Line2D([], [], **none, color=NOMINAL, markerfacecolor="none", markersize=9, label="nominal"),
-        *([Patch(color=CLAMPED, label="clamped")] if len(fixed) else []),
-    ]
-    figure = _with_titles(picture, list(_SIDES), handles)
-    for at, (axes, (focus, _)) in enumerate(zip(turned, frames, strict=True)):
-        across, up = ((markers - focus) @ axes[:2].T).T / half[1] * (0.5 * size[1])  # [px] from the middle.
-        for marker in np.flatnonzero(away | (seen & np.isin(recordings.labels, recordings.outliers))):
-            place: Any = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
-            name = f"{recordings.labels[marker]}: {recordings.residual_mm[marker]:.2f} mm"
-            name += ", left out" * (recordings.labels[marker] in recordings.outliers)
-            left = across[marker] > 0.0
-            figure.axes[0].annotate(
-                name,
-                place,
-                (-9 if left else 9, 0),
-                textcoords="offset points",
-                ha="right" if left else "left",
-                va="center",
-                path_effects=[withStroke(linewidth=2.5, foreground="white")],
-            )
-    with atomic_path(path) as target:
-        figure.savefig(target, format="png", dpi=_DPI)
-
-
-def _registered(recordings: Recordings, fixed: IntArray, away: FloatArray, radius: float, line: float) -> list[Layer]:
-    """Layers of the body and its markers; those outside of their rings (M,) are connected with them."""
-    mesh, markers, nominal = recordings.mesh, recordings.positions, recordings.nominal
-    q, triangles, seen = mesh.vertices, boundary_triangles(mesh), np.isfinite(markers).all(axis=1)
+    placed, half, size = _framed(shown, [*_SIDES.values()])
+    seen, line = np.isfinite(markers).all(axis=1), _line(size)
+    away = seen & (np.linalg.norm(markers - nominal, axis=1) > _RING * radius)
+    q, triangles = mesh.vertices, boundary_triangles(mesh)
     layers = [
         Layer("surface", q, triangles, BODY, opacity=0.42, light=(0.78, 0.28)),
         Layer("lines", q, face_edges(mesh), INK, opacity=0.22, size=line, shift=0.1 * radius),
@@ -190,13 +173,44 @@ def _registered(recordings: Recordings, fixed: IntArray, away: FloatArray, radiu
     if len(clamped := triangles[np.isin(triangles, fixed).all(axis=1)]):
         layers.append(Layer("surface", q, clamped, CLAMPED, opacity=0.75, light=(0.7, 0.22), shift=0.1 * radius))
     if seen.any():
-        layers.append(stems(recordings.feet[seen], markers[seen], INK, 3.0 * line))
+        standing = np.isin(labels, [*recordings.beside])[seen, None]
+        feet = np.where(standing, markers[seen], closest_points(mesh, markers[seen]).points)
+        layers.append(stems(feet, markers[seen], INK, 3.0 * line))
         layers.append(Layer("balls", markers[seen], None, MEASURED, size=radius, light=(0.72, 0.41)))
-    return [*layers, *([stems(nominal[away], markers[away], NOMINAL, 2.0 * line)] if away.any() else [])]
+    if away.any():
+        layers.append(stems(nominal[away], markers[away], NOMINAL, 2.0 * line))
+    none: dict[str, Any] = {"linestyle": "none", "marker": "o"}
+    handles = [
+        Line2D([], [], **none, color=MEASURED, label="measured"),
+        Line2D([], [], **none, color=NOMINAL, markerfacecolor="none", markersize=9, label="nominal"),
+        *([Patch(color=CLAMPED, label="clamped")] if len(fixed) else []),
+    ]
+    views = [View(layers, axes, focus, half) for axes, focus in placed]
+    figure = _with_titles(views, size, list(_SIDES), handles, renderer)
+    outlying = np.isin(labels, fit["outliers"])
+    for at, (axes, focus) in enumerate(placed):
+        across, up = ((markers - focus) @ axes[:2].T).T / half * (0.5 * size[1])  # [px] from the middle.
+        for marker in np.flatnonzero(away | (seen & outlying)):
+            place: Any = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
+            name = f"{labels[marker]}: {fit['residual_mm'][labels[marker]]:.2f} mm{', left out' * outlying[marker]}"
+            left = across[marker] > 0.0
+            figure.axes[0].annotate(
+                name,
+                place,
+                (-9 if left else 9, 0),
+                textcoords="offset points",
+                ha="right" if left else "left",
+                va="center",
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            )
+    _save(figure, path)
 
 
-def _with_titles(picture: Pixels, titles: Sequence[str], handles: Sequence[Any]) -> Figure:
+def _with_titles(
+    views: Sequence[View], size: Sequence[int], titles: Sequence[str], handles: Sequence[Any], renderer: Renderer | None
+) -> Figure:
     """A figure of views side by side, in pixels, with titles above and a legend below."""
+    (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer)
     width, height = picture.shape[1] / _DPI, picture.shape[0] / _DPI
     columns = max(1, int(width / _ENTRY))
     legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0

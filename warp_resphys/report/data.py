@@ -111,18 +111,18 @@ class Driven:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Quality of the recordings, and their registration on the body."""
+    """Quality of the recordings, and their registration on the body, by trial."""
 
-    quality: Mapping[str, Any]  # By trial, the content of `warp_resphys.data.recordings.quality.Quality`.
-    residuals: Mapping[str, Any]  # By trial: `rms_mm`, `residual_mm` and `shift_mm` by label, `outliers`.
-    drawn: str  # Name of the trial that fits worst, which is drawn.
-    labels: tuple[str, ...]  # Of its M markers.
-    positions: FloatArray  # (M, 3) [m] at rest, NaN for markers that were not seen.
-    residual_mm: FloatArray  # (M,) [mm] distance from the nominal positions.
-    outliers: tuple[str, ...]  # Labels of markers that were left out of the fit, as they were too far off.
-    nominal: FloatArray  # (M, 3) [m] nominal positions.
-    feet: FloatArray  # (M, 3) [m] closest points of the body; of markers that stand beside a free one, their places.
+    quality: Mapping[str, Any]  # As `warp_resphys.data.recordings.quality.Quality.to_plain` gives it.
+    registered: Mapping[str, Any]  # `rms_mm`, `outliers`, and by label `positions` [m], `residual_mm` and `shift_mm`.
+    nominal: Mapping[str, FloatArray]  # (3,) [m] nominal positions at rest, by label.
+    beside: Collection[str]  # Labels of markers that stand beside the body.
     mesh: Mesh  # The body at rest.
+
+    @property
+    def worst(self) -> str:
+        """Name of the trial that fits worst, which is drawn."""
+        return max(self.registered, key=lambda trial: float(self.registered[trial]["rms_mm"]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

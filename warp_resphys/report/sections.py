@@ -202,7 +202,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     recordings = data.recordings
     if recordings is None:
         return None
-    shown = f"The body at rest with the registered markers of the trial {recordings.drawn}"
+    shown = f"The body at rest with the registered markers of the trial {recordings.worst}"
 
     def picture(path: Path) -> Drawn:
         from .body_picture import draw_registration
@@ -214,8 +214,8 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
         return drawn_file(path, f"{shown}, from two sides.", caption)
 
     blocks = canvas.attempt("registration.png", picture)
-    mountings = mounting_table(recordings.residuals)
-    return Part("Registration", [*blocks, residual_table(recordings.residuals), *([mountings] if mountings else [])])
+    mountings = mounting_table(recordings.registered)
+    return Part("Registration", [*blocks, residual_table(recordings.registered), *([mountings] if mountings else [])])
 
 
 def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:

@@ -12,8 +12,7 @@ from ..data.rigid import RigidTransform, kabsch
 from ..energies.contact import MOTION, Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.errors import ConvergenceError, InputError
-from ..mesh.mesh import boundary_triangles, surface_vertices
-from ..report.obstacles import ObstacleSurface
+from ..mesh.mesh import surface_vertices
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
@@ -41,10 +40,10 @@ class LiveRobot:
     Attributes:
         size: longest side of the body [m].
         surface: (S,) vertices of its boundary.
-        faces: (F, 3) triangles of these, numbered among them.
         inputs: (C,) commanded values by name.
         limits: lowest and highest values (C,) of the parts of each input.
         parameters: quantities and original values of the parameters that may be changed, by name.
+        moved: (O,) inputs that moved obstacles in the last step, by name.
         time: since the start of the motion [s].
         failure: why the simulation stopped; empty while it runs.
     """
@@ -54,7 +53,6 @@ class LiveRobot:
         mesh = robot.simulator.body.mesh
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         self.surface = surface_vertices(mesh)
-        self.faces = np.searchsorted(self.surface, boundary_triangles(mesh))
         self.inputs = {name: np.zeros(len(robot_input.parts)) for name, robot_input in robot.inputs.items()}
         self.limits = {name: self._limits(name) for name in robot.inputs}
         self.parameters = {} if robot.is_data_driven else _changeable(robot)
@@ -63,7 +61,7 @@ class LiveRobot:
         self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)  # [N/m]
         self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of held vertices, (3,) target [m]
         self._on_body = _markers_on_body(robot)
-        self._placed: dict[str, FloatArray] = {}  # (O,) inputs that moved obstacles in the last step
+        self.moved: dict[str, FloatArray] = {}
         self.state: RobotState
         self.trial: RecordedTrial | None = None
         self.failure = ""
@@ -137,14 +135,9 @@ class LiveRobot:
         return self._held is not None
 
     @property
-    def moved(self) -> Mapping[str, FloatArray]:
-        """(O,) inputs that moved obstacles in the last step, by name."""
-        return self._placed
-
-    @property
-    def obstacles(self) -> ObstacleSurface:
-        """The robot's obstacles, at its parameters."""
-        return ObstacleSurface.of(self.robot.simulator.body, self.robot.parameters)
+    def target(self) -> FloatArray | None:
+        """Measured positions (N, 3) of the vertices [m], where every one is observed."""
+        return None if self.robot.labels else self.measured
 
     # Interactions
 
@@ -193,7 +186,7 @@ class LiveRobot:
 
     def reset(self) -> None:
         """Restarts from the initial state of the trial, or from rest without inputs."""
-        self.time, self.failure, self._held, self._placed = 0.0, "", None, {}
+        self.time, self.failure, self._held, self.moved = 0.0, "", None, {}
         for values in self.inputs.values():
             values[:] = 0.0
         with torch.no_grad():
@@ -221,7 +214,7 @@ class LiveRobot:
         except (ConvergenceError, InputError) as error:
             self.failure = f"Stopped: {error}"
             return False
-        self.time, self._placed = self.time + self.robot.time_step, placed
+        self.time, self.moved = self.time + self.robot.time_step, placed
         return True
 
     @property
@@ -241,7 +234,7 @@ class LiveRobot:
             values = np.zeros(len(self.robot.inputs[name].parts))
             if name in wanted:
                 target = wanted[name]
-                before = self._placed.get(name, np.zeros_like(values))
+                before = self.moved.get(name, np.zeros_like(values))
                 far = self._reach if number < 3 else self._reach / self.size
                 step = target - before if self.trial is not None else np.clip(target - before, -far, far)
                 values = before + step

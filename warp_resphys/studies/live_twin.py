@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from ..control.reduced_twin import reduced_twin
 from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
-from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
 from ..robot.twin.estimator import TwinNoise
 from ..robot.twin.scores import Forecast
 from ..robot.twin.stream import Alignment, Listener, Packet, recorded_packets
 from ..robot.twin.twin import JUMPS, Estimate, Twin
-from ..stepping.quantity import Quantity
 
 FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
@@ -95,22 +93,16 @@ class LiveTwin:
         settings: of the twin.
 
     Attributes:
-        size, surface, faces: as of `live.LiveRobot`.
         time: of the last packet [s].
         seconds: computing times of the last packets [s].
         failure: why the twin ended; empty while it runs.
     """
 
-    inputs: ClassVar[Mapping[str, FloatArray]] = {}
-    parameters: ClassVar[Mapping[str, tuple[Quantity, float]]] = {}
+    moved: ClassVar[Mapping[str, FloatArray]] = {}
     trial = None
 
     def __init__(self, robot: Robot, source: str, settings: TwinSettings) -> None:
         self.robot, self._source, self._settings = robot, source, settings
-        mesh = robot.simulator.body.mesh
-        self.size = float(np.ptp(mesh.vertices, axis=0).max())
-        self.surface = surface_vertices(mesh)
-        self.faces = np.searchsorted(self.surface, boundary_triangles(mesh))
         self._listener = Listener(source) if "://" in source else None
         self.seconds: deque[float] = deque(maxlen=_REMEMBERED)
         self._made = settings.twins_of(robot)
@@ -156,7 +148,7 @@ class LiveTwin:
         return np.asarray(state.double().cpu().numpy())
 
     @property
-    def ahead(self) -> FloatArray | None:
+    def target(self) -> FloatArray | None:
         """Predicted positions (N, 3) of the vertices [m]."""
         return None if self._prediction is None else self._prediction.state.q[0].double().cpu().numpy()
 

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from ..io.errors import InputError, ResphysError
 from ..io.settings import Count, Positive, Settings, Word, setting
+from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..report.bodies import sharp_edges
 from ..report.figures import TONES
 from ..report.obstacles import OBSTACLE, ObstacleSurface
 from ..report.render import MEASURED, upwards
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
-from ..robot.robot import Robot
 from .live import LiveRobot, range_of
 from .live_twin import LiveTwin, TwinSettings
 from .tables import show
@@ -39,7 +39,6 @@ _STATUS_EVERY: Final = 0.25  # [s]
 _HAND: Final = "hand"
 _BY_HAND: Final = "by hand"
 _EVERYWHERE: Final = ("0.0.0.0", "::")  # Hosts that stand for all addresses of a machine.
-_HIGHEST_PORT: Final = 65535
 _DOT: Final = 0.02  # Radius of a marker's dot, over the size of the body.
 _HELP: Final = """Drag the body to pull it, drag beside it to turn the view, scroll to zoom, right-drag to move.
 Keys: **space** pauses, **R** resets."""
@@ -86,8 +85,9 @@ def view(settings: ViewSettings, folder: Path) -> None:
         live = LiveTwin(robot, settings.source, settings.twin)
     else:
         live = LiveRobot(robot)
-        if settings.trial != _HAND and (name := _first_trial(robot) if settings.trial is None else settings.trial):
-            live.play_trial(name)
+        held_out = () if robot.folder is None else held_out_names(robot, moving=True)
+        name = next(iter(held_out), None) if settings.trial is None else settings.trial
+        live.play_trial(None if name == _HAND else name)
         live.step()  # Compiles the kernels of a step before the page is opened.
         live.reset()
     logging.getLogger("websockets").setLevel(logging.WARNING)
@@ -107,23 +107,12 @@ def view(settings: ViewSettings, folder: Path) -> None:
             live.close()
     show(f"{rate:.1f} pictures a second")
     if isinstance(live, LiveTwin):
-        for line in _summary(live):
-            show(line)
-
-
-def _first_trial(robot: Robot) -> str | None:
-    """Name of the first test trial that is a motion; None if there is none, or the robot comes from a file."""
-    return None if robot.folder is None else next(iter(held_out_names(robot, moving=True)), None)
-
-
-def _summary(live: LiveTwin) -> list[str]:
-    """Lines on a twin that has ended."""
-    lines = [*live.words, *[live.failure][: bool(live.failure)]]
-    if not live.seconds:
-        return ["no frames", *lines]
-    half, most = np.percentile(1e3 * np.array(live.seconds), [50, 99])
-    pace = f"an estimate for a packet in {half:.1f} ms (median), {most:.1f} ms (99th percentile)"
-    return [f"{pace}, steps of {1e3 * live.robot.time_step:g} ms", *lines]
+        pace = "no frames"
+        if live.seconds:
+            half, most = np.percentile(1e3 * np.array(live.seconds), [50, 99])
+            pace = f"an estimate for a packet in {half:.1f} ms (median), {most:.1f} ms (99th percentile), "
+            pace += f"steps of {1e3 * robot.time_step:g} ms"
+        show("\n".join(filter(None, [pace, *live.words, live.failure])))
 
 
 def _free_port(host: str, port: int) -> int:
@@ -132,18 +121,13 @@ def _free_port(host: str, port: int) -> int:
     Raises:
         InputError: the port is in use or cannot be bound.
     """
-    if port > _HIGHEST_PORT:
-        raise InputError(f"port is {port}: there are none above {_HIGHEST_PORT}.")
     with socket.socket() as tried:
         tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             tried.bind((host, port))
-        except UnicodeError:
-            raise InputError(f"host is {host!r}, which is not the name of a machine: 127.0.0.1 is this one.") from None
-        except OSError as error:
-            raise InputError(
-                f"port {port} of {host} cannot be used ({error.strerror}): choose another with port=, 0 for any."
-            ) from None
+        except (OSError, OverflowError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"port {port} of {host} cannot be used ({reason}): choose another, 0 for any.") from None
         return int(tried.getsockname()[1])
 
 
@@ -168,9 +152,13 @@ class Page:
         self._shown_trial: RecordedTrial | None = None
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
-        self._scale = 1.0 / live.size  # Of the scene: viser's cameras expect bodies of about a metre.
+        self._surface = surface_vertices(mesh)
+        self._faces = np.searchsorted(self._surface, boundary_triangles(mesh))
+        self._scale = 1.0 / float(
+            np.ptp(mesh.vertices, axis=0).max()
+        )  # Of the scene: viser's cameras expect bodies of about a metre.
         self._middle = mesh.vertices.mean(axis=0)
-        self._sharp = sharp_edges(mesh.vertices[live.surface], live.faces)
+        self._sharp = sharp_edges(mesh.vertices[self._surface], self._faces)
         self._set_scene()
         self._set_controls()
 
@@ -192,21 +180,22 @@ class Page:
         position = 1.3 * side / np.linalg.norm(side) + 0.35 * up
         camera.position = (float(position[0]), float(position[1]), float(position[2]))
         camera.up = (float(up[0]), float(up[1]), float(up[2]))
-        places = self._shown(live.positions[live.surface])
+        places = self._shown(live.positions[self._surface])
         blue, grey = _bytes(TONES["resphys"].dark), _bytes(TONES["target"].light)
         self._body = server.scene.add_mesh_simple(
-            "/body", places, live.faces.astype(np.uint32), color=blue, flat_shading=True, side="double"
+            "/body", places, self._faces.astype(np.uint32), color=blue, flat_shading=True, side="double"
         )
         self._target = server.scene.add_mesh_simple(
-            "/measured body", places, live.faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
+            "/measured body", places, self._faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
         )
+        self._placed, body = live.robot, live.robot.simulator.body
+        self._around = ObstacleSurface.of(body, live.robot.parameters)
         self._obstacles: Any = None
-        around = self._around()
-        if len(around.points):
+        if len(self._around.points):
             self._obstacles = server.scene.add_mesh_simple(
                 "/obstacles",
-                self._shown(around.points),
-                around.triangles.astype(np.uint32),
+                self._shown(self._around.points),
+                self._around.triangles.astype(np.uint32),
                 color=_bytes(OBSTACLE),
                 flat_shading=True,
                 side="double",
@@ -240,15 +229,6 @@ class Page:
         async def _(client: Any) -> None:
             if client.client_id == self._holder:
                 self._let_go()
-
-    def _around(self) -> ObstacleSurface:
-        """Obstacles of the robot, with its current parameters."""
-        live, self._placed = self._live, self._live.robot
-        if isinstance(live, LiveTwin):
-            self._surface = ObstacleSurface.of(self._placed.simulator.body, self._placed.parameters)
-            return self._surface
-        self._surface = live.obstacles
-        return self._surface.moved(live.moved)
 
     def _let_go(self) -> None:
         self._holder = None
@@ -416,27 +396,26 @@ class Page:
 
     def _show(self) -> None:
         live = self._live
-        if self._obstacles is not None and self._placed is not live.robot:
-            self._obstacles.vertices = self._shown(self._around().points)
-        elif self._obstacles is not None and isinstance(live, LiveRobot) and live.moved:
-            self._obstacles.vertices = self._shown(self._surface.moved(live.moved).points)
+        if self._obstacles is not None and (self._placed is not live.robot or live.moved):
+            if self._placed is not live.robot:  # Its parameters have changed.
+                self._placed = live.robot
+                self._around = ObstacleSurface.of(live.robot.simulator.body, live.robot.parameters)
+            self._obstacles.vertices = self._shown(self._around.moved(live.moved).points)
         if self._shown_state is live.state and self._shown_trial is live.trial:
             return
         self._shown_state, self._shown_trial = live.state, live.trial
         places = self._shown(live.positions)
         with self._server.atomic():
-            surface = places[live.surface]
+            surface = places[self._surface]
             self._body.vertices = surface
             self._edges.points = surface[self._sharp]
             self._dots(self._markers, live.markers)
-            measured = live.measured
-            whole = live.ahead if isinstance(live, LiveTwin) else None if live.robot.labels else measured
-            dots = measured is not None and (isinstance(live, LiveTwin) or bool(live.robot.labels))
-            self._dots(self._measured, measured if dots and measured is not None else np.empty((0, 3)))
-            if whole is not None:
-                self._target.vertices = self._shown(whole[live.surface])
-            if self._target.visible != (whole is not None):
-                self._target.visible = whole is not None
+            measured, target = live.measured, live.target
+            self._dots(self._measured, measured if measured is not None and live.robot.labels else np.empty((0, 3)))
+            if target is not None:
+                self._target.vertices = self._shown(target[self._surface])
+            if self._target.visible != (target is not None):
+                self._target.visible = target is not None
 
     def _dots(self, cloud: Any, points: FloatArray) -> None:
         seen = points[np.isfinite(points).all(axis=1)]

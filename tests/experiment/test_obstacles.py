@@ -27,7 +27,6 @@ from warp_resphys.io.files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report.identification_section import parameter_wording
 from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
@@ -133,7 +132,6 @@ class TestSurfaces:
         assert {"surface_friction", "surface_stiffness"} <= {*identifiable_parameters(simulator)}
         given = {"surface_friction": torch.tensor([0.1, 0.7], dtype=torch.float64)}
         assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.1], [0.7]]
-        assert parameter_wording("surface_friction")[:2] == ("Friction between surfaces", "")
 
     def test_friction_of_pairs_of_regions_is_configured_and_identified(self):
         pairs = "self_contact.pairs={pad: {first: lower, second: body, friction: 0.8}}"
@@ -143,7 +141,6 @@ class TestSurfaces:
         given = {"surface_friction_pad": torch.tensor([0.5, 0.6], dtype=torch.float64)}
         assert given.keys() <= {*identifiable_parameters(simulator)}
         assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.3, 0.5], [0.3, 0.6]]
-        assert parameter_wording("surface_friction_pad")[0] == "Friction between surfaces, 'pad'"
         with pytest.raises(InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"):
             build_body(settings(*ABOVE, pairs.replace("body", "shell")))
 

@@ -334,12 +334,12 @@ class TestRelease:
         assert row["points_mm"]["sysid"] < 0.5 * row["points_mm"]["undeformed"]
         page = (run / "report.html").read_text()
         for name, true in {
-            "Delay of the release, released [ms]": "7",
-            "First tilt of gravity, released [°]": "0",
+            "Release delay, released [ms]": "7",
+            "Gravity tilt 1, released [°]": "0",
         }.items():
             cells = re.sub(r"<[^>]*>", " ", page.partition(name)[2].partition("</tr>")[0]).split()
             assert cells[-1] == true
-        assert "Damping by stiffness [ms]: " in out
+        assert "Stiffness damping [ms]: " in out
         assert read_json(run / "law.json")["constants"]["stiffness_damping"] == found["stiffness_damping"]
 
     @pytest.fixture(scope="class")

@@ -78,7 +78,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
     assert identified["youngs_modulus"] == pytest.approx(MODULUS, rel=0.01)
     assert {name: identified[f"tendon_offset_1_{name}"] for name in OFFSETS} == pytest.approx(OFFSETS, abs=2e-4)
     page, metrics = (run / "report.html").read_text(), read_json(run / "metrics.json")
-    assert "First offset of the tendon &#39;first&#39;" in page
+    assert "Tendon offset 1 first" in page
     errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()

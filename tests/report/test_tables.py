@@ -128,7 +128,7 @@ class TestIdentification:
         modulus, damping = parameter_rows(identified, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
         assert modulus.head == "Young's modulus [kPa]"
         assert modulus.cells == [Cell("264"), Cell("251.3", beside="± 2.5"), Cell("250"), Cell("")]
-        assert damping.head == "Damping by stiffness [ms]"
+        assert damping.head == "Stiffness damping [ms]"
         assert damping.cells == [Cell(NONE), Cell("2.90", beside="± 0.10"), Cell(NONE), Cell("yes")]
         identified["parameters"]["youngs_modulus"] = -3.0
         assert parameter_rows(identified, {}, {})[0].cells[1].text == "0.0"
@@ -138,10 +138,16 @@ class TestIdentification:
         ("parameter", "value", "head", "text"),
         [
             ("prony_ratio_1", 0.25, "Prony ratio 1", "0.25"),
-            ("prony_time_2", 0.3125, "Relaxation time 2 [s]", "0.3125"),
-            ("tendon_offset_1_left", 0.002, "First offset of the tendon 'left' [mm]", "2"),
-            ("pressure_delay", 0.03, "Delay of the pressures [ms]", "30"),
-            ("unknown", 2.0, "unknown", "2"),
+            ("prony_time_2", 0.3125, "Prony time 2 [s]", "0.3125"),
+            ("tendon_offset_1_left", 0.002, "Tendon offset 1 left [mm]", "2"),
+            ("pressure_delay", 0.03, "Pressure delay [ms]", "30"),
+            ("pressure_slew", 2e-6, "Pressure slew [µs per unit]", "2"),
+            ("tendon_contraction_dead_band", 0.003, "Tendon contraction dead band [mm]", "3"),
+            ("muscle_contraction_dead_band", 0.03, "Muscle contraction dead band [%]", "3"),
+            ("pressure_slope_3", 2.0, "Pressure slope 3", "2"),
+            ("tip_youngs_modulus", 2e5, "Tip Young's modulus [kPa]", "200"),
+            ("obstacle_turn_x_bar", np.pi / 180, "Obstacle turn x bar [°]", "1"),
+            ("unknown", 2.0, "Unknown", "2"),
         ],
     )
     def test_names_and_units(self, parameter, value, head, text):
@@ -150,12 +156,12 @@ class TestIdentification:
 
     def test_what_the_data_cannot_tell(self, identified):
         said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
-        assert said == "SysID: the data determine damping by stiffness least, to 3.4 % of the range."
+        assert said == "SysID: the data determine stiffness damping least, to 3.4 % of the range."
         assert uncertainty_text("sysid", {**identified, "uncertainty": None}, {}) == ""
         identified["uncertainty"] |= {"poorest_deviation": 1.9, "correlation": [[1.0, -0.95], [-0.95, 1.0]]}
         said = uncertainty_text("sysid", identified, {})
         assert "over the whole range: set a prior" in said
-        assert f"do not separate Young's modulus and damping by stiffness (correlation {MINUS}0.95)" in said
+        assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):

@@ -19,60 +19,23 @@ if TYPE_CHECKING:
 
 # Name, unit on the page, and its number in an SI unit.
 Wording = tuple[str, str, float]
-_PARAMETERS: Final[Mapping[str, Wording]] = {
-    "youngs_modulus": ("Young's modulus", "kPa", 1e-3),
-    "poissons_ratio": ("Poisson's ratio", "", 1.0),
-    "density": ("Density", "kg/m³", 1.0),
-    "mass_damping": ("Damping by mass", "1/s", 1.0),
-    "stiffness_damping": ("Damping by stiffness", "ms", 1e3),
-    "attached_mass_factor": ("Factor of the attached masses", "", 1.0),
-    "gravity_tilt_1": ("First tilt of gravity", "°", 180.0 / np.pi),
-    "gravity_tilt_2": ("Second tilt of gravity", "°", 180.0 / np.pi),
-    "tendon_offset_1": ("First offset of the tendons", "mm", 1e3),
-    "tendon_offset_2": ("Second offset of the tendons", "mm", 1e3),
-    "tendon_friction": ("Friction of the tendons", "", 1.0),
-    "tendon_bristle_length": ("Bristle length of the tendons", "mm", 1e3),
-    "contact_stiffness": ("Stiffness of the obstacles", "kPa", 1e-3),
-    "contact_friction": ("Friction of the obstacles", "", 1.0),
-    "surface_stiffness": ("Stiffness between surfaces", "kPa", 1e-3),
-    "surface_friction": ("Friction between surfaces", "", 1.0),
-    "obstacle_growth": ("Growth of the obstacles", "mm", 1e3),
-    **{f"obstacle_{axis}": (f"Shift along {axis} of the obstacles", "mm", 1e3) for axis in "xyz"},
-    **{f"obstacle_turn_{axis}": (f"Turn about {axis} of the obstacles", "°", 180.0 / np.pi) for axis in "xyz"},
-    "clamp_turn": ("Turn of the second clamp", "°", 180.0 / np.pi),
-    "clamp_shift": ("Shift of the second clamp", "mm", 1e3),
-    "release_delay": ("Delay of the release", "ms", 1e3),
-    **{f"release_force_{axis}": (f"Added held force along {'xyz'[axis - 1]}", "N", 1.0) for axis in (1, 2, 3)},
-    "focal_factor": ("Factor of the focal length", "", 1.0),
-    **{f"camera_shift_{axis}": (f"Shift before the camera along {'xyz'[axis - 1]}", "mm", 1e3) for axis in (1, 2, 3)},
-    **{
-        f"camera_turn_{axis}": (f"Turn before the camera about {'xyz'[axis - 1]}", "°", 180.0 / np.pi)
-        for axis in (1, 2, 3)
-    },
-    "principal_point_1": ("Principal point, to the right", "px", 1.0),
-    "principal_point_2": ("Principal point, downwards", "px", 1.0),
-}
-_MATERIAL: Final = tuple(_PARAMETERS)[:5]  # Parameters that regions may have.
-_COMMANDS: Final[Mapping[str, Wording]] = {
-    "factor": ("Factor", "", 1.0),
-    "delay": ("Delay", "ms", 1e3),
-    "rise": ("Time constant", "ms", 1e3),
-    "slew": ("Reciprocal of the slew rate", "µs per unit", 1e6),
-    "dead_band": ("Dead band", "", 1.0),
-    "zero": ("Zero", "", 1.0),
-    "backlash": ("Backlash", "", 1.0),
-    "slope": ("Slope", "", 1.0),
-}
-_COMMAND: Final = re.compile(
-    r"(?:.+_)?(pressure|tension|contraction|stress)_(factor|delay|rise|slew|dead_band|zero|backlash|slope)(?:_([1-8]))?"
+_BAND: Final = "_(dead_band|zero|backlash)"  # In the unit of an input.
+_UNITS: Final = (  # By patterns of names, of which the first one that fits counts.
+    (r"(.+_)?youngs_modulus|(contact|surface)_stiffness.*", "kPa", 1e-3),
+    (r"(.+_)?density", "kg/m³", 1.0),
+    (r"(.+_)?mass_damping", "1/s", 1.0),
+    (r"(.+_)?stiffness_damping|.+_(delay|rise)", "ms", 1e3),
+    (r"gravity_tilt_.|(clamp|camera|obstacle)_turn.*", "°", 180.0 / np.pi),
+    (r"tendon_(offset|bristle).+|(clamp|camera)_shift.*|obstacle_(growth|[xyz])(_.+)?", "mm", 1e3),
+    (r"release_force_.", "N", 1.0),
+    (r"principal_point_.", "px", 1.0),
+    (r"prony_time_.+", "s", 1.0),
+    (r".+_slew", "µs per unit", 1e6),
+    (rf"muscle_contraction{_BAND}", "%", 100.0),
+    (rf"(.+_)?(pressure|stress){_BAND}", "kPa", 1e-3),
+    (rf"(.+_)?tension{_BAND}", "N", 1.0),
+    (rf"(.+_)?contraction{_BAND}", "mm", 1e3),
 )
-_BANDS: Final = {
-    "pressure": ("kPa", 1e-3),
-    "stress": ("kPa", 1e-3),
-    "tension": ("N", 1.0),
-    "contraction": ("mm", 1e3),
-    "muscle_contraction": ("%", 100.0),
-}
 _WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
 _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
@@ -179,35 +142,10 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Return name, unit and factor of a parameter, of parts, Prony branches, sliders, inputs and regions."""
-    if command := _COMMAND.fullmatch(parameter):
-        words, word, octave = command.groups()
-        kind, unit, factor = _COMMANDS[word]
-        if word in ("dead_band", "zero", "backlash"):
-            unit, factor = _BANDS["muscle_contraction" if parameter.startswith("muscle_contraction") else words]
-        kind += f" {octave} of the characteristic" if octave else ""
-        return f"{kind} of the {words}{'es' if words.endswith('s') else 's'}", unit, factor
-    if offset := re.fullmatch(r"(tendon_offset_[12])_(.+)", parameter):
-        kind, unit, factor = _PARAMETERS[offset[1]]
-        return f"{kind.removesuffix(' of the tendons')} of the tendon '{offset[2]}'", unit, factor
-    if pair := re.fullmatch(r"surface_friction_(.+)", parameter):
-        return f"Friction between surfaces, {pair[1]!r}", "", 1.0
-    if obstacle := re.fullmatch(
-        r"(contact_(?:stiffness|friction)|obstacle_(?:growth|(?:turn_)?[xyz]))_(.+)", parameter
-    ):
-        kind, unit, factor = _PARAMETERS[obstacle[1]]
-        return f"{kind.removesuffix('s')} '{obstacle[2]}'", unit, factor
-    if branch := re.fullmatch(r"prony_(ratio|time)_(\d+)", parameter):
-        kind, number = branch.groups()
-        return (f"Relaxation time {number}", "s", 1.0) if kind == "time" else (f"Prony ratio {number}", "", 1.0)
-    if slider := re.fullmatch(r"hysteresis_(ratio|strain)_(\d+)", parameter):
-        kind, number = slider.groups()
-        return f"{'Yield strain' if kind == 'strain' else 'Hysteresis ratio'} {number}", "", 1.0
-    region = next((parameter.removesuffix(f"_{name}") for name in _MATERIAL if parameter.endswith(f"_{name}")), "")
-    if region:
-        kind, unit, factor = _PARAMETERS[parameter.removeprefix(f"{region}_")]
-        return f"{kind} of {region}", unit, factor
-    return _PARAMETERS.get(parameter, (parameter, "", 1.0))
+    """Return the name of a parameter as in the settings but with spaces, its unit on the page, and the factor."""
+    words = parameter.replace("_", " ").replace("youngs", "Young's").replace("poissons", "Poisson's")
+    fits = ((unit, factor) for pattern, unit, factor in _UNITS if re.fullmatch(pattern, parameter))
+    return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
 def digits(value: float | None, factor: float, deviation: float | None = None) -> str:

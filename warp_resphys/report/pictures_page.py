@@ -53,29 +53,17 @@ _BETTER: Final = 0.9  # of the uncorrected distance, below which an identificati
 
 @dataclass(frozen=True)
 class PictureResult:
-    """Distances of a pose's pictures from those of models, means over its pictures by model; None where not measured.
-
-    Attributes:
-        pose: name.
-        material: name; empty for one material.
-        tested: whether it was kept back from the identification.
-        pictures: number of different pictures, of which the middle one is drawn.
-        outline_mm: mean distance of the outlines, both ways, at the depth of the body.
-        outline_px: the same in pixels.
-        overlap: common area over the area of both.
-        cloud_mm: mean distance of the points of scans and depth images from the surface.
-        points_mm: mean distance of the tracked points.
-    """
+    """Distances of a pose's pictures from those of models, means over pictures by model; None where not measured."""
 
     pose: str
-    material: str
-    tested: bool
-    pictures: int
-    outline_mm: Mapping[str, float | None]
+    material: str  # Its name; empty for one material.
+    tested: bool  # Whether it was kept back from the identification.
+    pictures: int  # Number of different pictures, of which the middle one is drawn.
+    outline_mm: Mapping[str, float | None]  # Mean distance of the outlines, both ways, at the depth of the body.
     outline_px: Mapping[str, float | None]
-    overlap: Mapping[str, float | None]
-    cloud_mm: Mapping[str, float | None]
-    points_mm: Mapping[str, float | None]
+    overlap: Mapping[str, float | None]  # Common area over the area of both.
+    cloud_mm: Mapping[str, float | None]  # Mean distance of the points of scans and depth images from the surface.
+    points_mm: Mapping[str, float | None]  # Mean distance of the tracked points.
 
     @property
     def compared(self) -> str:
@@ -282,27 +270,23 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
     Raises:
         DataFileError: the file is damaged.
     """
-    rows = list[tuple[PictureResult, list[_Panel]]]()
+    clouds = list[tuple[PictureResult, list[tuple[FloatArray, ...]]]]()
     with read_hdf5(outlines, "outlines") as file:
         for result, up in panels:
             number = next(own for own in file[result.pose] if f"{_FIRST}_places" in file[f"{result.pose}/{own}"])
-            rows.append((result, _cloud_panels(file[f"{result.pose}/{number}"], up)))
-    most = max(float(np.quantile(own.distances, _SHOWN)) for _, own_panels in rows for own in own_panels[1:])
-    figure = Figure(figsize=(len(_MODELS) * _CLOUD_PANEL, len(rows) * _CLOUD_PANEL * 0.8), layout="constrained")
-    axes = figure.subplots(len(rows), len(_MODELS), squeeze=False)
+            clouds.append((result, _seen_from_the_side(file[f"{result.pose}/{number}"], up)))
+    most = max(float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:])
+    figure = Figure(figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8), layout="constrained")
+    axes = figure.subplots(len(clouds), len(_MODELS), squeeze=False)
     dots = None
-    for (result, own_panels), row in zip(rows, axes, strict=True):
-        ends = np.concatenate([own.places for own in own_panels] + [own.body.reshape(-1, 2) for own in own_panels])
+    for (result, seen), row in zip(clouds, axes, strict=True):
+        ends = np.concatenate([part.reshape(-1, 2) for places, _, body in seen for part in (places, body)])
         low, high = _frame_of(ends, _CLOUD_MARGIN * float(np.ptp(ends, axis=0).max()))
-        for model, axis, own in zip(_MODELS, row, own_panels, strict=True):
-            axis.add_collection(PolyCollection([*own.body], facecolors=_BODY, edgecolors=_BODY, linewidths=0.3))
-            dots = axis.scatter(
-                *own.places.T, c=own.distances, s=2.5, cmap="viridis", vmin=0.0, vmax=most, linewidths=0
-            )
-            axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
-            axis.grid(visible=False)
-            for spine in axis.spines.values():
-                spine.set_visible(False)
+        for model, axis, (places, distances, body) in zip(_MODELS, row, seen, strict=True):
+            axis.add_collection(PolyCollection([*body], facecolors=_BODY, edgecolors=_BODY, linewidths=0.3))
+            dots = axis.scatter(*places.T, c=distances, s=2.5, cmap="viridis", vmin=0.0, vmax=most, linewidths=0)
+            axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+            axis.set_axis_off()
             axis.set_title(
                 f"{result.pose}{' (kept back)' * result.tested}\n{_MODELS[model].lower()}: "
                 f"{_text(result.cloud_mm[model])} mm"
@@ -319,28 +303,20 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
     return drawn_file(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
 
 
-@dataclass(frozen=True)
-class _Panel:
-    """A cloud and the body of a model, seen from the side."""
+def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatArray, ...]]:
+    """The points (P, 2) of a cloud, their distances (P,) [mm] and the triangles (F, 3, 2) of the body, by model.
 
-    places: FloatArray  # (P, 2) of the points [m]
-    distances: FloatArray  # (P,) [mm]
-    body: FloatArray  # (F, 3, 2) triangles of its surface [m]
-
-
-def _cloud_panels(group: h5py.Group, up: FloatArray) -> list[_Panel]:
-    """The panels of a cloud, in the order of the models: along the horizontal direction in which it is thinnest."""
-    triangles, panels = read_array(group, "triangles"), []
-    shape = read_array(group, f"{_FIRST}_surface")
+    They are seen along the horizontal direction in which the body is thinnest.
+    """
+    triangles, shape = read_array(group, "triangles"), read_array(group, f"{_FIRST}_surface")
     up = up / max(float(np.linalg.norm(up)), 1e-12)
     level = np.eye(3) - np.outer(up, up)
-    spread = np.linalg.eigh(level @ np.cov(shape.T) @ level)[1]
-    right = spread[:, -1]
+    axes = np.stack([np.linalg.eigh(level @ np.cov(shape.T) @ level)[1][:, -1], up], 1)
+    seen = []
     for model in _MODELS:
         places, distances, surface = (read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface"))
-        axes = np.stack([right, up], 1)
-        panels.append(_Panel(places @ axes, 1e3 * distances, surface[triangles] @ axes))
-    return panels
+        seen.append((places @ axes, 1e3 * distances, surface[triangles] @ axes))
+    return seen
 
 
 def _frame_of(points: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:

@@ -52,23 +52,14 @@ Known = Mapping[str, Sequence[float]]  # errors of the models whose roll-outs ar
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """A model beside another one, on the same held-out trials.
-
-    Attributes:
-        model: the model.
-        other: the model with which it is compared.
-        errors: of the model on each trial [mm]; None where its roll-out diverged.
-        others: of the other model.
-        where: which trials these are, such as "with other loads"; may be empty.
-        idle: whether no epoch of its training was kept, so that its learned force is zero.
-    """
+    """A model beside another one, on the same held-out trials."""
 
     model: str
-    other: str
-    errors: Sequence[float | None]
-    others: Sequence[float | None]
-    where: str = ""
-    idle: bool = False
+    other: str  # With which it is compared.
+    errors: Sequence[float | None]  # Of the model on each trial [mm]; None where its roll-out diverged.
+    others: Sequence[float | None]  # Of the other model.
+    where: str = ""  # Which trials these are, such as "with other loads".
+    idle: bool = False  # Whether no epoch of its training was kept, so that its learned force is zero.
 
     @cached_property
     def gain(self) -> Gain | None:

@@ -23,7 +23,7 @@ from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
-from warp_resphys.report.page import NONE, Canvas, Drawn, Picture
+from warp_resphys.report.page import NONE, Canvas, Drawn
 from warp_resphys.settings.stages import ReportStage
 
 BEAM = beam.config()
@@ -39,7 +39,7 @@ def no_figures(no_drawing, monkeypatch):
 
     def figure(canvas, name, _, alt, caption):
         (canvas.folder / f"{name}.png").touch()
-        return Drawn(name, caption, Picture("data:,", alt))
+        return Drawn(name, caption, alt, "data:,")
 
     monkeypatch.setattr(Canvas, "figure", figure)
 

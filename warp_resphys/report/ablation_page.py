@@ -1,6 +1,5 @@
 """The page of the marker ablation: a box plot, a table, and the method of reconstruction."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,12 +18,10 @@ from .page import (
     Row,
     Text,
     canvas_beside,
-    experiment_kicker,
     number_text,
     write_page,
 )
 
-_LOG = logging.getLogger(__name__)
 _COLUMNS: Final[Mapping[str, str]] = {
     "median_mm": "Median [mm]",
     "lower_quartile_mm": "Lower quartile",
@@ -82,13 +79,10 @@ def write_ablation_report(
             Part("", [figure, PageTable("Markers", [*_COLUMNS.values()], body, note)]),
             Part("How it was reconstructed", [Text(how)]),
         ],
-        title=settings.title,
-        kicker=experiment_kicker(settings.name),
-        verdict=[verdict(rows, uncorrected)],
-        metrics=metrics,
-        settings=settings.plain(),
+        settings,
+        [verdict(rows, uncorrected)],
+        metrics,
     )
-    _LOG.info("report written: %s", path)
 
 
 def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:

@@ -11,7 +11,7 @@ import numpy as np
 from ..learning.baselines import BASELINES
 from ..learning.intervals import Intervals
 from .data import Driven, FloatArray, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
-from .page import Canvas, Drawn, Part, drawn_file, mm_text, unbroken
+from .page import Canvas, Drawn, Part, mm_text, unbroken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,7 +55,7 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
         coloured = f"{quantity.per}s".capitalize()
         summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
         draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
-        return drawn_file(path, alt, caption)
+        return Drawn.of(path, alt, caption)
 
     limit = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
     what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()

@@ -1,6 +1,7 @@
 """The section of the page of a run on the motion in a trial: a film, a view in space, pictures, and the tip."""
 
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ from .data import (
     shown_markers,
     shown_models,
 )
-from .page import Block, Canvas, Drawn, Part, data_address, largest_text, unbroken
+from .page import Block, Canvas, Drawn, Part, largest_text, unbroken
 from .render import Renderer, draw, hangs, write_film
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
@@ -98,7 +99,8 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
 
         def film(path: Path) -> Drawn:
             canvas.started["video"].result()
-            return Drawn("video", caption, film=data_address(path.read_bytes(), "video/mp4"))
+            alt = "The simulated bodies and what was observed, in motion"
+            return replace(Drawn.of(path, alt, caption), name="video")
 
         blocks += canvas.attempt("motion.mp4", film)
     blocks += _in_space(data, name)

@@ -21,10 +21,10 @@ from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError
 from ..io.files import write_text
 from ..learning.metrics import PublishedError
+from ..settings.run import RunSettings
 from .render import DrawingError, Renderer
 
 if TYPE_CHECKING:
-    import jinja2
     from matplotlib.figure import Figure as Drawing
 
 _LOG = logging.getLogger(__name__)
@@ -66,13 +66,6 @@ class PageTable:
     unfolded: bool = False  # Whether it is unfolded at first.
 
 
-class Picture(NamedTuple):
-    """A figure as a data address, and its description."""
-
-    address: str
-    alt: str
-
-
 @dataclass(frozen=True)
 class Text:
     """A paragraph."""
@@ -97,8 +90,14 @@ class Drawn:
 
     name: str  # Of the file, and on the page.
     caption: str
-    picture: Picture | None = None
-    film: str = ""  # Address of a film, in place of a picture.
+    alt: str  # Description.
+    address: str  # Its content, as a data address.
+
+    @classmethod
+    def of(cls, path: Path, alt: str, caption: str) -> "Drawn":
+        """Returns a PNG or MP4 file as a picture or a film."""
+        kind = {".png": "image/png", ".mp4": "video/mp4"}[path.suffix]
+        return cls(path.stem, caption, alt, data_address(path.read_bytes(), kind))
 
 
 @dataclass(frozen=True)
@@ -116,22 +115,6 @@ class ViewInSpace:
 
 
 Block = Text | Items | PageTable | Drawn | ViewInSpace
-
-
-class Script(NamedTuple):
-    """A script on a page, and its digest for the content security policy."""
-
-    text: Markup
-    digest: str
-
-    @classmethod
-    def of(cls, parts: "Sequence[Part]") -> "Script | None":
-        """Returns the script that the blocks of a page need, or None."""
-        if not any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
-            return None
-        text = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
-        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
-        return cls(Markup(text), f"sha256-{digest}")
 
 
 @dataclass(frozen=True)
@@ -157,8 +140,7 @@ class Canvas:
 
         figures.settle(figure)
         figures.save_png(figure, self.folder / f"{name}.png")
-        address = data_address(figures.themed_svg(figure, name), "image/svg+xml")
-        return Drawn(name, caption, Picture(address, alt))
+        return Drawn(name, caption, alt, data_address(figures.themed_svg(figure, name), "image/svg+xml"))
 
     def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
         """Return a picture drawn into a file, or a sentence why it cannot be drawn, once for each reason.
@@ -201,50 +183,24 @@ def canvas_beside(path: Path) -> Iterator[Canvas]:
 def write_page(
     path: Path,
     parts: Sequence[Part],
-    *,
-    title: str,
-    kicker: str,
+    run: RunSettings,
     verdict: Sequence[str],
-    metrics: Mapping[str, Any] | None = None,
-    settings: Mapping[str, Any] | None = None,
+    metrics: Mapping[str, Any],
     timed: PageTable | None = None,
 ) -> None:
-    """Write a page.
+    """Write the page of a run.
 
     Args:
         path: The page's file.
         parts: Its sections.
-        title: Its heading.
-        kicker: Line above the heading.
-        verdict: Sentences below the heading.
-        metrics: Of a run: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
-        settings: Of the same run, as nested data.
-        timed: Times of the simulations of that run.
+        run: Settings, with the title.
+        verdict: Sentences below the title.
+        metrics: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
+        timed: Times of the simulations.
 
     Raises:
         DataFileError: The file cannot be written.
     """
-    page = _template("page.html").render(
-        title=title,
-        kicker=kicker,
-        verdict=verdict,
-        parts=parts,
-        script=Script.of(parts),
-        kind_of=lambda block: type(block).__name__,
-        metrics=metrics,
-        settings=list(flatten(settings or {})),
-        timed=timed,
-        duration=duration_text,
-    )
-    write_text(path, page)
-
-
-def experiment_kicker(name: str) -> Markup:
-    """Return the line above the heading of the page of an experiment."""
-    return Markup("experiment <code>{}</code>").format(name)
-
-
-def _template(name: str) -> "jinja2.Template":
     import jinja2
 
     environment = jinja2.Environment(
@@ -254,7 +210,25 @@ def _template(name: str) -> "jinja2.Template":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(name)
+    script, digest = "", ""  # The script that some blocks need, and its digest for the content security policy.
+    if any(isinstance(block, ViewInSpace) for part in parts for block in part.blocks):
+        script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    page = environment.get_template("page.html").render(
+        title=run.title,
+        experiment=run.name,
+        verdict=verdict,
+        parts=parts,
+        script=Markup(script),
+        digest=digest,
+        kind_of=lambda block: type(block).__name__,
+        metrics=metrics,
+        settings=list(flatten(run.plain())),
+        timed=timed,
+        duration=duration_text,
+    )
+    write_text(path, page)
+    _LOG.info("report written: %s", path)
 
 
 def number_text(value: float | None) -> str:
@@ -316,11 +290,6 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield f"{prefix}{key}", f"[{', '.join(map(str, value))}]"
         else:
             yield f"{prefix}{key}", "null" if value is None else str(value)
-
-
-def drawn_file(path: Path, alt: str, caption: str) -> Drawn:
-    """Return a PNG file as a picture."""
-    return Drawn(path.stem, caption, Picture(data_address(path.read_bytes(), "image/png"), alt))
 
 
 def data_address(content: bytes, kind: str) -> str:

@@ -1,6 +1,5 @@
 """The page of an identification from pictures: outlines on the pictures, their distances, and the parameters."""
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -30,13 +29,9 @@ from .page import (
     Row,
     Text,
     canvas_beside,
-    drawn_file,
-    experiment_kicker,
     number_text,
     write_page,
 )
-
-log = logging.getLogger(__name__)
 
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
 _DRAWN: Final = {"simulation": TONES["simulation"].light, "sysid": "#35d0ff"}
@@ -168,13 +163,10 @@ def write_pictures_report(
             Part("Identification", [parameters]),
             Part("How it is compared", [Text(_HOW)]),
         ],
-        title=run.title,
-        kicker=experiment_kicker(run.name),
-        verdict=[picture_verdict(results)],
-        metrics=metrics,
-        settings=run.plain(),
+        run,
+        [picture_verdict(results)],
+        metrics,
     )
-    log.info("report written: %s", path)
 
 
 _HOW: Final = (
@@ -256,7 +248,7 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
         f"{_text(result.outline_mm['sysid'])} mm identified"
         for result, _ in panels
     )
-    return drawn_file(path, f"Outlines on pictures. Mean distances: {alt}.", caption)
+    return Drawn.of(path, f"Outlines on pictures. Mean distances: {alt}.", caption)
 
 
 def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path) -> Drawn:
@@ -300,7 +292,7 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
         "the undeformed body, the simulator with the parameters of the data sheet, and the identified one."
     )
     alt = "; ".join(f"{own.pose}: {', '.join(_text(own.cloud_mm[model]) for model in _MODELS)} mm" for own, _ in panels)
-    return drawn_file(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
+    return Drawn.of(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
 
 
 def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatArray, ...]]:
@@ -312,7 +304,7 @@ def _seen_from_the_side(group: h5py.Group, up: FloatArray) -> list[tuple[FloatAr
     up = up / max(float(np.linalg.norm(up)), 1e-12)
     level = np.eye(3) - np.outer(up, up)
     axes = np.stack([np.linalg.eigh(level @ np.cov(shape.T) @ level)[1][:, -1], up], 1)
-    seen = []
+    seen = list[tuple[FloatArray, ...]]()
     for model in _MODELS:
         places, distances, surface = (read_array(group, f"{model}_{key}") for key in ("places", "distances", "surface"))
         seen.append((places @ axes, 1e3 * distances, surface[triangles] @ axes))

@@ -1,6 +1,5 @@
 """The page of a run, of a fold or over the folds: the errors, then sections on its other results."""
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -28,7 +27,6 @@ from .page import (
     canvas_beside,
     duration_text,
     error_parts,
-    experiment_kicker,
     mm_text,
     number_text,
     published_parts,
@@ -46,8 +44,6 @@ from .sections import (
 )
 from .training_section import training_section
 from .verdict import LEAST_TRIALS, known_errors, recommended, standings, verdict
-
-_LOG = logging.getLogger(__name__)
 
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _TIMED: Final = {
@@ -93,14 +89,11 @@ def write_report(path: Path, data: RunReport) -> None:
     write_page(
         path,
         [part for section in SECTIONS if (part := made[section]) is not None],
-        title=data.settings.title,
-        kicker=experiment_kicker(data.experiment),
-        verdict=verdict(data.metrics, data.settings),
-        metrics=data.metrics,
-        settings=data.settings.plain(),
-        timed=PageTable("Model", ["Wall time"], timed) if timed else None,
+        data.settings,
+        verdict(data.metrics, data.settings),
+        data.metrics,
+        PageTable("Model", ["Wall time"], timed) if timed else None,
     )
-    _LOG.info("report written: %s", path)
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:

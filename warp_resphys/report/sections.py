@@ -22,7 +22,6 @@ from .page import (
     Part,
     Row,
     Text,
-    drawn_file,
     error_parts,
     in_a_row,
     number_text,
@@ -211,7 +210,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
         caption = (
             f"{shown}, which fits worst. Rings are nominal positions; a line leads to a marker outside of its ring."
         )
-        return drawn_file(path, f"{shown}, from two sides.", caption)
+        return Drawn.of(path, f"{shown}, from two sides.", caption)
 
     blocks = canvas.attempt("registration.png", picture)
     mountings = mounting_table(recordings.registered)

@@ -192,7 +192,8 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
         across, up = ((markers - focus) @ axes[:2].T).T / half * (0.5 * size[1])  # [px] from the middle.
         for marker in np.flatnonzero(away | (seen & outlying)):
             place: Any = (size[0] * (at + 0.5) + across[marker], 0.5 * size[1] - up[marker])
-            name = f"{labels[marker]}: {fit['residual_mm'][labels[marker]]:.2f} mm{', left out' * outlying[marker]}"
+            name = f"{labels[marker]}: {fit['residual_mm'][labels[marker]]:.2f} mm"
+            name += ", left out" if outlying[marker] else ""
             left = across[marker] > 0.0
             figure.axes[0].annotate(
                 name,

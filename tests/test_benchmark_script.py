@@ -1,15 +1,14 @@
 """The script that times the simulator, on the smallest bodies."""
 
+import benchmark
 import numpy as np
 import pytest
 import torch
+from benchmarks import gripper, measuring, peers, steps
 
-from support.scripts import script
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.files import read_json
 
-benchmark, measuring = script("benchmark"), script("benchmarks.measuring")
-gripper, peers, steps = (script(f"benchmarks.{name}") for name in ("gripper", "peers", "steps"))
 TINY = ("mesh.divisions=[2,1,1]", "--repeats=1", "--materials=0.45")
 
 

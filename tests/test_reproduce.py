@@ -1,6 +1,5 @@
 """The script of the published tables and of the page of robots: its pages, which rows it keeps, and what it refuses."""
 
-import importlib.util
 import json
 import shutil
 import subprocess
@@ -8,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import reproduce
 
 from support.command_line import configuration
 from warp_resphys.io.errors import ResphysError
@@ -26,28 +26,19 @@ SMALL_ROBOT = [
 ]
 
 
-@pytest.fixture
-def script(monkeypatch):
-    specification = importlib.util.spec_from_file_location("reproduce", SCRIPT)
-    module = importlib.util.module_from_spec(specification)
-    monkeypatch.setitem(sys.modules, "reproduce", module)
-    specification.loader.exec_module(module)
-    return module
-
-
-def end_of(script, monkeypatch, *arguments):
+def end_of(monkeypatch, *arguments):
     """Runs the script in this process, whose runs are processes of their own; returns its exit code."""
     monkeypatch.setattr(sys, "argv", ["reproduce.py", *map(str, arguments)])
     try:
-        script.main()
+        reproduce.main()
     except SystemExit as end:
         return end.code
     return 0
 
 
-def test_the_page_of_robots_is_that_of_the_kept_results(script):
+def test_the_page_of_robots_is_that_of_the_kept_results():
     kept = json.loads((DOCS / "robots.json").read_text())
-    assert (DOCS / "robots.md").read_text() == script.robots_page(kept, {}, DOCS / "robots") + "\n"
+    assert (DOCS / "robots.md").read_text() == reproduce.robots_page(kept, {}, DOCS / "robots") + "\n"
 
 
 def test_the_readme_has_the_figures_of_the_robots():
@@ -68,49 +59,47 @@ def table_of(text, head):
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_every_row_is_an_experiment(script):
+def test_every_row_is_an_experiment():
     experiments = {path.stem for path in (SCRIPT.parents[1] / "conf/experiment").glob("*.yaml")}
-    assert {robot["experiment"] for robot in script.ROWS["robots"].values()} <= experiments
-    assert {*script.ROWS["beams"]} <= experiments
-    every = [*script.ROWS["robots"].values(), *script.ROWS["variants"].values()]
+    assert {robot["experiment"] for robot in reproduce.ROWS["robots"].values()} <= experiments
+    assert {*reproduce.ROWS["beams"]} <= experiments
+    every = [*reproduce.ROWS["robots"].values(), *reproduce.ROWS["variants"].values()]
     assert configuration("config", *(override for row in every for override in row.get("overrides", ())))
 
 
-def test_gains_and_the_best_models_are_those_of_the_trials(script):
+def test_gains_and_the_best_models_are_those_of_the_trials():
     errors = {"rest": [9.0, 8.0], "simulation": [2.0, 2.0], "sysid": [1.0, 1.0], "resphys": [3.0, None]}
-    pair = script._best_pair(errors)
+    pair = reproduce._best_pair(errors)
     assert (pair["corrected"], pair["other"], pair["gain"]["share"]) == ("sysid", "simulation", 0.5)
-    assert script._gain(errors, "sysid", "resphys") is None
+    assert reproduce._gain(errors, "sysid", "resphys") is None
     kept = json.loads((DOCS / "robots.json").read_text())
     kept["sopra"]["gains"]["resphys"]["lower"] = -0.1
-    page = script.robots_page(kept, {"tentacle": "data.steps is -1"}, DOCS / "robots")
+    page = reproduce.robots_page(kept, {"tentacle": "data.steps is -1"}, DOCS / "robots")
     assert "reduces the error of identification on 0 of 6 robots." in page
     assert "| 48 % (\N{MINUS SIGN}10 to 50) |" in page
     assert "| Tentacle (failed since 2026-11-27) |" in page
     assert "- Tentacle failed: data.steps is -1" in page
 
 
-def test_rows_with_other_settings_and_other_recordings_are_refused(script, monkeypatch, capsys, tmp_path):
+def test_rows_with_other_settings_and_other_recordings_are_refused(monkeypatch, capsys, tmp_path):
     with pytest.raises(ResphysError, match="has sopra with its own settings, not with budget=quick"):
-        script.kept_results(DOCS / "robots.json", ["sopra"], ["budget=quick"])
+        reproduce.kept_results(DOCS / "robots.json", ["sopra"], ["budget=quick"])
     (tmp_path / "m1.csv").write_text("0,1")
     with pytest.raises(ResphysError, match="are not those of the page"):
-        script.robot_run("tentacle", tmp_path, [], Path("runs"))
-    assert end_of(script, monkeypatch, "tentacle", "--data", tmp_path, "--results", tmp_path / "out") == 2
+        reproduce.robot_run("tentacle", tmp_path, [], Path("runs"))
+    assert end_of(monkeypatch, "tentacle", "--data", tmp_path, "--results", tmp_path / "out") == 2
     assert capsys.readouterr().err == "--data has no recordings of tentacle\n"
     assert not (tmp_path / "out").exists()
     with pytest.raises(ResphysError, match="there is no starfish: choose from beams, robots, beam_oscillation"):
-        script.selected(["starfish"])
+        reproduce.selected(["starfish"])
 
 
 @pytest.mark.slow
-def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_others(script, monkeypatch, tmp_path):
+def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_others(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(script.ROWS["variants"]["published_physics"], "overrides", ["seed=-1"])
+    monkeypatch.setitem(reproduce.ROWS["variants"]["published_physics"], "overrides", ["seed=-1"])
     arguments = ["--results", "out", "--overrides", *SMALL_BEAM]
-    assert (
-        end_of(script, monkeypatch, "beam_oscillation/default", "beam_oscillation/published_physics", *arguments) == 2
-    )
+    assert end_of(monkeypatch, "beam_oscillation/default", "beam_oscillation/published_physics", *arguments) == 2
     page = Path("out/reproduction.md").read_text()
     (metrics,) = (json.loads(path.read_text()) for path in Path("runs").rglob("metrics.json"))
     ours = " ".join(error_parts(metrics["errors_mm"]["resphys"])).strip()
@@ -120,21 +109,21 @@ def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_
     assert "seed is -1" in page
     assert Path("out/reproduction/beam_oscillation_error_over_time.png").is_file()
     overrides = ["ablation.counts=[1,4]", "ablation.draws=3", "ablation.processes=1"]
-    assert end_of(script, monkeypatch, "marker_ablation", *arguments, *overrides) == 0
+    assert end_of(monkeypatch, "marker_ablation", *arguments, *overrides) == 0
     (ablation,) = (json.loads(path.read_text()) for path in Path("runs/marker_ablation").rglob("metrics.json"))
     median = number_text(ablation["by_markers"][1]["median_mm"])
     assert f"| 4 | below 0.1 | high | {median} |" in Path("out/reproduction.md").read_text()
 
 
 @pytest.mark.slow
-def test_a_robot_has_a_row_and_those_of_earlier_runs_keep_theirs(script, monkeypatch, tmp_path):
+def test_a_robot_has_a_row_and_those_of_earlier_runs_keep_theirs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(script.ROWS["robots"]["sopra"], "experiment", "tendon_rod")
+    monkeypatch.setitem(reproduce.ROWS["robots"]["sopra"], "experiment", "tendon_rod")
     shutil.copytree(DOCS / "robots", "out/robots")
     kept = json.loads((DOCS / "robots.json").read_text())
     del kept["sopra"]
     Path("out/robots.json").write_text(json.dumps(kept))
-    assert end_of(script, monkeypatch, "robots", "--results", "out", "--overrides", *SMALL_ROBOT) == 0
+    assert end_of(monkeypatch, "robots", "--results", "out", "--overrides", *SMALL_ROBOT) == 0
     (metrics,) = (json.loads(path.read_text()) for path in Path("runs").rglob("metrics.json"))
     page = Path("out/robots.md").read_text()
     new, *others = table_of(page, "| Robot | Without physics [mm]")

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 import warp_resphys
-from support.configured import check, composed
 from support.main_job import IN_RUN, run, run_without_report
-from support.sentences import offending
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import sampling
 from warp_resphys.control.estimate import Estimator, Noise
@@ -366,23 +364,3 @@ class TestDriving:
         assert "stopped." in err
         assert record.stat().st_mtime_ns == before
         assert driven == ["drive"]
-
-
-@pytest.mark.parametrize(
-    ("override", "key"),
-    [
-        ("control.tracked=[Tip]", "control.tracked"),
-        ("control.models=[simfree]", "control.models"),
-        ("control.models=[sysid]", "control.receding"),
-        ("control.limits.high=9", "control.limits"),
-        ("control.shapes=[square]", "control.shapes"),
-        ("control.seconds=[0.1]", "control.seconds"),
-        ("+laboratory.trials.t000={payload: 0.01};data.payload_at={z: -0.2}", "laboratory.trials"),
-        ("control.reduction.modes=[4,4]", "control.reduction.modes"),
-        ("data.folds=leave_one_out", "control is for a robot with markers"),
-    ],
-)
-def test_invalid_settings_of_control_are_refused(override, key):
-    with pytest.raises(InputError) as caught:
-        check(composed("experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20", *override.split(";")))
-    assert key in (offending(str(caught.value)), str(caught.value)[: len(key)])

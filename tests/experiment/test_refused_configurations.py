@@ -177,7 +177,16 @@ CASES = {
         ("all guides of tendon 2 are fixed in the world", "+tendons.routes.left.fixed_guides=[0,1]"),
         ("the route has guides 0 to 1", "+tendons.routes.left.fixed_guides=[2]"),
     ],
-    ("experiment=tendon_rod_control",): [
+    ("experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20"): [
+        ("control.tracked", "control.tracked=[Tip]"),
+        ("control.models", "control.models=[simfree]"),
+        ("control.receding", "control.models=[sysid]"),
+        ("control.limits", "control.limits.high=9"),
+        ("control.shapes", "control.shapes=[square]"),
+        ("control.seconds", "control.seconds=[0.1]"),
+        ("laboratory.trials", "+laboratory.trials.t000={payload: 0.01}", "data.payload_at={z: -0.2}"),
+        ("control.reduction.modes", "control.reduction.modes=[4,4]"),
+        ("control is for a robot with markers", "data.folds=leave_one_out"),
         ("reduced model, which has no contact", FLOOR.replace("005", "5")),
         ("reduced model, which has no contact", "self_contact={distance: 1e-4}"),
     ],

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from support.driven_run import LIMIT, arm_settings, bent
-from support.measured_run import TRACKED, sag
+from support.made_up_run import LIMIT, TRACKED, arm_settings, bent, sag
 from warp_resphys.experiment.build import shipped_arm
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import box_hexahedra

@@ -8,8 +8,8 @@ import scipy.optimize
 import torch
 import warp as wp
 
+from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from support.vertex_run import settings, write_run
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.report.data import errors_by_load
@@ -51,24 +51,16 @@ def law(**changes):
 
 def released(**changes):
     """Settings of a beam whose last trial is held in another way."""
-    plain = settings()
+    plain = vertex_settings()
     return plain.changed(law=LawSettings(), data=plain.data.changed(others={OTHER: {"weight_g": 120.0}}), **changes)
 
 
 def run(folder, own, **more):
     """Writes a run with a law, and returns its page."""
     models = ("simulation", *(["law"] if own["accepted"] else []), "simfree", "resphys")
-    write_run(folder, settings(), models=models, **more)
+    write_vertex_run(folder, vertex_settings(), models=models, **more)
     write_json(folder / "law.json", own)
     return report(folder, released())
-
-
-@pytest.fixture(autouse=True)
-def _periods(monkeypatch):
-    """A model `law` between the uncorrected simulation and ResPhys."""
-    from support import vertex_run
-
-    monkeypatch.setitem(vertex_run.PERIODS, "law", 0.141)
 
 
 @pytest.mark.usefixtures("no_drawing")

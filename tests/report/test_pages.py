@@ -7,10 +7,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from support import measured_run as beam
 from support.chambered import hollow_box
-from support.driven_run import BASE, LABORATORY, MODELS, arm_settings, data, errors_of, write_run
-from support.measured_run import FRAMES, SECONDS, STEP, TRACKED, TRIALS, write_folds, write_recordings, write_split
+from support.made_up_run import (
+    ARM_MODELS,
+    BASE,
+    BEAM_MODELS,
+    FRAMES,
+    LABORATORY,
+    SECONDS,
+    STEP,
+    TRACKED,
+    TRIALS,
+    arm_settings,
+    beam_settings,
+    data,
+    write_arm_run,
+    write_folds,
+    write_recordings,
+    write_split,
+)
 from support.report_page import report
 from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.build import build_mesh
@@ -26,7 +41,7 @@ from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.page import NONE, Canvas, Drawn
 from warp_resphys.settings.stages import ReportStage
 
-BEAM = beam.config()
+BEAM = beam_settings()
 FIGURES_OF_AN_ARM = {
     *("error_over_time", "loss_history", "markers", "inputs"),
     *("training_resphys", "training_simfree"),
@@ -52,14 +67,14 @@ class TestArms:
     @pytest.mark.usefixtures("no_drawing")
     def test_page(self, tmp_path):
         settings = arm_settings()
-        write_run(tmp_path, settings, steps=200)
+        write_arm_run(tmp_path, settings, steps=200)
         page = report(tmp_path, settings)
-        errors = errors_of(tmp_path)
+        errors = read_json(tmp_path / "errors.json")
         assert all(link.startswith("data:") for link in page.links)
         assert re.search(r"https?://", page.source) is None
         assert page.allows_its_scripts_alone()
         assert all(len(image["alt"]) > 40 for image in page.images)
-        for model in MODELS:
+        for model in ARM_MODELS:
             assert f"{errors['errors_mm'][model]['mean']:.3f} ± " in page.text
             assert f"{errors['per_marker'][model]['Ring 2 - 3']:.3f}" in page.text
             assert f"{errors['median_filtered'][model]:.3f} mm (" in page.text
@@ -82,7 +97,7 @@ class TestArms:
     @pytest.mark.usefixtures("no_figures")
     def test_longer_rollouts_of_which_one_diverged(self, tmp_path):
         settings = arm_settings("sopra_extrapolation", data=data(folder="recordings", train_fraction=0.5))
-        write_run(tmp_path, settings, horizons=(1, 2), diverged=("simfree",), simulated=False)
+        write_arm_run(tmp_path, settings, horizons=(1, 2), diverged=("simfree",), simulated=False)
         page = report(tmp_path, settings)
         for said in ("Longer than the training", "First 1 s", "A line ends", "of 494 vertices", "9.89 ± 5.02"):
             assert said in page.text
@@ -93,9 +108,9 @@ class TestArms:
     @pytest.mark.usefixtures("no_figures")
     def test_higher_pressures(self, tmp_path):
         settings = arm_settings("sopra_overpressure", data=data(input_scales=[1.25, 1.75]))
-        write_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
-        text, scales = report(tmp_path, settings).text, errors_of(tmp_path)["scales"]
-        assert all(f"{scales[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in MODELS)
+        write_arm_run(tmp_path, settings, test=2, scales=(1.25, 1.75))
+        text, scales = report(tmp_path, settings).text, read_json(tmp_path / "errors.json")["scales"]
+        assert all(f"{scales[f][m]['mean']:.3f} ± " in text for f in ("1", "1.25", "1.75") for m in ARM_MODELS)
         assert "none of 2 (1.25 times), 2 of 2 (1.75 times), the first after 0.40 s" in text
         trials, pressures = read_trials(tmp_path, settings), read_driven(tmp_path, settings)
         assert trials.names == ("test_00", "test_01")
@@ -114,7 +129,9 @@ class TestArms:
             "data": data(folder="recordings", input_limit=None),
         }
         settings = arm_settings("segment_real", 2, **own)
-        write_run(tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False)
+        write_arm_run(
+            tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False
+        )
         page = report(tmp_path, settings)
         for said in (
             "ResPhys diverged in 1 of 1 trials.",
@@ -131,7 +148,7 @@ class TestArms:
     @pytest.mark.usefixtures("no_figures")
     def test_settings_are_shown_and_what_diverged_is_said(self, tmp_path):
         settings = arm_settings()
-        write_run(tmp_path, settings, test=1, train=1, steps=60)
+        write_arm_run(tmp_path, settings, test=1, train=1, steps=60)
         metrics = read_json(tmp_path / "errors.json")
         metrics["errors_mm"]["resphys"] = {"mean": None, "std": None, "trajectories": 1, "diverged": 1}
         metrics["per_trajectory"][0]["errors_mm"]["resphys"] = None
@@ -143,7 +160,7 @@ class TestArms:
     @pytest.mark.parametrize("name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"])
     def test_a_missing_file_is_one_sentence(self, tmp_path, name):
         settings = arm_settings()
-        write_run(tmp_path, settings, test=1, steps=40, models=("resphys",))
+        write_arm_run(tmp_path, settings, test=1, steps=40, models=("resphys",))
         (tmp_path / name).unlink()
         with pytest.raises(DataFileError, match=name) as caught:
             report(tmp_path, settings)
@@ -152,26 +169,26 @@ class TestArms:
 
     def test_files_that_do_not_belong_together_are_refused(self, tmp_path):
         settings = arm_settings()
-        write_run(tmp_path, settings, test=2, steps=40, models=("resphys",))
+        write_arm_run(tmp_path, settings, test=2, steps=40, models=("resphys",))
         other = tmp_path / "other"
-        write_run(other, settings, test=3, steps=40, models=("resphys",))
+        write_arm_run(other, settings, test=3, steps=40, models=("resphys",))
         (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
         with pytest.raises(DataFileError, match=r"rollouts.h5 names trials that .* does not hold \(test_02\)"):
             read_trials(tmp_path, settings)
-        write_run(tmp_path, settings, test=2, steps=40, models=("resphys",), chambers=7)
+        write_arm_run(tmp_path, settings, test=2, steps=40, models=("resphys",), chambers=7)
         with pytest.raises(DataFileError, match=r"pressures of chamber_7, but the body's chambers are chamber_1, "):
             report(tmp_path, settings)
 
     def test_what_is_read(self, tmp_path):
         settings = arm_settings()
-        write_run(tmp_path, settings, diverged=("simfree",))
+        write_arm_run(tmp_path, settings, diverged=("simfree",))
         trials, film = read_trials(tmp_path, settings), read_film(tmp_path, settings, build_mesh(settings.mesh))
         pressures = read_driven(tmp_path, settings)
         assert pressures.scaled == ()
         assert trials.times[0, [0, -1]].tolist() == [0.0, pytest.approx(2.0)]
         assert np.isnan(trials.target[0, 30:36, 1]).all()
         assert np.isinf(trials.errors_mm["simfree"][0, 60:]).all()
-        expected = errors_of(tmp_path)["errors_mm"]
+        expected = read_json(tmp_path / "errors.json")["errors_mm"]
         for model in ("sysid", "resphys"):
             assert trials.errors_mm[model][:, 1:].mean() == pytest.approx(expected[model]["mean"], rel=1e-5)
         assert film.positions["resphys"].shape[0] == len(film.times) == 51
@@ -180,7 +197,7 @@ class TestArms:
 
     def test_markers_are_drawn_over_time(self, tmp_path):
         settings = arm_settings()
-        write_run(tmp_path, settings, steps=40)
+        write_arm_run(tmp_path, settings, steps=40)
         trials, mesh = read_trials(tmp_path, settings), build_mesh(settings.mesh)
         canvas = SimpleNamespace(figure=lambda name, *_: name)
 
@@ -196,7 +213,7 @@ class TestArms:
 
     def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):
         settings, shown = arm_settings(), []
-        write_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
+        write_arm_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
         monkeypatch.setattr(run_page, "write_report", lambda _, data: shown.append(data))
         stage.make_report(StageContext("report", tmp_path, "", ReportStage(config=settings)))
         (page_data,) = shown
@@ -216,7 +233,7 @@ class TestBeams:
         page = report(tmp_path, BEAM)
         errors = read_json(tmp_path / "errors.json")
         assert page.allows_its_scripts_alone()
-        for model in beam.MODELS:
+        for model in BEAM_MODELS:
             assert f"{errors['errors_mm'][model]['mean']:.3f}" in page.text
             assert f"{errors['per_marker'][model]['Tip - 2']:.3f}" in page.text
             assert all(f"{row['errors_mm'][model]:.3f}" in page.text for row in errors["per_trajectory"])

@@ -6,8 +6,8 @@ import re
 import pytest
 from matplotlib.image import imread
 
+from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from support.vertex_run import settings, write_run
 from warp_resphys.experiment.report import read_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json
@@ -15,7 +15,7 @@ from warp_resphys.report import figures
 from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.page import error_parts, number_text
 
-SETTINGS = settings()
+SETTINGS = vertex_settings()
 DRAWN = {"error_over_time", "tip_displacement", "training_resphys", "training_simfree", "motion"}
 
 
@@ -23,7 +23,7 @@ DRAWN = {"error_over_time", "tip_displacement", "training_resphys", "training_si
 def finished(tmp_path_factory):
     """A run with its page."""
     folder = tmp_path_factory.mktemp("run")
-    write_run(folder, SETTINGS)
+    write_vertex_run(folder, SETTINGS)
     return folder, report(folder, SETTINGS)
 
 
@@ -70,13 +70,13 @@ def test_page_says_how_far_and_stands_beside_the_published_numbers(finished):
 
 @pytest.mark.usefixtures("can_draw")
 def test_the_same_run_gives_the_same_page(finished, tmp_path):
-    write_run(tmp_path, SETTINGS)
+    write_vertex_run(tmp_path, SETTINGS)
     assert report(tmp_path, SETTINGS).source == finished[1].source
 
 
 @pytest.mark.usefixtures("no_drawing")
 def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
-    write_run(tmp_path, SETTINGS, models=("simulation", "resphys"), diverged=("resphys",))
+    write_vertex_run(tmp_path, SETTINGS, models=("simulation", "resphys"), diverged=("resphys",))
     stale = tmp_path / "figures" / "motion.png"
     stale.parent.mkdir()
     stale.write_bytes(b"of an earlier run")
@@ -91,7 +91,7 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
 
 @pytest.mark.usefixtures("no_drawing")
 def test_errors_of_exactly_zero_are_a_report(tmp_path):
-    write_run(tmp_path, SETTINGS, models=("reconstruction",))
+    write_vertex_run(tmp_path, SETTINGS, models=("reconstruction",))
     trials = read_trials(tmp_path, SETTINGS)
     trials.positions["reconstruction"][:] = trials.target
     figure = error_over_time(trials.errors_mm, trials.times[0])
@@ -101,23 +101,25 @@ def test_errors_of_exactly_zero_are_a_report(tmp_path):
 
 @pytest.mark.usefixtures("no_drawing")
 def test_poses_have_no_time(tmp_path):
-    write_run(tmp_path, SETTINGS, steps=0, begins="static", models=("simulation", "resphys"))
+    write_vertex_run(tmp_path, SETTINGS, steps=0, begins="static", models=("simulation", "resphys"))
     assert "2 test trials, 1 step and" in report(tmp_path, SETTINGS).text
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"training_resphys"}
-    write_run(tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys"))  # As beside motions.
+    write_vertex_run(
+        tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys")
+    )  # As beside motions.
     assert not read_trials(tmp_path, SETTINGS).moves
 
 
 def test_the_trial_of_the_largest_error_is_drawn(tmp_path):
-    write_run(tmp_path, SETTINGS)
+    write_vertex_run(tmp_path, SETTINGS)
     trials = read_trials(tmp_path, SETTINGS)
     assert trials.worst == 1
 
 
 def test_arrays_that_do_not_fit_are_refused(tmp_path):
-    write_run(tmp_path, SETTINGS)
+    write_vertex_run(tmp_path, SETTINGS)
     other = tmp_path / "other"
-    write_run(other, SETTINGS, steps=20)
+    write_vertex_run(other, SETTINGS, steps=20)
     (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
     with pytest.raises(DataFileError, match="shape"):
         read_trials(tmp_path, SETTINGS)
@@ -125,7 +127,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path):
 
 @pytest.mark.usefixtures("no_drawing")
 def test_a_page_that_cannot_be_written_is_one_sentence(tmp_path):
-    write_run(tmp_path, SETTINGS)
+    write_vertex_run(tmp_path, SETTINGS)
     (tmp_path / "figures").write_text("in the way")
     with pytest.raises(DataFileError, match="cannot write figures"):
         report(tmp_path, SETTINGS)

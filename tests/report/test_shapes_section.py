@@ -2,8 +2,8 @@
 
 import pytest
 
+from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from support.vertex_run import settings, write_run
 from warp_resphys.io.files import write_json
 from warp_resphys.report.sections import shapes_table, share_text
 
@@ -38,12 +38,12 @@ def test_a_model_that_diverges_on_a_body():
 
 @pytest.mark.usefixtures("no_drawing")
 def test_page_has_the_bodies(tmp_path):
-    write_run(tmp_path, settings(), models=("simulation", "simfree", "resphys"))
+    write_vertex_run(tmp_path, vertex_settings(), models=("simulation", "simfree", "resphys"))
     found = {"thin <beam>": result(1.5, 0.3, 0.015, outside=0.12), "L": result(2.0, 0.5, 0.002, outside=0.0)}
     write_json(tmp_path / "shapes.json", found)
-    shape = {"mesh": settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
+    shape = {"mesh": vertex_settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
     ranges = {"youngs_modulus": {"lower": 1e5, "upper": 1e6}}
-    page = report(tmp_path, settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
+    page = report(tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
     for said in (
         "Other bodies of the same material",
         "thin <beam>",

@@ -9,11 +9,8 @@ import pytest
 
 from support.browser import opened as browser_of_tests
 from support.browser import until
-from support.driven_run import arm_settings
-from support.driven_run import write_run as write_driven
+from support.made_up_run import arm_settings, vertex_settings, write_arm_run, write_vertex_run
 from support.report_page import FAILING, Page, report
-from support.vertex_run import settings as vertex_settings
-from support.vertex_run import write_run as write_vertex
 from warp_resphys import Body, Capsule, Contact, Sphere
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
@@ -21,7 +18,7 @@ from warp_resphys.report.bodies import ComparedMotion
 from warp_resphys.report.obstacles import OBSTACLE, ObstacleSurface
 from warp_resphys.report.view import reduced, view_in_space
 
-RUNS = {"markers": (write_driven, arm_settings), "vertices": (write_vertex, vertex_settings)}
+RUNS = {"markers": (write_arm_run, arm_settings), "vertices": (write_vertex_run, vertex_settings)}
 
 
 def decoded(text, kind):

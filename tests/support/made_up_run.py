@@ -1,0 +1,460 @@
+"""Made-up runs, every file that a report reads: of a beam that is let go, an arm under pressure, and whole vertices.
+
+Models differ from the reality by their sizes, periods and lags.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from support.configured import composed
+from warp_resphys.experiment.build import build_mesh
+from warp_resphys.experiment.files import Dataset
+from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
+from warp_resphys.io.settings import parse
+from warp_resphys.learning.metrics import marker_errors, median_filter, summarise, summarise_trajectories
+from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.report.data import mean_distance
+from warp_resphys.settings.run import RunSettings
+
+GRAVITY = np.array([0.0, 0.02, -9.8])
+
+
+def _write_rollouts(folder, names, step, film_steps, drawn, observed, films):
+    """rollouts.h5, with observed positions (R, T, M, 3) and filmed bodies (F, N, 3) by model [m]."""
+    with atomic_hdf5(folder / "rollouts.h5", "rollouts", {"names": names, "time_step": step, "film_trial": drawn}) as f:
+        create(f, "film_steps", film_steps, "1")
+        for model, values in observed.items():
+            create(f, f"{model}_observed", values, "m", 1)
+            create(f, f"{model}_film", np.clip(films[model], -1e30, 1e30).astype(np.float32), "m")
+
+
+def _write_trainings(folder, models):
+    """Histories of the trainings of those models that are learned."""
+    epochs = [
+        {
+            "epoch": epoch,
+            "train_loss": 1.0 / epoch,
+            "validation_loss": 1.5 / epoch,
+            "rollout_error_mm": 1.0 / epoch if epoch % 5 == 0 else None,
+            "learning_rate": 1e-3,
+        }
+        for epoch in range(1, 31)
+    ]
+    kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.2}
+    for model in {"simfree", "resphys_uncorrected", "resphys"} & set(models):
+        write_json(folder / f"training_{model}.json", {"kept": kept, "epochs": epochs})
+
+
+def _write_stages(folder, **seconds):
+    for name, duration in seconds.items():
+        write_json(folder / "stages" / f"{name}.json", {"seconds": duration, "peak_memory_gib": 0.8})
+
+
+def _write_recordings(folder, trials, tracked, reference, rng, release=61.3):
+    """quality.json and registration.json, from the places of the registered markers by label [m]."""
+    labels, places = [*tracked, *reference], np.array([*tracked.values(), *reference.values()])
+    second, first_standing, last = labels[1 % len(tracked)], next(iter(reference)), labels[-1]
+    quality, registration = {}, {}
+    for number, trial in enumerate(trials):
+        rows = [
+            {
+                "label": label,
+                "still": label in reference,
+                "seen": 0.99 if number == 0 and label == second else 1.0,
+                "gaps": int(number == 0 and label == second),
+                "longest_gap_frames": 7,
+                "masked_frames": 7,
+                "jumps": [{"frame": 80, "mm": 0.31}] if label == first_standing else [],
+                "noise_mm": 0.0071,
+                "drift_mm": 0.02 if label in reference else None,
+            }
+            for label in labels
+        ]
+        quality[trial] = {
+            "source": f"recordings/{trial}.c3d",
+            "rate_hz": 100.0,
+            "frames": 300,
+            "release_frame": release,
+            "longest_gap_filled": 5,
+            "markers": rows,
+            "warnings": [f"{first_standing} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
+        }
+        residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))
+        registration[trial] = {
+            "rms_mm": 0.82 + 0.1 * number,
+            "residual_mm": residual,
+            "outliers": [last] if number == 2 else [],
+            "shift_mm": {label: [0.2, 0.2, 0.2] for label in tracked},
+            "positions": dict(zip(labels, places.tolist(), strict=True)),
+        }
+    write_json(folder / "quality.json", quality)
+    write_json(folder / "registration.json", registration)
+
+
+TRIALS = {"bare": 0.0, "load52": 0.0520154, "load101": 0.1020303}
+TRACKED = {"Tip - 1": [0.1, 0.015, 0.036], "Tip - 2": [0.1, -0.006, 0.024], "Tip - 3": [0.1, 0.036, 0.006]}
+REFERENCE = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
+STEP, SECONDS, FRAMES = 0.01, 0.4, 45
+BOUND = np.array(list(TRACKED.values())) + 1e-4
+_SWINGS = {  # Period, damping and level of a model of the beam, over those of the reality.
+    "published": (1.5, 1.0, 2.0),
+    "simulation": (1.06, 1.4, 1.05),
+    "sysid_elastic": (1.02, 1.2, 1.0),
+    "sysid": (1.01, 1.05, 1.0),
+    "simfree": (1.005, 1.1, 0.98),
+    "resphys_uncorrected": (1.008, 1.0, 1.0),
+    "resphys": (1.003, 1.0, 1.0),
+}
+BEAM_MODELS = tuple(_SWINGS)
+_FOUND = {"youngs_modulus": 251.3e3, "poissons_ratio": 0.499, "mass_damping": 0.94, "stiffness_damping": 2.9e-3}
+_STARTS = {
+    "youngs_modulus": (264e3, 180e3, 400e3),
+    "poissons_ratio": (0.499, 0.45, 0.48),
+    "mass_damping": (0.0, 0.5, 2.0),
+    "stiffness_damping": (0.0, 1e-3, 5e-3),
+}
+
+
+def beam_settings(**data):
+    """Settings of an experiment on recordings of a beam that is let go."""
+    plain = composed("mesh.divisions=[6,2,2]")
+    published = {**plain["simulation"], "youngs_modulus": 215e3, "poissons_ratio": 0.45}
+    plain |= {
+        "name": "beam_real",
+        "title": "Real beam",
+        "simulation": {**plain["simulation"], "youngs_modulus": 264e3, "poissons_ratio": 0.499},
+        "published": {"simulation": published, "physics": {}, "integrator": "implicit_euler"},
+        "markers": {"tracked": TRACKED, "reference": REFERENCE},
+        "in_the_loop": {"epochs": 5},
+        "data": {"kind": "recorded", "folder": "recordings", "seconds": SECONDS, "folds": None, **data},
+        "time_step": STEP,
+    }
+    return parse(RunSettings, plain)
+
+
+def sag(rest, times, payload, model=None):
+    """(T, P, 3) [m] where points at rest (P, 3) are: a beam along x that is let go, sags and swings."""
+    period, damping, level = _SWINGS[model] if model else (1.0, 1.0, 1.0)
+    frequency = 2 * np.pi / (period * (0.13 + 1.5 * payload))
+    swing = 1.0 - np.exp(-3.0 * damping * times) * np.cos(frequency * times)
+    tip = -(0.0065 + 0.3 * payload) * level * np.where(times > 0, swing, 0.0)
+    along = np.clip(rest[:, 0] / 0.1, 0.0, None)
+    moved = np.repeat(rest[None], len(times), axis=0)
+    moved[..., 2] += tip[:, None] * along**2
+    moved[..., 0] -= 2.0 * tip[:, None] * along / 0.1 * (rest[:, 2] - 0.015)
+    return moved
+
+
+def _frames(rng):
+    """(3, T) times of the frames of all trials [s]."""
+    return np.arange(1, FRAMES + 1) * STEP - rng.uniform(0.0, STEP, len(TRIALS))[:, None]
+
+
+def write_recordings(folder: Path):
+    """dataset.h5, quality.json, registration.json and truth.json of a beam."""
+    rng = np.random.default_rng(0)
+    times = _frames(rng)
+    markers = np.stack([sag(BOUND, t, payload) for t, payload in zip(times, TRIALS.values(), strict=True)])
+    markers += rng.normal(0.0, 5e-5, markers.shape)
+    markers[0, 9:16, 1] = np.nan
+    times[-1, -3:], markers[-1, -3:] = times[-1, -4], np.nan
+    held, payload = np.repeat(BOUND[None], 3, 0) + 2e-4, np.array([*TRIALS.values()])
+    words = tuple(TRIALS), tuple(TRACKED), ("released",) * 3
+    Dataset(*words, times, markers, held, payload, GRAVITY, STEP, bound=BOUND).write(folder / "dataset.h5")
+    base = np.array(list(REFERENCE.values())) + 5e-4
+    seen = dict(zip(TRACKED, BOUND + 2e-4, strict=True)), dict(zip(REFERENCE, base, strict=True))
+    _write_recordings(folder, TRIALS, *seen, rng)
+    material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49, "mass_damping": 1.0}
+    write_json(folder / "truth.json", {"material": material})
+
+
+def write_split(folder: Path, test, models=BEAM_MODELS, diverged=()):
+    """identification.json, rollouts.h5, errors.json and the histories of the trainings of a beam."""
+    rest = box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2)).vertices
+    steps = np.arange(round(SECONDS / STEP) + 1) * STEP
+    frames = dict(zip(TRIALS, _frames(np.random.default_rng(0)), strict=True))
+    films = {model: sag(rest, steps, TRIALS[test[-1]], model) for model in models}
+    observed = {model: np.stack([sag(BOUND, frames[t], TRIALS[t], model) for t in test]) for model in models}
+    for model in diverged:
+        films[model][20:] = observed[model][0, 20:] = np.nan
+    _write_rollouts(folder, list(test), STEP, np.arange(len(steps)), test[-1], observed, films)
+    truth = np.stack([sag(BOUND, frames[trial], TRIALS[trial]) for trial in test])
+    errors = {m: 1e3 * np.linalg.norm(x - truth, axis=-1)[:, : round(SECONDS / STEP)] for m, x in observed.items()}
+    means = {model: [float(each.mean()) for each in rows] for model, rows in errors.items()}
+    content = {
+        "errors_mm": {model: summarise(rows.mean(axis=2)) for model, rows in errors.items()},
+        "per_trajectory": [
+            {"name": trial, "errors_mm": {model: means[model][row] for model in models}}
+            for row, trial in enumerate(test)
+        ],
+        "per_marker": {
+            model: dict(zip(TRACKED, rows.mean(axis=(0, 1)).tolist(), strict=True)) for model, rows in errors.items()
+        },
+    }
+    if "resphys" in models:
+        own = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0, 1.0], "coverage": 0.87, "half_width_mm": 3.0}
+        content["intervals"] = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": own}}
+    write_json(folder / "errors.json", content)
+    searched = {"sysid": tuple(_FOUND), "sysid_elastic": tuple(_FOUND)[:2]}
+    write_json(folder / "identification.json", {m: _search(names) for m, names in searched.items() if m in models})
+    _write_trainings(folder, models)
+    _write_stages(folder, identify=95.0)
+
+
+def _search(names):
+    """Content of identification.json for a model whose parameters these are: three searches."""
+
+    def record(start, k):
+        values = {name: _FOUND[name] + (_STARTS[name][start] - _FOUND[name]) * 0.6**k for name in names}
+        return {"loss": 0.002 + 0.1 * (start + 1) * 0.5**k, **values}
+
+    correlation = np.eye(len(names))
+    correlation[0, 1] = correlation[1, 0] = -0.96
+    return {
+        "parameters": {name: _FOUND[name] for name in names},
+        "loss": 0.002,
+        "history": [[record(start, k) for k in range(12)] for start in range(3)],
+        "at_bounds": ["poissons_ratio"],
+        "uncertainty": {
+            "deviation": {name: 0.01 * _FOUND[name] for name in names},
+            "correlation": correlation.tolist(),
+            "poorest": dict(zip(names, [0.8, 0.6, 0.01, 0.0], strict=False)),
+            "poorest_deviation": 0.12,
+        },
+    }
+
+
+def write_folds(folder: Path, models=BEAM_MODELS):
+    """A run with a fold for each trial, as its stages leave it."""
+    write_recordings(folder)
+    folds = {}
+    for trial in TRIALS:
+        write_split(folder / f"fold_{trial}", [trial], models)
+        folds[trial] = read_json(folder / f"fold_{trial}" / "errors.json")
+    means = {model: float(np.mean([fold["errors_mm"][model]["mean"] for fold in folds.values()])) for model in models}
+    over = {model: {"mean": mean, "std": 0.1, "trajectories": 3, "diverged": 0} for model, mean in means.items()}
+    write_json(folder / "metrics.json", {"folds": folds, "errors_mm": over, "versions": {"numpy": "9"}})
+
+
+ARM_MODELS = ("simulation", "sysid", "simfree", "resphys")
+ARM_STEP, LIMIT = 0.02, 20e3
+BASE = {"Base - 1": [-0.03, -0.02, -0.005], "Base - 2": [-0.03, 0.02, -0.005], "Base - 3": [0.03, 0.0, -0.005]}
+LABORATORY = {
+    "mesh": {"kind": "arm_generated"},
+    "time_step": 0.01,
+    "integrator": "bdf2",
+    "material": {},
+    "fibres": {"angles": [8.0], "stiffness": 1e4},
+    "noise": 0.0,
+    "placement_noise": 0.0,
+}
+_BENDS = {  # Size and lag [s] of a model of the arm, beside the reality.
+    None: (1.0, 0.0),
+    "simulation": (1.35, 0.08),
+    "sysid": (1.15, 0.05),
+    "simfree": (0.9, 0.3),
+    "resphys": (1.02, 0.01),
+}
+
+
+def data(**changes):
+    """The settings group ``data`` of an arm."""
+    own = {"folder": None, "input_limit": LIMIT, "train_fraction": 1.0, "input_scales": []}
+    return {"kind": "recorded", **own, **changes}
+
+
+def arm_settings(name="sopra", chambers=6, **changes):
+    """Settings of an experiment on the arm that comes with the package."""
+    heights, radii = (-0.13, -0.15, -0.27), (0.022, 0.022, 0.018)
+    tracked = {
+        f"Ring {k + 1} - {at + 1}": [radii[k] * np.cos(0.3 + 1.6 * at), radii[k] * np.sin(0.3 + 1.6 * at), heights[k]]
+        for k in range(3)
+        for at in range(4)
+    }
+    plain = composed("mesh=arm_coarse")
+    plain |= {
+        "name": name,
+        "title": "Pneumatic arm",
+        "fixed": {"z": 0.0},
+        "markers": {"tracked": tracked, "reference": BASE},
+        "laboratory": LABORATORY,
+        "chambers": {"count": chambers, "axis": [0.0, 0.0, -1.0]},
+        "data": data(),
+        "time_step": ARM_STEP,
+    }
+    return parse(RunSettings, {**plain, **changes})
+
+
+def pressures(trials, steps, chambers, factor=1.0):
+    """Smooth pressures (K, C) between zero and the limit, by trial [Pa]."""
+    times = ARM_STEP * np.arange(steps)[:, None]
+    rows = {}
+    for number, trial in enumerate(trials):
+        phase = np.arange(chambers) * 2.4 + number
+        waves = np.sin(times * (2.0 + 0.3 * np.arange(chambers)) + phase) + 0.5 * np.sin(5.0 * times + phase)
+        rows[trial] = factor * np.clip(12e3 * waves * np.minimum(1.0, times / 0.3), 0.0, LIMIT)
+    return rows
+
+
+def bent(points, pressure, model=None, sag=0.0):
+    """Positions (K + 1, P, 3) of points (P, 3) of a hanging arm under pressures (K, C) [m]."""
+    level, lag = _BENDS[model]
+    angle = 2.0 * np.pi / 3.0 * np.arange(pressure.shape[1])
+    push = pressure / LIMIT @ np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    tip = np.zeros((len(push) + 1, 2))
+    rate = ARM_STEP / (0.1 + lag)
+    for k, target in enumerate(push):
+        tip[k + 1] = tip[k] + rate * (0.03 * level * target - tip[k])
+    along = (points[:, 2] / points[:, 2].min()) ** 2
+    moved = np.repeat(points[None], len(tip), axis=0)
+    moved[..., :2] += tip[:, None] * along[:, None]
+    moved[..., 2] += (8.0 * (tip**2).sum(axis=1)[:, None] - sag) * along
+    return moved
+
+
+def write_arm_run(
+    folder: Path,
+    settings,
+    *,
+    train=2,
+    test=3,
+    steps=100,
+    chambers=6,
+    models=ARM_MODELS,
+    scales=(),
+    horizons=(),
+    diverged=(),
+    simulated=True,
+    sag=0.0,
+):
+    """Writes all files of a run of an arm; bodies hang lower by the sag [m]."""
+    mesh, rng = build_mesh(settings.mesh), np.random.default_rng(0)
+    labels = list(settings.markers.tracked)
+    bound = np.array(list(settings.markers.tracked.values())) + 1e-4
+    nominal = [f"test_{number:02d}" for number in range(test)]
+    driven = pressures([*(f"train_{n:02d}" for n in range(train)), *nominal], steps, chambers)
+    for scale in scales:
+        driven |= pressures([f"{name}_{scale:g}" for name in nominal], steps, chambers, scale)
+    markers = np.stack([bent(bound, pressure, None, sag) for pressure in driven.values()])
+    markers += rng.normal(0.0, 5e-5, markers.shape)
+    markers[:, 30:36, min(1, len(labels) - 1)] = np.nan
+    drawn, count = np.stack(list(driven.values())), train + test
+    parts = {"dataset.h5": slice(None, count)} | ({"dataset_scaled.h5": slice(count, None)} if scales else {})
+    channels = {"pressure": tuple(f"chamber_{number + 1}" for number in range(chambers))}
+    for name, rows in parts.items():
+        names = tuple(driven)[rows]
+        times = np.tile(ARM_STEP * np.arange(steps + 1), (len(names), 1))
+        words, x = (names, tuple(labels), ("rest",) * len(names)), markers[rows]
+        own = {"bound": bound, "inputs": {"pressure": drawn[rows]}, "channels": channels}
+        Dataset(*words, times, x, x[:, 0], np.zeros(len(x)), GRAVITY, ARM_STEP, **own).write(folder / name)
+    rolled, film = list(driven)[train:], np.arange(0, steps + 1, 2)
+    observed = {m: np.stack([bent(bound, driven[name], m, sag) for name in rolled]) for m in models}
+    films = {m: bent(mesh.vertices, driven[rolled[0]], m, sag)[film] for m in models}
+    for model in diverged:
+        observed[model][0, 60:] = films[model][film >= 60] = np.nan
+    _write_rollouts(folder, rolled, ARM_STEP, film, rolled[0], observed, films)
+    write_json(folder / "errors.json", _arm_errors(observed, markers[train:], rolled, test, labels, scales, horizons))
+    _write_recordings(
+        folder, list(driven)[:2], dict(zip(labels, bound, strict=True)), settings.markers.reference, rng, None
+    )
+    if simulated:
+        material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
+        write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
+    if "sysid" in models:
+        found = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
+        history = [[{"loss": 0.3 * 0.6**k + 0.02, **found} for k in range(9)]]
+        own = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
+        write_json(folder / "identification.json", {"sysid": own})
+    _write_trainings(folder, models)
+    write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61, "replayed_mm": 0.17}})
+    _write_stages(folder, **{"import": 75.0})
+
+
+def _arm_errors(simulated, measured, names, test, labels, scales, horizons):
+    distances = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
+    for rows in distances.values():
+        rows[np.isinf(rows)] = np.nan
+    nominal = {model: rows[:test] for model, rows in distances.items()}
+
+    def part(rows, first=0, last=None):
+        return {model: summarise(values[first:last]) for model, values in rows.items()}
+
+    late = {"left": 2, "first_s": {"test_01": 1.2, "test_00": 0.84}}
+    content = {
+        "errors_mm": part(nominal),
+        "per_trajectory": summarise_trajectories(names[:test], nominal),
+        "per_marker": {
+            model: dict(zip(labels, np.nanmean(1e3 * np.linalg.norm(m - measured, axis=3), axis=(0, 1)), strict=True))
+            for model, m in simulated.items()
+        },
+        "median_filtered": {m: median_filter(rows.mean(axis=0), ARM_STEP).max() for m, rows in nominal.items()},
+        "range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}},
+    }
+    if horizons:
+        content["horizons"] = {
+            f"{w:g}": part({m: rows[:, : round(w / ARM_STEP)] for m, rows in nominal.items()}) for w in horizons
+        }
+        first, *_, last = content["horizons"].values()
+        content["growth"] = {
+            m: None if last[m]["mean"] is None else last[m]["mean"] / first[m]["mean"] - 1.0 for m in first
+        }
+    if scales:
+        content["scales"] = {"1": content["errors_mm"]} | {
+            f"{scale:g}": part(distances, test * (k + 1), test * (k + 2)) for k, scale in enumerate(scales)
+        }
+        late = {"1": {}, f"{scales[0]:g}": {}, f"{scales[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
+        content["scales_range"] = {
+            scale: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
+            for scale, first in late.items()
+        }
+    return content
+
+
+STEPS = 40
+AMPLITUDES = {"0.05 kg": 0.008, "0.07 kg": 0.01, "0.12 <kg>": 0.02}  # of the tip [m]; the first trial is for training
+PERIODS = {"simulation": 0.16, "reconstruction": 0.14, "simfree": 0.143, "resphys": 0.14, "law": 0.141}  # s
+OFFSETS = {"reconstruction": 1e-9, "resphys": 2e-6}  # m
+
+
+def vertex_settings(**changes):
+    """Settings of an experiment with observed vertices."""
+    return parse(RunSettings, {**composed("mesh.divisions=[4,1,1]"), "time_step": STEP, **changes})
+
+
+def swinging(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
+    """(steps + 1, N, 3) positions [m] of a beam along x whose tip swings along z and comes to rest."""
+    time = np.arange(steps + 1) * STEP
+    tip = amplitude * np.exp(-3.0 * time) * np.cos(2.0 * np.pi * time / period) + offset * (time > 0.0)
+    positions = np.repeat(vertices[None], steps + 1, axis=0)
+    positions[..., 2] += tip[:, None] * (vertices[:, 0] / vertices[:, 0].max()) ** 2
+    return positions
+
+
+def write_vertex_run(folder, settings, *, models=tuple(PERIODS)[:-1], diverged=(), steps=STEPS, begins="given"):
+    """Writes every file of a run whose vertices are observed."""
+    vertices = build_mesh(settings.mesh).vertices
+    names, test = tuple(AMPLITUDES), list(AMPLITUDES)[1:]
+    target = np.stack([swinging(vertices, size, steps=steps) for size in AMPLITUDES.values()])
+    times = np.tile(STEP * np.arange(steps + 1), (3, 1))
+    words = names, (), (begins,) * 3
+    Dataset(*words, times, target, target[:, 0], np.zeros(3), GRAVITY, STEP).write(folder / "dataset.h5")
+    runs = {
+        m: np.stack([swinging(vertices, AMPLITUDES[t], PERIODS[m], OFFSETS.get(m, 0.0), steps) for t in test])
+        for m in models
+    }
+    for model in diverged:
+        runs[model][1, 5:9] *= 1e200
+        runs[model][1, 9:] = np.nan
+    _write_rollouts(folder, test, STEP, np.arange(steps + 1), test[1], runs, {m: q[1] for m, q in runs.items()})
+    first = min(1, steps)
+    pairs = {model: zip(q, target[1:], strict=True) for model, q in runs.items()}
+    errors = {model: [marker_errors(a[first:], b[first:]) for a, b in rows] for model, rows in pairs.items()}
+    summaries = {model: summarise(rows) for model, rows in errors.items()}
+    against = {m: rows for m, rows in summaries.items() if m != "reconstruction"}
+    content = {"errors_mm": summaries, "errors_vs_reconstruction_mm": against}
+    write_json(folder / "errors.json", content | {"per_trajectory": summarise_trajectories(test, errors)})
+    _write_trainings(folder, models)
+    seconds = {name: {"mean": 0.421, "std": 0.1} for name in ("simulation", "target", "resphys", "inference")}
+    write_json(folder / "times.json", {"steps": steps, "seconds": seconds})
+    _write_stages(folder, acquire=12.0, train=75.4)
